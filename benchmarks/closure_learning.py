@@ -14,7 +14,8 @@ alone as many as one that trains in every round.
 
 - homographies: as many pairs, each of two views of one image under a random homography, federated
 - own map: pairs of each robot's own keyframes, federated
-- closures: that, and codes on which places of at least two other keyframes agree, federated
+- keypoints too: that, and keypoints that other views of the robot's map show again or do not
+- closures: as own map, and codes on which places of at least two other keyframes agree, federated
 - poisoned: as closures, but one robot of five sends codes at random and reverses its updates, ten times as long
 - central: pairs of one robot and across robots, whose images are in one place
 - alone: own map, one robot in each of three buildings; each of the networks is measured in every third building
@@ -75,7 +76,7 @@ from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
-from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair, TaughtImage
+from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair, TaughtImage, VotedImage, vote
 from fcslam.learning.revisits import FARTHEST_M, FEWEST_SHARED, Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
@@ -108,13 +109,14 @@ PAIRS_A_BUILDING = 120
 """Most pairs of views per building on which keypoint recall is measured."""
 ALONE = 3
 """Robots that train alone; each building of the test measures the network of one of them."""
-ARMS = ("bundled", "homographies", "own map", "closures", "poisoned", "central", "alone")
+ARMS = ("bundled", "homographies", "own map", "keypoints too", "closures", "poisoned", "central", "alone")
 REPEATED = ("own map",)
 """Arms with all training seeds; the others have the first."""
-LATER_DRIVEN = ("bundled", "own map", "closures")
+LATER_DRIVEN = ("bundled", "own map", "keypoints too", "closures")
 """Arms that are also measured on later drives, with the first training seed."""
 COMPARED = (
     ("own map", "homographies"),
+    ("keypoints too", "own map"),
     ("own map", "alone"),
     ("own map", "central"),
     ("closures", "own map"),
@@ -151,6 +153,7 @@ class Learner:
     keyframes: tuple[TrainingExample, ...]
     """Its images, with its keypoints as labels."""
     pairs: tuple[RevisitPair, ...]
+    voted: tuple[VotedImage, ...]
     taught: tuple[TaughtImage, ...]
     misled: tuple[TaughtImage, ...]
     """As ``taught``, if the liar of the building sends codes at random."""
@@ -264,21 +267,22 @@ def fleet_of(drives: dict[str, MappedDrive], tied: Sequence[Tie]) -> Fleet:
     learners = []
     honest, misled = taught_images(drives, tied, None), taught_images(drives, tied, LIAR)
     for name, drive in drives.items():
-        pairs = [
-            pair_of((i, j), drive.keyframes[i], drive.keyframes[j], rows, drive.T_own_base[i])
-            for i, j, rows in revisits_in_map(drive.keyframes, drive.T_own_base)
-        ]
+        frames, poses = drive.keyframes, drive.T_own_base
+        found = revisits_in_map(frames, poses)
+        pairs = [pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in found.pairs]
+        voted = [vote(k, frames[k].features.keypoints_px, each) for k, each in enumerate(found.sightings)]
         keyframes = tuple(
             TrainingExample(f.image, Labels(f.features.keypoints_px, ranked(len(f.features.scores))))
             for f in drive.keyframes
         )
-        learners.append(Learner(name, keyframes, tuple(pairs), tuple(honest[name]), tuple(misled[name])))
+        votes = tuple(each for each in voted if each is not None)
+        learners.append(Learner(name, keyframes, tuple(pairs), votes, tuple(honest[name]), tuple(misled[name])))
     largest = max(np.bincount([drive.map_index for drive in drives.values()]).argmax(), 0)
     joint = [drive for drive in drives.values() if drive.map_index == largest]
     frames = [frame for drive in joint for frame in drive.keyframes]
     poses = np.concatenate([drive.T_map_base for drive in joint])
     everything = [
-        pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses)
+        pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses).pairs
     ]
     received = sum(HEAD_BYTES + RECORD_BYTES * len(image.points) for name in drives for image in honest[name])
     return Fleet(tuple(learners), RevisitExamples([frame.image for frame in frames], everything), received)
@@ -359,8 +363,8 @@ def revisits_of(arm: str, learner: Learner, lied_to: bool, seed: int) -> Revisit
     if arm == "homographies":
         return homography_pairs(learner, seed)
     images = [example.image for example in learner.keyframes]
-    if arm in ("own map", "alone"):
-        return RevisitExamples(images, learner.pairs)
+    if arm in ("own map", "keypoints too", "alone"):
+        return RevisitExamples(images, learner.pairs, voted=learner.voted)
     return RevisitExamples(images, learner.pairs, learner.misled if lied_to else learner.taught)
 
 
@@ -381,7 +385,9 @@ def trained(
     """The networks of an arm, one or several, of which the mean counts; None for the bundled one."""
     if arm == "bundled":
         return [None]
-    settings = settings.model_copy(update={"training": settings.training.model_copy(update={"seed": seed})})
+    layers = "heads" if arm == "keypoints too" else "codes"
+    training = settings.training.model_copy(update={"seed": seed})
+    settings = settings.model_copy(update={"trained": layers, "training": training})
     start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings, ExecutionOptions(), lambda *_: None)
     learners = [(k, learner) for k, fleet in enumerate(fleets) for learner in fleet.learners]
     steps = settings.rounds * settings.local_steps

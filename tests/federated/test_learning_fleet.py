@@ -133,10 +133,25 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
             assert len(again) >= 0.9 * len(places[robot, weak]), "old places are described again"
         service.send_signal(signal.SIGINT)
         service.wait(LIMIT_S)
+        assert in_use_of(tmp_path, released=version, before=weak) == 1
+        assert in_use_of(tmp_path, released=weak, before=version) == 0, "the worse one is taken back"
     finally:
         for process in everyone:
             process.kill()
             process.wait()
+
+
+def in_use_of(folder, released, before):
+    """The number of the version in use after the mission judged a released one: 1, or 0 if it is taken back."""
+    from fcslam.federated.fleet_learning import MissionTeacher
+    from fcslam.federated.live_settings import FleetLearningSettings
+    from fcslam.federated.releases import Releases
+
+    releases = Releases.opened(folder / f"releases-{released}", b"", before)
+    releases.add(released, b"", {})
+    settings = FleetLearningSettings(gate={"fewest_places": 20})
+    MissionTeacher(folder / "data", settings, releases, lambda *_: None).step()
+    return releases.in_use
 
 
 def rows(rounds):

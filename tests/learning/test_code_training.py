@@ -11,8 +11,8 @@ from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
 from fcslam.federated.codec import weights_to_network  # noqa: E402
 from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
-from fcslam.learning.code_training import CodeInputs, code_names, train_codes  # noqa: E402
-from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, network_from_state  # noqa: E402
+from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
+from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork, sample_codes  # noqa: E402
 from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, TaughtImage  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
@@ -58,7 +58,7 @@ def test_only_the_layers_of_the_codes_change(encoder, start):
     network = train_codes(start, OWN, CodeInputs(), settings, LocalTrainingPlan(0, 3), CPU).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
     assert changed
-    assert changed <= code_names(network)
+    assert changed <= layer_names(network, network.code_layers)
     assert not any("running" in name for name in changed)
     before = network_from_state(encoder, start)
     image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(1))

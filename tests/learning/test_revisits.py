@@ -121,10 +121,31 @@ def test_keyframes_near_one_another_in_the_map_are_paired_from_any_time():
     walls, points = room(), world_points(room())
     poses = np.array([FIRST, [1.8, 1.2, np.pi], SECOND])
     views = [view(pose, walls, points, seed) for seed, pose in enumerate(poses)]
-    found = list(revisits_in_map([frame for frame, _ in views], poses))
+    found = revisits_in_map([frame for frame, _ in views], poses).pairs
     assert [(i, j) for i, j, _ in found] == [(0, 2)]  # the one between them looks the other way
     rows = found[0][2]
     assert len(rows) >= FEWEST_SHARED
     assert np.mean(views[0][1][rows[:, 0]] == views[2][1][rows[:, 1]]) > 0.98
     far = np.array([FIRST, [1.8, 1.2, np.pi], [FIRST[0] + FARTHEST_M + 1.0, 0.0, 0.0]])
-    assert not list(revisits_in_map([frame for frame, _ in views], far))
+    assert not revisits_in_map([frame for frame, _ in views], far).pairs
+
+
+def test_sightings_tell_which_keypoints_other_views_miss():
+    walls, points = room(), world_points(room())
+    poses = np.array([FIRST, SECOND, SECOND])
+    views = [view(pose, walls, points, seed) for seed, pose in enumerate(poses)]
+    whole = revisits_in_map([frame for frame, _ in views], poses)
+    for sightings in whole.sightings:
+        assert np.all(sightings.found <= sightings.shown)
+        assert sightings.shown.max() == 2
+        assert sightings.found.sum() > 0.8 * sightings.shown.sum()
+    rows = whole.pairs[0][2]
+    missing = rows[:5, 1]  # five points of the second view that the first one shows
+    kept = np.setdiff1d(np.arange(len(views[1][1])), missing)
+    features = views[1][0].features.take(kept)
+    second = Keyframe.of(views[1][0].image, features, views[1][0].camera, views[1][0].surroundings)
+    less = revisits_in_map([views[0][0], second, views[2][0]], poses)
+    of_first = rows[:5, 0]
+    assert np.array_equal(less.sightings[0].shown[of_first], whole.sightings[0].shown[of_first])
+    assert np.all(less.sightings[0].found[of_first] <= whole.sightings[0].found[of_first])
+    assert less.sightings[0].found[of_first].sum() <= whole.sightings[0].found[of_first].sum() - 4

@@ -82,8 +82,10 @@ class FleetLearning(NamedTuple):
         from fcslam.federated.live_settings import FleetLearningSettings
 
         settings = FleetLearningSettings() if self.config is None else load(FleetLearningSettings, self.config)
-        if settings.federated.trained != "codes":
-            raise ServiceError(f"{self.config}: a fleet that maps trains codes; set federated.trained to codes")
+        if not settings.federated.on_revisits:
+            raise ServiceError(
+                f"{self.config}: a fleet that maps trains on what it saw again; set federated.trained to codes or heads"
+            )
         if settings.federated.privacy.noise_multiplier:
             raise ServiceError(
                 f"{self.config}: robots report on held-out pairs without noise; set noise_multiplier to 0"

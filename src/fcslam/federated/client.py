@@ -22,6 +22,7 @@ from fcslam.federated.weights import Weights, trained_names
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
+from fcslam.learning.point_training import train_points
 from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
@@ -112,16 +113,20 @@ class RobotClient:
             compatible=settings.compatible,
             frozen_statistics=frozen,
         )
-        only_codes = settings.trained == "codes"
         training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
-        former = legacy_weights(self.cache, run_id, round_number, weights) if plan.compatible or only_codes else None
+        needs_former = plan.compatible > 0.0 or settings.on_revisits
+        former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
         legacy = None if former is None else weights_to_network(former, encoder).state_dict()
         device, on_step = torch.device(self.device), partial(self.on_step, self.name)
         moments = load_optimiser_state(self.cache, run_id, round_number)
-        if only_codes:
+        if settings.on_revisits:
             trained = train_codes(
                 start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
             )
+            if settings.trained == "heads" and self.revisits.voted:
+                codes, moments = trained.network.state_dict(), trained.optimiser_state
+                points = train_points(codes, self.revisits, training, plan, device, on_step, legacy, moments)
+                trained = points._replace(losses=trained.losses | points.losses)
         else:
             images = self._labelled_images(weights, settings).train
             trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)

@@ -51,7 +51,7 @@ def _train(message: Message, client: FederatedClient) -> Message:
 
 def _evaluate(message: Message, client: FederatedClient) -> Message:
     request = read_request(message.content)
-    if request.settings.trained == "codes" and isinstance(client, JudgingClient):
+    if request.settings.on_revisits and isinstance(client, JudgingClient):
         rows = client.judge(request.weights, request.settings)
         arrays = weights_to_record({PAIRS_KEY: rows})
         return Message(client_reply(client.name, request.version, {}, arrays), reply_to=message)

@@ -11,15 +11,17 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from fcslam.cloud.teaching import PlacePoints
 from fcslam.features.codes import Matches, mutual_matches
-from fcslam.features.dense import sample_codes
+from fcslam.features.detector import ImageFeatures
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, revisits_in_map
+from fcslam.learning.validation import detect
 from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.motions import MotionConfig
-from fcslam.records import Codes, FloatArray
+from fcslam.records import FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")
 """Of what a robot reports about each pair: the share of the shared keypoints that match, and whether the pair is more
@@ -30,6 +32,8 @@ MOST_APART: Final = 300
 """Pairs of keyframes of different places that are compared."""
 MOST_PAIRS: Final = 1000
 """Pairs that a robot reports on."""
+SAME_PX: Final = 3.0
+"""A version finds a shared point if it has a keypoint within this of it."""
 
 Judgement = NDArray[np.float32]
 """Shape (P, 2): a row for each pair, by ``COLUMNS``; a place is found (1), not found (0), or NaN without others."""
@@ -48,7 +52,7 @@ class HeldOutPairs:
     @classmethod
     def of(cls, frames: Sequence[Keyframe], T_own_base: FloatArray) -> "HeldOutPairs":
         """Of keyframes that are held out, at their estimated poses in the robot's map, shape (N, 3)."""
-        revisits = list(revisits_in_map(frames, T_own_base))
+        revisits = revisits_in_map(frames, T_own_base).pairs
         chosen = np.linspace(0, len(revisits) - 1, min(len(revisits), MOST_PAIRS)).astype(int)
         first, second = np.triu_indices(len(frames), 1)
         distances = np.hypot(*(T_own_base[first, :2] - T_own_base[second, :2]).T)
@@ -59,11 +63,14 @@ class HeldOutPairs:
 
 @torch.inference_mode()
 def judge(network: KeypointNetwork, pairs: HeldOutPairs, device: torch.device) -> Judgement:
-    """Judge the codes of a network at the keypoints that the frames have, so that versions differ in codes alone."""
-    codes = [_codes(network, frame, device) for frame in pairs.frames]
-    found = [_right(codes[i], codes[j], rows) for i, j, rows in pairs.revisits]
-    same = [_inliers(pairs, codes, i, j) for i, j, _ in pairs.revisits]
-    other = [_inliers(pairs, codes, i, j) for i, j in pairs.apart.tolist()]
+    """Judge the keypoints and codes that a network finds in the frames, by the points that these share."""
+    frames = [_described(network, frame, device) for frame in pairs.frames]
+    nearest = [_nearest(frame, new) for frame, new in zip(pairs.frames, frames, strict=True)]
+    found = [
+        _right(frames[i], frames[j], nearest[i][rows[:, 0]], nearest[j][rows[:, 1]]) for i, j, rows in pairs.revisits
+    ]
+    same = [_inliers(frames[i], frames[j]) for i, j, _ in pairs.revisits]
+    other = [_inliers(frames[i], frames[j]) for i, j in pairs.apart.tolist()]
     judged = np.full((len(found), len(COLUMNS)), np.nan, np.float32)
     judged[:, 0] = found
     if other:
@@ -96,20 +103,33 @@ def same_pairs(first: Mapping[str, Judgement], second: Mapping[str, Judgement]) 
     }
 
 
-def _codes(network: KeypointNetwork, frame: Keyframe, device: torch.device) -> Codes:
+def _described(network: KeypointNetwork, frame: Keyframe, device: torch.device) -> Keyframe:
+    """The frame with the keypoints and codes of the network."""
     grey = torch.from_numpy(frame.image.astype(np.float32) / 255.0)[None, None].to(device)
-    return sample_codes(network(grey).code_logits[0].float().cpu().numpy(), frame.features.keypoints_px)
+    points, codes = detect(network, grey)
+    features = ImageFeatures(
+        frozen(points, np.float32), frozen(np.empty(len(points)), np.float32), frozen(codes, np.uint8)
+    )
+    return Keyframe.of(frame.image, features, frame.camera, frame.surroundings)
 
 
-def _right(a: Codes, b: Codes, rows: NDArray[np.int64]) -> float:
-    """Share of the shared keypoints that are each other's nearest by their codes."""
-    matched = {(i, j) for i, j in mutual_matches(a, b).pairs.tolist()}
-    return sum((i, j) in matched for i, j in rows.tolist()) / len(rows)
+def _nearest(frame: Keyframe, new: Keyframe) -> NDArray[np.int64]:
+    """The new keypoint at each keypoint of the frame, shape (K,); -1 where there is none within ``SAME_PX``."""
+    if not len(new.features.keypoints_px):
+        return np.full(len(frame.features.keypoints_px), -1)
+    gaps, rows = cKDTree(new.features.keypoints_px).query(frame.features.keypoints_px)
+    return np.where(np.asarray(gaps) <= SAME_PX, rows, -1)
 
 
-def _inliers(pairs: HeldOutPairs, codes: Sequence[Codes], i: int, j: int) -> int:
+def _right(a: Keyframe, b: Keyframe, first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
+    """Share of the shared points whose keypoints, -1 where there is none, are each other's nearest by their codes."""
+    matched = {(i, j) for i, j in mutual_matches(a.features.descriptors, b.features.descriptors).pairs.tolist()}
+    return sum(pair in matched for pair in zip(first.tolist(), second.tolist(), strict=True)) / len(first)
+
+
+def _inliers(a: Keyframe, b: Keyframe) -> int:
     first, second = (
-        PlacePoints(pairs.frames[k].positions[pairs.frames[k].placed], codes[k][pairs.frames[k].placed]) for k in (i, j)
+        PlacePoints(each.positions[each.placed], each.features.descriptors[each.placed]) for each in (a, b)
     )
     return inliers(first, second)
 

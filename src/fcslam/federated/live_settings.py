@@ -75,7 +75,10 @@ class LiveRounds(FederatedSettings):
         default=600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
     )
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
-    trained: TrainedLayers = Field(default="codes", description="robots train the layers of the codes alone")
+    trained: TrainedLayers = Field(
+        default="codes",
+        description="layers that robots train: codes, those of the descriptors; or heads, also those of the keypoints",
+    )
     compatible: float = Field(
         default=4.0,
         ge=0.0,

@@ -14,7 +14,7 @@ from fcslam.features.detector import GreyImage, decode_grey
 from fcslam.federated.held_out import HeldOutPairs
 from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings
 from fcslam.geometry import se2
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, TaughtImage
+from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, TaughtImage, vote
 from fcslam.learning.revisits import FEWEST_SHARED, Keyframe, revisits_in_map
 from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
@@ -53,7 +53,9 @@ def own_examples(
     trained = [each for each, is_held_out in zip(shown, held_out, strict=True) if not is_held_out]
     judged = [each for each, is_held_out in zip(shown, held_out, strict=True) if is_held_out]
     frames, poses = _keyframes(trained)
-    pairs = [_pair(frames, poses, i, j, rows) for i, j, rows in revisits_in_map(frames, poses)]
+    found = revisits_in_map(frames, poses)
+    pairs = [_pair(frames, poses, i, j, rows) for i, j, rows in found.pairs]
+    voted = [vote(k, frames[k].features.keypoints_px, each) for k, each in enumerate(found.sightings)]
     numbers = {(first_epoch + frame.part, frame.image.keyscan): number for number, (frame, _) in enumerate(trained)}
     images = []
     for packet in taught:
@@ -62,7 +64,8 @@ def own_examples(
             number = numbers.get((packet.epoch, body.number))
             image = None if number is None else _taught(frames[number], trained[number][0], number, body)
             images += [] if image is None else [image]
-    examples = RevisitExamples([frame.image for frame in frames], pairs, images)
+    votes = [each for each in voted if each is not None]
+    examples = RevisitExamples([frame.image for frame in frames], pairs, images, votes)
     return OwnExamples(examples, HeldOutPairs.of(*_keyframes(judged)))
 
 

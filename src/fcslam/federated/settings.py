@@ -9,7 +9,7 @@ from fcslam.learning.settings import TrainingSettings
 
 StrategyName = Literal["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"]
 Normalisation = Literal["averaged", "frozen"]
-TrainedLayers = Literal["all", "codes"]
+TrainedLayers = Literal["all", "codes", "heads"]
 
 
 class ScreeningSettings(Settings):
@@ -112,8 +112,9 @@ class FederatedSettings(Settings):
     )
     trained: TrainedLayers = Field(
         default="all",
-        description="layers that robots train: all, or those of the codes alone, so that keypoints stay as they are; "
-        "codes needs frozen batch statistics",
+        description="layers that robots train: all; codes, those of the descriptors alone, so that keypoints stay as "
+        "they are; or heads, those of the descriptors and of the keypoints, on what a robot saw again; codes and heads "
+        "need frozen batch statistics",
     )
     collapse: float = Field(
         default=0.15,
@@ -140,11 +141,16 @@ class FederatedSettings(Settings):
 
     @model_validator(mode="after")
     def _codes_leave_statistics(self) -> Self:
-        if self.trained == "codes" and self.normalisation != "frozen":
+        if self.on_revisits and self.normalisation != "frozen":
             raise ValueError(
                 "batch statistics belong to the keypoints too; set normalisation to frozen, or trained to all"
             )
         return self
+
+    @property
+    def on_revisits(self) -> bool:
+        """Whether robots train on what they saw again, and on no image files."""
+        return self.trained != "all"
 
     def client_training(self) -> TrainingSettings:
         """The training settings of a robot, with the steps of the whole run."""

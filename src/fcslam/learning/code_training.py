@@ -19,7 +19,8 @@ from fcslam.learning.local_training import (
     LocalTrainingPlan,
     LocalTrainingResult,
     continued_optimiser,
-    freeze_statistics,
+    freeze_all_but,
+    layer_names,
     local_rate,
     local_result,
     network_from_state,
@@ -44,7 +45,8 @@ class CodeInputs:
 
     def of(self, network: KeypointNetwork, images: Sequence[GreyImage], seed: int, device: torch.device) -> Tensor:
         """Shape (K + V, C, H/8, W/8), float16, for K images and the V views of ``draw_views``; always of the same."""
-        frozen = {name: value for name, value in network.state_dict().items() if name not in code_names(network)}
+        heads = layer_names(network, (*network.code_layers, *network.point_layers))
+        frozen = {name: value for name, value in network.state_dict().items() if name not in heads}
         is_same = self._frozen.keys() == frozen.keys() and all(
             torch.equal(value, self._frozen[name]) for name, value in frozen.items()
         )
@@ -57,12 +59,6 @@ class CodeInputs:
                     parts.append(network.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
             self._inputs = torch.cat(parts)
         return self._inputs
-
-
-def code_names(network: KeypointNetwork) -> set[str]:
-    """Names of the parameters and statistics of the layers that are trained here."""
-    values = {id(value) for layer in network.code_layers for value in layer.state_dict(keep_vars=True).values()}
-    return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
 
 
 def train_codes(
@@ -98,7 +94,7 @@ def train_codes(
         raise TrainingError("codes are trained on places that were seen again, and there are none; set trained to all")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
-    freeze_all_but_codes(network)
+    freeze_all_but(network, layer_names(network, network.code_layers))
     known = inputs.of(network, revisits.images, settings.seed, device)
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
     proximal = proximal_term(network, plan)
@@ -132,11 +128,3 @@ def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork
         described = network.describe(given)
         with torch.no_grad():
             return described, before.describe(given)
-
-
-def freeze_all_but_codes(network: KeypointNetwork) -> None:
-    """Let only the layers of the codes be trained, without their batch statistics."""
-    trained = code_names(network)
-    for name, parameter in network.named_parameters():
-        parameter.requires_grad_(name in trained)
-    freeze_statistics(network)

@@ -1,6 +1,6 @@
 """Local training: a client's part of a federated round. It trains some steps from given weights."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -142,6 +142,19 @@ def local_result(
         # Checked here, because whatever continues from this state would diverge.
         raise TrainingError("training diverged in the last step; lower the learning rate")
     return LocalTrainingResult(network, {name: total / plan.steps for name, total in sums.items()}, state)
+
+
+def layer_names(network: KeypointNetwork, layers: Sequence[nn.Module]) -> set[str]:
+    """Names of the parameters and statistics of some layers of a network."""
+    values = {id(value) for layer in layers for value in layer.state_dict(keep_vars=True).values()}
+    return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
+
+
+def freeze_all_but(network: KeypointNetwork, names: Collection[str]) -> None:
+    """Let only the parameters of these names be trained, without batch statistics."""
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(name in names)
+    freeze_statistics(network)
 
 
 def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:

@@ -55,6 +55,11 @@ class KeypointNetwork(nn.Module):
         """The layers that give the codes at 1/8 of the resolution; the keypoints depend on them a little."""
         return self.body.code_layers
 
+    @property
+    def point_layers(self) -> tuple[nn.Module, ...]:
+        """The layers that turn features into keypoints; the codes do not depend on them."""
+        return self.body.point_layers
+
     def code_inputs(self, image: Tensor) -> Tensor:
         """Input of the layers of the codes for images (B, 1, H, W), shape (B, C, H/8, W/8)."""
         inputs: Tensor = self.body.code_inputs(image)
@@ -114,6 +119,11 @@ class LightBody(nn.Module):
         """As in ``KeypointNetwork``."""
         return self.to_sixteenth, self.joint, self.code_head
 
+    @property
+    def point_layers(self) -> tuple[nn.Module, ...]:
+        """As in ``KeypointNetwork``; without ``context_eighth``, by which training of the codes leaves keypoints."""
+        return self.context_quarter, self.point_head, self.refine
+
     def code_inputs(self, image: Tensor) -> Tensor:
         """As in ``KeypointNetwork``."""
         return self._resolutions(_even_contrast(image))[-1]
@@ -159,6 +169,11 @@ class VggBody(nn.Module):
     def code_layers(self) -> tuple[nn.Module, ...]:
         """As in ``KeypointNetwork``."""
         return (self.code_head,)
+
+    @property
+    def point_layers(self) -> tuple[nn.Module, ...]:
+        """As in ``KeypointNetwork``."""
+        return (self.point_head,)
 
     def code_inputs(self, image: Tensor) -> Tensor:
         """As in ``KeypointNetwork``."""

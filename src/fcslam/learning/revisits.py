@@ -8,7 +8,7 @@ first tell how far the predicted pixels are off in each part of the image. Then 
 which: also where codes disagree, as only those pairs can teach anything.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -70,6 +70,26 @@ class Keyframe:
         """Locate the keypoints."""
         positions, placed = locate_among(features.keypoints_px, camera, surroundings, CEILING_M)
         return cls(image, features, camera, surroundings, positions, placed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """How often other keyframes show the keypoints of one, found again or not."""
+
+    shown: NDArray[np.int64]
+    """Keyframes that show each keypoint, shape (K,)."""
+    found: NDArray[np.int64]
+    """Those of them in which it is a keypoint again, shape (K,)."""
+
+
+class Revisits(NamedTuple):
+    """What the keyframes of one map show in common."""
+
+    pairs: list[tuple[int, int, NDArray[np.int64]]]
+    """The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
+    least ``FEWEST_SHARED``."""
+    sightings: list[Sightings]
+    """By keyframe, of all pairs whose poses fit."""
 
 
 class Correspondences(NamedTuple):
@@ -140,24 +160,31 @@ def correspond_predicted(
     return Correspondences(np.column_stack((asked[found], nearest[found])), shown)
 
 
-def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
-    """Pairs of keyframes of one map that show the same points, from whatever time.
+def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Revisits:
+    """Find what keyframes of one map show again, from whatever time.
 
     Args:
         frames: N keyframes.
         T_map_base: their estimated poses in the map, shape (N, 3), metres and radians.
-
-    Yields:
-        The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
-        least ``FEWEST_SHARED``.
     """
+    pairs = []
+    shown, found = ([np.zeros(len(frame.features.keypoints_px), np.int64) for frame in frames] for _ in range(2))
     for i, first in enumerate(frames):
         between = se2.between(T_map_base[i], T_map_base[i + 1 :])
         near = (np.hypot(*between[:, :2].T) <= FARTHEST_M) & (np.abs(between[:, 2]) <= WIDEST_RAD)
         for k in np.flatnonzero(near).tolist():
-            rows = correspond(first, frames[i + 1 + k], between[k]).rows
+            j, T_first_second = i + 1 + k, between[k]
+            rows, shown_there = correspond(first, frames[j], T_first_second)
+            if not len(rows):  # nothing fits, so whoever is not found is not missing either
+                continue
+            shown_here = predict(frames[j], first, se2.inverse(T_first_second))[1]
+            for number, mask, column in ((i, shown_there, rows[:, 0]), (j, shown_here, rows[:, 1])):
+                mask[column] = True
+                shown[number] += mask
+                found[number][column] += 1
             if len(rows) >= FEWEST_SHARED:
-                yield i, i + 1 + k, rows
+                pairs.append((i, j, rows))
+    return Revisits(pairs, [Sightings(*each) for each in zip(shown, found, strict=True)])
 
 
 def _offsets_of_alike(
