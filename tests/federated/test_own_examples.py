@@ -8,26 +8,31 @@ import httpx
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
+torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.federated.fleet_grid import FleetGrid
-from fcslam.federated.fleet_server import FleetApp
-from fcslam.federated.identity import ROBOT_HEADER, RobotAuthenticator
-from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings
-from fcslam.federated.own_examples import SPLIT_FILE, own_examples
-from fcslam.federated.robot_learning import BusyRobotError, Idleness, LearningEndError, LearningRobot, checked_lessons
-from fcslam.records import Channel, Place, frozen
-from fcslam.robot.backend import RobotBackend
-from fcslam.robot.beside import Inline
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes
-from fcslam.wire.batches import write_batch
-from fcslam.wire.messages import Packet, TaughtPlace
-from fcslam.wire.packets import decode, encode
-from tests.robot.test_views import records_of
-from tests.wire.examples import ACKNOWLEDGEMENT, TAUGHT_PLACE, packet
+from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
+from fcslam.federated.codec import weights_to_network  # noqa: E402
+from fcslam.federated.fleet_grid import FleetGrid  # noqa: E402
+from fcslam.federated.fleet_server import FleetApp  # noqa: E402
+from fcslam.federated.held_out import judge  # noqa: E402
+from fcslam.federated.identity import ROBOT_HEADER, RobotAuthenticator  # noqa: E402
+from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
+from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
+from fcslam.federated.own_examples import SPLIT_FILE, own_examples  # noqa: E402
+from fcslam.federated.robot_learning import BusyRobotError, Idleness, LearningEndError, LearningRobot, checked_lessons  # noqa: E402
+from fcslam.records import Channel, Place, frozen  # noqa: E402
+from fcslam.robot.backend import RobotBackend  # noqa: E402
+from fcslam.robot.beside import Inline  # noqa: E402
+from fcslam.robot.frontend import RobotConfig, RobotFrontend  # noqa: E402
+from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes  # noqa: E402
+from fcslam.wire.batches import write_batch  # noqa: E402
+from fcslam.wire.messages import Packet, TaughtPlace  # noqa: E402
+from fcslam.wire.packets import decode, encode  # noqa: E402
+from tests.robot.test_views import records_of  # noqa: E402
+from tests.wire.examples import ACKNOWLEDGEMENT, TAUGHT_PLACE, packet  # noqa: E402
 
+CODE_LAYER, POINT_BIAS = "body.code_head.0.0.weight", "body.refine.4.bias"
 SETTINGS = RobotLearningSettings(held_out=HeldOutSettings(side_m=3.0))
 
 
@@ -75,6 +80,26 @@ def test_taught_codes_are_at_the_pixels_of_their_keypoints(driven):
         right += [own[tuple(pixel)] == code.tobytes() for pixel, code in given]
     assert np.mean(right) > 0.99
     assert not own_examples(folder, SETTINGS, taught, 5).revisits.taught, "those of another start"
+
+
+@pytest.mark.slow
+def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
+    (driven[0] / SPLIT_FILE).unlink(missing_ok=True)
+    held_out = own_examples(driven[0], SETTINGS, (), 0).held_out
+    start = read_detector_weights(BUNDLED_NETWORK, "light")
+    scale = np.random.default_rng(1).standard_normal(start[CODE_LAYER].shape) * start[CODE_LAYER].std()
+    others = {"noisy": {CODE_LAYER: start[CODE_LAYER] + np.float32(2.0) * scale.astype(np.float32)},
+              "blind": {POINT_BIAS: start[POINT_BIAS] - np.float32(100.0)}}  # fmt: skip
+    rows = {
+        name: judge(weights_to_network({**start, **changed}, "light"), held_out, torch.device("cpu"))
+        for name, changed in {"bundled": {}, **others}.items()
+    }
+    assert len(rows["bundled"]) == len(held_out.revisits) > 0
+    recall = {name: float(each[:, 0].mean()) for name, each in rows.items()}
+    assert recall["bundled"] > 0.3
+    assert recall["noisy"] < 0.7 * recall["bundled"]
+    assert recall["blind"] == 0.0
+    assert np.nansum(rows["blind"][:, 1]) == 0.0
 
 
 @pytest.mark.slow
