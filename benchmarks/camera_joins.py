@@ -100,7 +100,7 @@ def summary(rows: Sequence[tuple], networks: Sequence[str]) -> Iterator[tuple]:
         gap = mean_interval(first - driven, np.random.default_rng(1))
         yield (
             name, f"{sum(row[2] == 1 for row in own)} of {len(own)}", sum(row[3] for row in own),
-            sum(row[4] for row in own), float(np.median(driven)), f"{gap.mean:+.1f} [{gap.low:+.1f}, {gap.high:+.1f}]",
+            sum(row[4] for row in own), float(driven.mean()), f"{gap.mean:+.1f} [{gap.low:+.1f}, {gap.high:+.1f}]",
             100.0 * float(gap.mean / first.mean()),
         )  # fmt: skip
 

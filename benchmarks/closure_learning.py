@@ -8,7 +8,7 @@ same three kinds of light, among other furniture. Each training fleet is mapped 
 come from estimated poses (`learning/revisits.py`, `cloud/teaching.py`). True poses serve the evaluation only.
 
 All networks start from the bundled one. Robots train the layers of the codes (`learning/code_training.py`), on pairs of
-their own keyframes that show the same points of their map. Federated arms have every robot of every building as a
+their own keyframes that show the same points of their map; in one arm also those of the keypoints. Federated arms have every robot of every building as a
 client, and a sixth of them trains in a round. Central training has as many steps as all robots together, and a robot
 alone as many as one that trains in every round.
 
@@ -30,7 +30,7 @@ places, corrected, NMS 8 px; it needs FCSLAM_DATA.
 All seeds were fixed before the first run. The recipe was chosen on networks that were trained in buildings 301 to 310
 and measured in 501 to 503 and 511 to 514. --keep resumes by arm, seed and building; networks and mapped drives stay in
 FOLDER, and drives are mapped again only if their file is removed. It needs a GL library, and with the default size some
-50 minutes of one core.
+three hours of one core.
 """
 
 import pickle

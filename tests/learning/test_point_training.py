@@ -13,7 +13,7 @@ from fcslam.federated.codec import weights_to_network  # noqa: E402
 from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.local_training import LocalTrainingPlan, layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.point_training import LOSS, train_points, voted_targets  # noqa: E402
+from fcslam.learning.point_training import LOST_FACTOR, train_points, voted_targets  # noqa: E402
 from fcslam.learning.revisit_batches import FEWEST_VOTED, VOTED_VIEWS, RevisitExamples, VotedImage, draw_voted, vote  # noqa: E402
 from fcslam.learning.revisits import Sightings  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
@@ -72,12 +72,30 @@ def test_only_the_layers_of_the_keypoints_change(encoder, voted):
 def test_targets_move_the_voted_keypoints_alone():
     initial = np.full((1, 32, 32), 0.01, np.float32)
     image = VotedImage(0, np.array([[8.2, 7.9], [20.0, 20.0], [0.0, 31.0]], np.float32), np.array([True, False, True]))
-    found = voted_targets(initial, [image])[0]
+    found = voted_targets(initial, [image], (0, 0))[0]
     assert found[7:10, 7:10].sum() == pytest.approx(1.0)
-    assert found[19:22, 19:22] == pytest.approx(0.01 * LOSS)
+    assert found[19:22, 19:22] == pytest.approx(0.01 * LOST_FACTOR)
     assert found[30:, :2] == pytest.approx(0.01 * 20.0)  # a corner: four pixels, and no gain beyond the largest
     assert np.count_nonzero(found != initial[0]) == 9 + 9 + 4
     assert (initial == np.float32(0.01)).all()
+    shifted = voted_targets(initial[:, 6:, 3:], [image], (6, 3))[0]  # without the last point
+    assert shifted[1:4, 4:7].sum() == pytest.approx(1.0)
+    assert np.count_nonzero(shifted != np.float32(0.01)) == 9 + 9
+
+
+@pytest.mark.parametrize("step", range(5))
+def test_without_a_vote_the_initial_network_stays(light, step):
+    """Steps shift the grid of cells, each in another way."""
+    nobody = VotedImage(0, np.empty((0, 2), np.float32), np.empty(0, bool))
+    plan = LocalTrainingPlan(step, 1)
+    done = train_points(light, RevisitExamples([IMAGE], voted=[nobody]), SMALL, plan, CPU)
+    voted_on = VotedImage(0, np.array([[40.0, 40.0]], np.float32), np.array([True]))
+    moved = train_points(light, RevisitExamples([IMAGE], voted=[voted_on]), SMALL, plan, CPU)
+    still, pull = (
+        sum(float(value.abs().sum()) for name, value in each.optimiser_state.items() if name.endswith("exp_avg"))
+        for each in (done, moved)
+    )
+    assert still < 0.05 * pull
 
 
 def test_votes_need_enough_views_and_agreement():

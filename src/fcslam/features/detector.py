@@ -157,7 +157,7 @@ class OnnxDetector:
         height, width = image.shape
         if not image.size:
             return np.empty(image.shape, np.float32), np.zeros((CODE_BITS, 1, 1), np.float32)
-        scores, logits = self._run(_padded(image))
+        scores, logits = self._run(padded(image))
         return scores[:height, :width], logits
 
     def _find(self, image: GreyImage) -> tuple[Keypoints, Logits]:
@@ -218,8 +218,8 @@ def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     return session, dict(session.get_modelmeta().custom_metadata_map)
 
 
-def _padded(image: GreyImage) -> GreyImage:
+def padded(image: GreyImage) -> GreyImage:
     """Pad an image (H, W) by reflection at the lower and right edge to whole cells."""
     height, width = image.shape
-    padded = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REFLECT_101)
-    return np.asarray(padded, np.uint8)
+    whole = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REFLECT_101)
+    return np.asarray(whole, np.uint8)

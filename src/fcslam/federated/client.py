@@ -85,7 +85,7 @@ class RobotClient:
     images_settings: TrainingSettings | None = None
     """Settings with which the images were read; None if they were given."""
     revisits: RevisitExamples = field(default_factory=RevisitExamples)
-    """Points that were seen again, on which codes are trained alone."""
+    """Points that were seen again, on which ``codes`` and ``heads`` are trained."""
     inputs: CodeInputs = field(default_factory=CodeInputs)
     """Of the images of ``revisits``."""
     held_out: HeldOutPairs = field(default_factory=HeldOutPairs)

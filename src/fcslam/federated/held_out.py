@@ -11,20 +11,20 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fcslam.cloud.teaching import PlacePoints
 from fcslam.features.codes import Matches, mutual_matches
-from fcslam.features.detector import ImageFeatures
+from fcslam.features.dense import find_peaks, sample_codes
+from fcslam.features.detector import ImageFeatures, OnnxConfig
+from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.revisits import Keyframe, revisits_in_map
-from fcslam.learning.validation import detect
+from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
 from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.motions import MotionConfig
 from fcslam.records import FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")
-"""Of what a robot reports about each pair: the share of the shared keypoints that match, and whether the pair is more
+"""Of what a robot reports about each pair: right matches as a share of the shared points, and whether the pair is more
 similar than any two keyframes of different places."""
 APART_M: Final = 8.0
 """Keyframes farther apart than this show different places."""
@@ -32,8 +32,6 @@ MOST_APART: Final = 300
 """Pairs of keyframes of different places that are compared."""
 MOST_PAIRS: Final = 1000
 """Pairs that a robot reports on."""
-SAME_PX: Final = 3.0
-"""A version finds a shared point if it has a keypoint within this of it."""
 
 Judgement = NDArray[np.float32]
 """Shape (P, 2): a row for each pair, by ``COLUMNS``; a place is found (1), not found (0), or NaN without others."""
@@ -44,30 +42,33 @@ class HeldOutPairs:
     """The pairs on which versions are compared."""
 
     frames: Sequence[Keyframe] = field(default=())
-    revisits: Sequence[tuple[int, int, NDArray[np.int64]]] = field(default=())
-    """Numbers of two frames that show the same place, and of their keypoints that are the same points, (M, 2)."""
+    revisits: Sequence[tuple[int, int, int]] = field(default=())
+    """Numbers of two frames that show the same place, and how many of their keypoints are the same points."""
+    T_own_base: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    """Estimated poses of the frames in the robot's map, shape (K, 3)."""
     apart: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
     """Numbers of two frames that show different places, shape (N, 2)."""
 
     @classmethod
     def of(cls, frames: Sequence[Keyframe], T_own_base: FloatArray) -> "HeldOutPairs":
         """Of keyframes that are held out, at their estimated poses in the robot's map, shape (N, 3)."""
-        revisits = revisits_in_map(frames, T_own_base).pairs
+        revisits = [(i, j, len(rows)) for i, j, rows in revisits_in_map(frames, T_own_base).pairs]
         chosen = np.linspace(0, len(revisits) - 1, min(len(revisits), MOST_PAIRS)).astype(int)
         first, second = np.triu_indices(len(frames), 1)
         distances = np.hypot(*(T_own_base[first, :2] - T_own_base[second, :2]).T)
         far = np.flatnonzero(distances > APART_M)
         far = far[np.linspace(0, len(far) - 1, min(len(far), MOST_APART)).astype(int)]
-        return cls(frames, [revisits[k] for k in chosen], np.column_stack((first[far], second[far])))
+        return cls(frames, [revisits[k] for k in chosen], T_own_base, np.column_stack((first[far], second[far])))
 
 
 @torch.inference_mode()
 def judge(network: KeypointNetwork, pairs: HeldOutPairs, device: torch.device) -> Judgement:
-    """Judge the keypoints and codes that a network finds in the frames, by the points that these share."""
+    """Judge the keypoints and codes that a network finds in the frames."""
     frames = [_described(network, frame, device) for frame in pairs.frames]
-    nearest = [_nearest(frame, new) for frame, new in zip(pairs.frames, frames, strict=True)]
+    between = [se2.between(pairs.T_own_base[i], pairs.T_own_base[j]) for i, j, _ in pairs.revisits]
     found = [
-        _right(frames[i], frames[j], nearest[i][rows[:, 0]], nearest[j][rows[:, 1]]) for i, j, rows in pairs.revisits
+        _recall(frames[i], frames[j], T_i_j, shared)
+        for (i, j, shared), T_i_j in zip(pairs.revisits, between, strict=True)
     ]
     same = [_inliers(frames[i], frames[j]) for i, j, _ in pairs.revisits]
     other = [_inliers(frames[i], frames[j]) for i, j in pairs.apart.tolist()]
@@ -104,27 +105,22 @@ def same_pairs(first: Mapping[str, Judgement], second: Mapping[str, Judgement]) 
 
 
 def _described(network: KeypointNetwork, frame: Keyframe, device: torch.device) -> Keyframe:
-    """The frame with the keypoints and codes of the network."""
-    grey = torch.from_numpy(frame.image.astype(np.float32) / 255.0)[None, None].to(device)
-    points, codes = detect(network, grey)
-    features = ImageFeatures(
-        frozen(points, np.float32), frozen(np.empty(len(points)), np.float32), frozen(codes, np.uint8)
-    )
+    """The frame with the keypoints and codes of the network, found as robots do."""
+    config = OnnxConfig()
+    maps = network(torch.from_numpy(frame.image.astype(np.float32) / 255.0)[None, None].to(device))
+    scores = network.scores(maps)[0].cpu().numpy()
+    points, strengths = find_peaks(scores, config.least_score, config.nms_px, config.most_features)
+    codes = sample_codes(maps.code_logits[0].cpu().numpy(), points)
+    features = ImageFeatures(frozen(points, np.float32), frozen(strengths, np.float32), frozen(codes, np.uint8))
     return Keyframe.of(frame.image, features, frame.camera, frame.surroundings)
 
 
-def _nearest(frame: Keyframe, new: Keyframe) -> NDArray[np.int64]:
-    """The new keypoint at each keypoint of the frame, shape (K,); -1 where there is none within ``SAME_PX``."""
-    if not len(new.features.keypoints_px):
-        return np.full(len(frame.features.keypoints_px), -1)
-    gaps, rows = cKDTree(new.features.keypoints_px).query(frame.features.keypoints_px)
-    return np.where(np.asarray(gaps) <= SAME_PX, rows, -1)
-
-
-def _right(a: Keyframe, b: Keyframe, first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
-    """Share of the shared points whose keypoints, -1 where there is none, are each other's nearest by their codes."""
+def _recall(a: Keyframe, b: Keyframe, T_a_b: FloatArray, shared: int) -> float:
+    """Keypoints that are the same points by the poses and match by their codes, as a share of the points that both
+    frames are known to show; at most 1."""
     matched = {(i, j) for i, j in mutual_matches(a.features.descriptors, b.features.descriptors).pairs.tolist()}
-    return sum(pair in matched for pair in zip(first.tolist(), second.tolist(), strict=True)) / len(first)
+    right = sum((i, j) in matched for i, j in correspond(a, b, T_a_b).rows.tolist())
+    return min(right / shared, 1.0)
 
 
 def _inliers(a: Keyframe, b: Keyframe) -> int:

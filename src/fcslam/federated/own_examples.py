@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.features.detector import GreyImage, decode_grey
+from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.federated.held_out import HeldOutPairs
 from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings
 from fcslam.geometry import se2
@@ -70,8 +70,10 @@ def own_examples(
 
 
 def _picture(frame: KeptKeyframe, version: str) -> GreyImage | None:
-    """The image of a keyframe that the present detector described; None for another one, or if it is broken."""
-    return decode_grey(frame.image.encoded) if frame.detector_version == version else None
+    """The image of a keyframe that the present detector described, in whole cells; None for another one, or if it is
+    broken."""
+    picture = decode_grey(frame.image.encoded) if frame.detector_version == version else None
+    return None if picture is None else padded(picture)
 
 
 def _split(path: Path, frames: Sequence[KeptKeyframe], settings: HeldOutSettings) -> list[bool]:

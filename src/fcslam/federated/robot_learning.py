@@ -121,7 +121,8 @@ class LearningRobot:
         revisits = examples.revisits
         tell(
             f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own, "
-            f"{len(revisits.taught)} taught; {len(examples.held_out.revisits)} pairs held out"
+            f"{len(revisits.taught)} taught, {len(revisits.voted)} with voted keypoints; "
+            f"{len(examples.held_out.revisits)} pairs held out"
         )
 
 

@@ -62,7 +62,11 @@ class FederatedSettings(Settings):
     """Settings of a federated training run."""
 
     rounds: int = Field(default=200, ge=1, description="number of rounds of local training and aggregation")
-    local_steps: int = Field(default=10, ge=1, description="optimiser steps of each robot in a round")
+    local_steps: int = Field(
+        default=10,
+        ge=1,
+        description="optimiser steps of each robot in a round; with trained: heads, so many for each head",
+    )
     judge_every: int = Field(
         default=5,
         ge=1,
@@ -140,7 +144,7 @@ class FederatedSettings(Settings):
         return self
 
     @model_validator(mode="after")
-    def _codes_leave_statistics(self) -> Self:
+    def _revisits_leave_statistics(self) -> Self:
         if self.on_revisits and self.normalisation != "frozen":
             raise ValueError(
                 "batch statistics belong to the keypoints too; set normalisation to frozen, or trained to all"

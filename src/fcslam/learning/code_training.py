@@ -42,17 +42,24 @@ class CodeInputs:
 
     _frozen: dict[str, Tensor] = field(default_factory=dict)
     _inputs: Tensor | None = None
+    _seed: int | None = None
 
-    def of(self, network: KeypointNetwork, images: Sequence[GreyImage], seed: int, device: torch.device) -> Tensor:
-        """Shape (K + V, C, H/8, W/8), float16, for K images and the V views of ``draw_views``; always of the same."""
+    def of(
+        self, network: KeypointNetwork, images: Sequence[GreyImage], seed: int | None, device: torch.device
+    ) -> Tensor:
+        """Shape (K + V, C, H/8, W/8), float16, for K images, always the same, and the V views of ``draw_views``.
+
+        ``seed`` is that of the views; None for none.
+        """
         heads = layer_names(network, (*network.code_layers, *network.point_layers))
         frozen = {name: value for name, value in network.state_dict().items() if name not in heads}
         is_same = self._frozen.keys() == frozen.keys() and all(
             torch.equal(value, self._frozen[name]) for name, value in frozen.items()
         )
-        if self._inputs is None or not is_same:
+        if self._inputs is None or self._seed != seed or not is_same:
+            self._seed = seed
             self._frozen = {name: value.clone() for name, value in frozen.items()}
-            parts, shown = [], [*images, *draw_views(images, seed)]
+            parts, shown = [], [*images, *(() if seed is None else draw_views(images, seed))]
             for k in range(0, len(shown), _IMAGES_AT_ONCE):
                 grey = np.stack(shown[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
                 with torch.no_grad():
@@ -95,7 +102,7 @@ def train_codes(
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
     freeze_all_but(network, layer_names(network, network.code_layers))
-    known = inputs.of(network, revisits.images, settings.seed, device)
+    known = inputs.of(network, revisits.images, settings.seed if plan.compatible else None, device)
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
     proximal = proximal_term(network, plan)
     optimiser = continued_optimiser(network, optimiser_state)

@@ -121,7 +121,7 @@ class LightBody(nn.Module):
 
     @property
     def point_layers(self) -> tuple[nn.Module, ...]:
-        """As in ``KeypointNetwork``; without ``context_eighth``, by which training of the codes leaves keypoints."""
+        """As in ``KeypointNetwork``; ``context_eighth`` is left out: by it, training of the codes keeps keypoints."""
         return self.context_quarter, self.point_head, self.refine
 
     def code_inputs(self, image: Tensor) -> Tensor:

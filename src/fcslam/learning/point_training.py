@@ -1,7 +1,7 @@
-"""Training of the keypoints alone, on which of them other views of a robot's own map show again.
+"""Training of the keypoints alone, by votes: whether other views of the robot's own map find a keypoint again.
 
-Keypoints that are found again become more probable than with the initial network, and those that never are, less. All
-other pixels keep their probability. The layers of the codes stay as they are.
+Keypoints that most views find become more probable than with the initial network, and those that hardly any finds,
+less. All other pixels keep their probability. The layers of the codes stay as they are.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ from fcslam.records import FloatArray
 
 MOST_GAIN: Final = 20.0
 """Largest factor by which a keypoint that is found again becomes more probable; it never exceeds 1."""
-LOSS: Final = 0.05
+LOST_FACTOR: Final = 0.05
 """Factor by which one that is not becomes less probable."""
 
 
@@ -72,11 +72,13 @@ def train_points(
     freeze_all_but(network, layer_names(network, network.point_layers))
     proximal = proximal_term(network, plan)
     optimiser = continued_optimiser(network, optimiser_state)
+    # The state may be that of the training of the codes, without moments of these layers.
+    is_new = not any(optimiser.state.get(value) for value in network.parameters() if value.requires_grad)
     sums = {"found again": 0.0}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
         for group in optimiser.param_groups:
-            group["lr"] = local_rate(settings, step, done, optimiser_state is None)
+            group["lr"] = local_rate(settings, step, done, is_new)
         voted = draw_voted(revisits, settings.seed, step)
         grey = np.stack([revisits.images[each.image] for each in voted]).astype(np.float32) / 255.0
         images = torch.from_numpy(grey).unsqueeze(1).to(device).contiguous(memory_format=torch.channels_last)
@@ -84,10 +86,10 @@ def train_points(
             logits = network(images).point_logits
             with torch.no_grad():
                 initial = before(images).point_logits
-        targets = torch.from_numpy(voted_targets(_probabilities(initial), voted)).to(device)
-        valid = torch.ones_like(targets, dtype=torch.bool)
         shift = grid_shift(settings.encoder, settings.seed, step)
-        loss = detector_loss(*shift_grid((logits.float(), targets, valid), shift))
+        logits, initial = shift_grid((logits.float(), initial.float()), shift)
+        wanted = voted_targets(np.asarray(cell_probabilities(initial).cpu()), voted, shift)
+        loss = detector_loss(logits, torch.from_numpy(wanted).to(device), torch.ones_like(logits, dtype=torch.bool))
         total = loss if proximal is None else loss + proximal.loss(network)
         descend(network, optimiser, total, step)
         sums["found again"] += float(loss.detach())
@@ -95,18 +97,18 @@ def train_points(
     return local_result(network, optimiser, sums, plan)
 
 
-def voted_targets(probabilities: FloatArray, voted: Sequence[VotedImage]) -> FloatArray:
+def voted_targets(probabilities: FloatArray, voted: Sequence[VotedImage], shift: tuple[int, int]) -> FloatArray:
     """The probabilities (B, H, W) that the network should give, from the initial ones and the votes on B images.
 
-    A keypoint is what lies within a pixel of it.
+    A keypoint is what lies within a pixel of it. The maps begin ``shift`` rows and columns into the images.
     """
     targets = probabilities.copy()
+    height, width = targets.shape[1:]
     for target, image in zip(targets, voted, strict=True):
-        for (x, y), is_found in zip(np.rint(image.points).astype(int).tolist(), image.is_found.tolist(), strict=True):
+        pixels = np.rint(image.points).astype(int) - shift[::-1]
+        for (x, y), is_found in zip(pixels.tolist(), image.is_found.tolist(), strict=True):
+            if not (0 <= x < width and 0 <= y < height):
+                continue
             window = target[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-            window *= np.clip(1.0 / max(window.sum(), 1e-9), 1.0, MOST_GAIN) if is_found else LOSS
+            window *= np.clip(1.0 / max(window.sum(), 1e-9), 1.0, MOST_GAIN) if is_found else LOST_FACTOR
     return targets
-
-
-def _probabilities(logits: Tensor) -> FloatArray:
-    return np.asarray(cell_probabilities(logits.float()).cpu())

@@ -1,4 +1,4 @@
-"""Rehearsal: views of a robot's own images as it never sees them, in which the codes have to stay as they were.
+"""Distillation on distorted views of a robot's own images: there the codes stay those of the initial network.
 
 A robot that trains on one building forgets others. Random homographies and light carry its images far from what it
 sees. There the network that training started from is the teacher (Li and Hoiem, "Learning without forgetting", 2016).

@@ -66,7 +66,7 @@ class VotedImage:
     points: Points
     """Shape (M, 2), pixels."""
     is_found: NDArray[np.bool_]
-    """Shape (M,): found again in most views that show the point, or in hardly any."""
+    """Shape (M,). True: at least half of the views that show the point find it again. False: at most a quarter do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

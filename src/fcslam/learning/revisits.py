@@ -175,13 +175,15 @@ def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Revis
         for k in np.flatnonzero(near).tolist():
             j, T_first_second = i + 1 + k, between[k]
             rows, shown_there = correspond(first, frames[j], T_first_second)
-            if not len(rows):  # nothing fits, so whoever is not found is not missing either
-                continue
-            shown_here = predict(frames[j], first, se2.inverse(T_first_second))[1]
-            for number, mask, column in ((i, shown_there, rows[:, 0]), (j, shown_here, rows[:, 1])):
-                mask[column] = True
+            back, shown_here = correspond(frames[j], first, se2.inverse(T_first_second))
+            # A keypoint without a position is found only from the other side.
+            for number, mask, ours, theirs in (
+                (i, shown_there, rows[:, 0], back[:, 1]), (j, shown_here, back[:, 0], rows[:, 1]),
+            ):  # fmt: skip
+                seen = np.union1d(ours, theirs)
+                mask[seen] = True
                 shown[number] += mask
-                found[number][column] += 1
+                found[number][seen] += 1
             if len(rows) >= FEWEST_SHARED:
                 pairs.append((i, j, rows))
     return Revisits(pairs, [Sightings(*each) for each in zip(shown, found, strict=True)])

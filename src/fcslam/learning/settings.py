@@ -52,7 +52,7 @@ class LossSettings(Settings):
     keypoints: float = Field(
         default=100.0,
         ge=0.0,
-        description="weight of the loss that leaves keypoints where they are while robots train codes alone",
+        description="weight of the loss that leaves keypoints where they are while the layers of the codes are trained",
     )
 
 
