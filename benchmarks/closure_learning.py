@@ -8,9 +8,9 @@ same three kinds of light, among other furniture. Each training fleet is mapped 
 come from estimated poses (`learning/revisits.py`, `cloud/teaching.py`). True poses serve the evaluation only.
 
 All networks start from the bundled one. Robots train the layers of the codes (`learning/code_training.py`), on pairs of
-their own keyframes that show the same points of their map; in one arm also those of the keypoints. Federated arms have every robot of every building as a
-client, and a sixth of them trains in a round. Central training has as many steps as all robots together, and a robot
-alone as many as one that trains in every round.
+their own keyframes that show the same points of their map; in one arm also those of the keypoints. Federated arms have
+every robot of every building as a client, and a sixth of them trains in a round. Central training has as many steps as
+all robots together, and a robot alone as many as one that trains in every round.
 
 - homographies: as many pairs, each of two views of one image under a random homography, federated
 - own map: pairs of each robot's own keyframes, federated

@@ -246,9 +246,10 @@ def test_sets(vision: Path) -> Iterator[tuple[str, PlaceSet, Path]]:
     tour = read_place_set(vision / CORRIDOR)
     numbers, trained = np.array([int(path.stem) for path in tour.queries]), np.unique(trained_pairs(vision / CORRIDOR))
     first, second = TRAINED_PAIRS
+    is_new = (numbers > first) & ~np.isin(numbers, trained)
     yield (
         "corridor, later part",
-        restricted(tour, numbers > second, (numbers > first) & ~np.isin(numbers, trained)),
+        restricted(tour, numbers > second, is_new),
         vision / CORRIDOR,
     )
     tower = read_place_set(vision / TOWER, UNSEEN_FLOORS)

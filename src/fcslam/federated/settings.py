@@ -65,7 +65,7 @@ class FederatedSettings(Settings):
     local_steps: int = Field(
         default=10,
         ge=1,
-        description="optimiser steps of each robot in a round; with trained: heads, so many for each head",
+        description="optimiser steps of each robot in a round; of each head, with trained: heads",
     )
     judge_every: int = Field(
         default=5,
