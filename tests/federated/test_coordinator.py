@@ -81,6 +81,14 @@ def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
     assert not same(state.weights, TRAINED)
 
 
+def test_the_length_of_the_last_updates_is_kept_for_the_next_round(tmp_path):
+    state, _ = run([Fake("a", 1.0), Fake("b", 1.0)], tmp_path, settings(rounds=2, server_momentum=0.0))
+    trained = [name for name in START if not name.endswith(("running_mean", "running_var"))]
+    assert state.update_length == pytest.approx(np.sqrt(sum(START[name].size for name in trained)), rel=1e-6)
+    again, _ = run([Fake("a", 1.0), Fake("b", 1.0)], tmp_path, settings(rounds=2, server_momentum=0.0))
+    assert again.update_length == state.update_length
+
+
 @pytest.mark.parametrize(("robots", "most"), [(1, 0.0), (2, 0.5), (4, 0.75)])
 def test_momentum_goes_no_further_than_all_robots_one_after_another(robots, most, tmp_path):
     def end(share):

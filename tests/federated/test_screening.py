@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.federated.screening import agreements, screen, statistics_distances
+from fcslam.federated.screening import agreements, screen, statistics_distances, update_length
 from fcslam.federated.settings import ScreeningSettings
 from fcslam.federated.weights import apply_update, trained_names, update_vector, weights_error
 
@@ -52,6 +52,22 @@ def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind, settings):
     refused = screen(answers, BEFORE, settings)
     assert set(refused) == {"bad"}
     assert refused["bad"]
+
+
+def test_a_majority_of_long_updates_is_refused_by_the_lengths_of_the_round_before():
+    good = honest(99)["convolution.weight"] - BEFORE["convolution.weight"]
+    long = BEFORE | {"convolution.weight": (BEFORE["convolution.weight"] - 10.0 * good).astype(np.float32)}
+    answers = {f"robot{seed}": honest(seed) for seed in range(2)} | dict.fromkeys(("bad1", "bad2", "bad3"), long)
+    usual = update_length({"a": honest(1), "b": honest(2)}, BEFORE)
+    assert set(screen(answers, BEFORE, ScreeningSettings(), earlier_length=usual)) == {"bad1", "bad2", "bad3"}
+    assert set(screen(answers, BEFORE, ScreeningSettings())) == {"robot0", "robot1"}, "the round alone cannot know"
+
+
+def test_the_round_before_sets_no_bound_where_all_updates_are_longer():
+    answers = {f"robot{seed}": honest(seed) for seed in range(5)}
+    usual = update_length(answers, BEFORE)
+    assert not screen(answers, BEFORE, ScreeningSettings(), earlier_length=0.01 * usual)
+    assert update_length({}, BEFORE) == 0.0
 
 
 @pytest.mark.parametrize(

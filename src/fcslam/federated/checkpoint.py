@@ -46,6 +46,8 @@ class CoordinatorState:
     """How often each robot was asked to train: an upper bound of the updates that have left it."""
     origin: str
     """Detector version of the initial weights."""
+    update_length: float = 0.0
+    """Median norm of the updates of the last round, by which those of the next one are screened; 0 before the first."""
 
     @classmethod
     def at_start(cls, initial: Weights, version: str, scores: Mapping[Evaluator, float]) -> Self:
@@ -72,6 +74,7 @@ def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings
         "best_round": state.best_round,
         "asked": dict(state.times_asked),
         "origin": state.origin,
+        "update_length": state.update_length,
     }
     tensors = {
         f"{group}/{name}": torch.from_numpy(np.asarray(array, order="C"))
@@ -124,6 +127,7 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
             groups["memory"],
             {str(robot): int(rounds) for robot, rounds in header["asked"].items()},
             str(header["origin"]),
+            float(header.get("update_length", 0.0)),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(

@@ -34,7 +34,7 @@ from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, PAIRS_KEY, reply_m
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.registry import RobotRegistry, sample_robots
 from fcslam.federated.replies import RoundReplies, printable_line, read_replies
-from fcslam.federated.screening import screen
+from fcslam.federated.screening import screen, update_length
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.strategies import Aggregator, StrategyFactory
 from fcslam.federated.weights import Weights, interpolate_weights
@@ -138,7 +138,8 @@ class Coordinator:
         comparison = self._evaluate(candidate, state, replies)
         decision = self._decide(comparison, state)
 
-        following = self._next_state(trained, weights, candidate.weights, comparison, decision)
+        length = update_length(replies.weights, sent.weights)
+        following = self._next_state(trained, weights, candidate.weights, comparison, decision, length)
         privacy = self._settings.privacy
         report = RoundReport(
             round_number=following.rounds_done,
@@ -183,7 +184,8 @@ class Coordinator:
         messages = self._grid.send_and_receive(requests, timeout=self._settings.deadline_s)
         replies = read_replies(messages, {connected[robot]: robot for robot in chosen}, model)
         frozen = self._settings.normalisation == "frozen"
-        for robot, reason in screen(replies.weights, model.weights, self._settings.screening, frozen).items():
+        refused = screen(replies.weights, model.weights, self._settings.screening, frozen, state.update_length)
+        for robot, reason in refused.items():
             replies.leave_out(robot, reason)
         duplicates = self._robots.duplicates
         replies.add_notes({f"another {robot}": "two of one name are there, one is not asked" for robot in duplicates})
@@ -255,6 +257,7 @@ class Coordinator:
         average: Weights,
         comparison: VersionComparison,
         decision: Decision,
+        length: float,
     ) -> CoordinatorState:
         """The state after the round; ``state`` is the one in which the robots were asked."""
         number = state.rounds_done + 1
@@ -270,6 +273,7 @@ class Coordinator:
             strategy_state=self._aggregator.state,
             times_asked=state.times_asked,
             origin=state.origin,
+            update_length=length,
         )
 
     def _measure(self, model: GlobalModel, round_number: int) -> Mapping[Evaluator, Metrics]:

@@ -15,12 +15,19 @@ SMALLEST_MEDIAN: Final = 3
 """Least number of updates of which one can be recognised as an outlier."""
 WORST_CHANNEL: Final = 8.0
 """A channel may be as many times as far from the median as all channels together."""
+LONGER_THAN_BEFORE: Final = 2.0
+"""The limit of an update's length by those of the round before is so many times that by those of its own round: they
+grow at the start of training. It holds where most of a round's updates are poisoned."""
 BATCH_NORM_EPSILON: Final = 1e-5
 """Added to variances by batch normalisation."""
 
 
 def screen(
-    updates: Mapping[str, Weights], sent: Weights, settings: ScreeningSettings, frozen: bool = False
+    updates: Mapping[str, Weights],
+    sent: Weights,
+    settings: ScreeningSettings,
+    frozen: bool = False,
+    earlier_length: float = 0.0,
 ) -> dict[str, str]:
     """The reasons why updates are refused, by robot.
 
@@ -33,6 +40,7 @@ def screen(
         sent: weights that all robots trained from.
         settings: the thresholds.
         frozen: batch statistics must come back unchanged.
+        earlier_length: ``update_length`` of the round before; 0 if there is none.
     """
     refused = {robot: reason for robot, weights in updates.items() if (reason := weights_error(weights, sent))}
     parameters = trained_names(sent, frozen_statistics=True)
@@ -40,11 +48,18 @@ def screen(
     for robot in [robot for robot in updates if frozen and robot not in refused]:
         if any(not np.array_equal(updates[robot][name], sent[name]) for name in statistics):
             refused[robot] = "batch statistics that were to stay as they are have changed"
-    for names in (parameters, statistics):
+    for names, earlier in ((parameters, earlier_length), (statistics, 0.0)):
         rest = _vectors(updates, sent, names, refused)
-        refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), settings)
+        refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), earlier, settings)
     refused |= _odd_statistics(updates, refused, settings)
     return refused | _disagreeing(_vectors(updates, sent, parameters, refused), settings)
+
+
+def update_length(updates: Mapping[str, Weights], sent: Weights) -> float:
+    """Median norm of the accepted updates of a round, without batch statistics; 0 if there is none."""
+    names = trained_names(sent, frozen_statistics=True)
+    lengths = [float(np.linalg.norm(each)) for each in _vectors(updates, sent, names, {}).values()]
+    return float(np.median(lengths)) if lengths else 0.0
 
 
 def _vectors(
@@ -57,13 +72,19 @@ def _vector(weights: Weights, names: Sequence[str]) -> FloatVector:
     return update_vector(weights, {name: np.zeros_like(weights[name]) for name in names}, names)
 
 
-def _too_long(updates: Mapping[str, FloatVector], size: float, settings: ScreeningSettings) -> dict[str, str]:
+def _too_long(
+    updates: Mapping[str, FloatVector], size: float, earlier: float, settings: ScreeningSettings
+) -> dict[str, str]:
     lengths = {robot: float(np.linalg.norm(update)) for robot, update in updates.items()}
     limits = []
     if settings.largest_change is not None:
         limits.append(settings.largest_change * size)
     if settings.longest is not None and len(lengths) >= settings.quorum:
         limits.append(settings.longest * float(np.median(list(lengths.values()))))
+    if settings.longest is not None and earlier > 0.0:
+        bound = LONGER_THAN_BEFORE * settings.longest * earlier
+        if min(lengths.values(), default=0.0) <= bound:  # not if training itself has changed
+            limits.append(bound)
     limit = min(limits, default=np.inf)
     return {
         robot: f"an update of length {length:.3g}, at most {limit:.3g}"

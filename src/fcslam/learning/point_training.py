@@ -74,7 +74,7 @@ def train_points(
     optimiser = continued_optimiser(network, optimiser_state)
     # The state may be that of the training of the codes, without moments of these layers.
     is_new = not any(optimiser.state.get(value) for value in network.parameters() if value.requires_grad)
-    sums = {"found again": 0.0}
+    sums = {"votes": 0.0}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
         for group in optimiser.param_groups:
@@ -92,7 +92,7 @@ def train_points(
         loss = detector_loss(logits, torch.from_numpy(wanted).to(device), torch.ones_like(logits, dtype=torch.bool))
         total = loss if proximal is None else loss + proximal.loss(network)
         descend(network, optimiser, total, step)
-        sums["found again"] += float(loss.detach())
+        sums["votes"] += float(loss.detach())
         on_step(done)
     return local_result(network, optimiser, sums, plan)
 
