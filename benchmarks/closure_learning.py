@@ -113,7 +113,7 @@ ARMS = ("bundled", "homographies", "own map", "keypoints too", "closures", "pois
 REPEATED = ("own map",)
 """Arms with all training seeds; the others have the first."""
 LATER_DRIVEN = ("bundled", "own map", "keypoints too", "closures")
-"""Arms that are also measured on later drives, with the first training seed."""
+"""Arms that are also measured on later drives."""
 COMPARED = (
     ("own map", "homographies"),
     ("keypoints too", "own map"),
@@ -202,7 +202,7 @@ def main() -> None:
             networks = kept_networks(place, partial(trained, arm, seed, examples, settings))
             forgetting += kept.rows((*key, "photographs"), partial(photograph_rows, arm, seed, networks))
             for on, folders, names in ((UNSEEN, unseen, ROBOTS), (LATER_DRIVES, fleets, LATER)):
-                if on == LATER_DRIVES and (arm not in LATER_DRIVEN or seed != chosen.seeds[0]):
+                if on == LATER_DRIVES and arm not in LATER_DRIVEN:
                     continue
                 for folder in folders:
                     measure = partial(building_row, arm, seed, on, folder, names, networks)
@@ -588,14 +588,14 @@ def shown(values: Sequence[Interval], sign: str = "+") -> list[str]:
     return [f"{each.mean:{sign}.3f} [{each.low:{sign}.3f}, {each.high:{sign}.3f}]" for each in values]
 
 
-def seeds_of(rows: Sequence[tuple], arm: str) -> int:
-    return len({row[1] for row in rows if row[0] == arm})
+def seeds_of(rows: Sequence[tuple], arm: str, on: str) -> int:
+    return len({row[1] for row in rows if row[0] == arm and row[2] == on})
 
 
 def gains(rows: Sequence[tuple], on: str) -> Iterator[tuple]:
     """Every arm less the bundled detector."""
     for arm in dict.fromkeys(row[0] for row in rows if row[2] == on and row[0] != "bundled"):
-        yield arm, seeds_of(rows, arm), *shown(gain(rows, arm, "bundled", on))
+        yield arm, seeds_of(rows, arm, on), *shown(gain(rows, arm, "bundled", on))
 
 
 def differences(rows: Sequence[tuple]) -> Iterator[tuple]:
@@ -603,13 +603,13 @@ def differences(rows: Sequence[tuple]) -> Iterator[tuple]:
     measured = {row[0] for row in rows}
     for arm, other in COMPARED:
         if {arm, other} <= measured:
-            yield f"{arm} - {other}", seeds_of(rows, arm), *shown(gain(rows, arm, other, UNSEEN))
+            yield f"{arm} - {other}", seeds_of(rows, arm, UNSEEN), *shown(gain(rows, arm, other, UNSEEN))
 
 
 def means(rows: Sequence[tuple], on: str) -> Iterator[tuple]:
     for arm in dict.fromkeys(row[0] for row in rows if row[2] == on):
         values = [mean_interval(each, np.random.default_rng(1)) for each in by_building(rows, arm, on).T]
-        yield arm, seeds_of(rows, arm), *shown(values, "")
+        yield arm, seeds_of(rows, arm, on), *shown(values, "")
 
 
 def draw(rows: Sequence[tuple]) -> Figure:
