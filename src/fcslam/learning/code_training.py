@@ -129,7 +129,7 @@ def train_codes(
 
 
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:
-    """What both networks make of inputs of the trained layers, shape (B, C, H/8, W/8)."""
+    """Descriptions by both networks of inputs of the trained layers, shape (B, C, H/8, W/8)."""
     given = inputs.float().contiguous(memory_format=torch.channels_last)
     with torch.autocast(given.device.type, torch.bfloat16):
         described = network.describe(given)

@@ -82,8 +82,8 @@ class Sightings:
     """Those of them in which it is a keypoint again, shape (K,)."""
 
 
-class Revisits(NamedTuple):
-    """What the keyframes of one map show in common."""
+class MapRevisits(NamedTuple):
+    """Points that keyframes of one map share."""
 
     pairs: list[tuple[int, int, NDArray[np.int64]]]
     """The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
@@ -160,7 +160,7 @@ def correspond_predicted(
     return Correspondences(np.column_stack((asked[found], nearest[found])), shown)
 
 
-def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Revisits:
+def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> MapRevisits:
     """Find what keyframes of one map show again, from whatever time.
 
     Args:
@@ -186,7 +186,7 @@ def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Revis
                 found[number][seen] += 1
             if len(rows) >= FEWEST_SHARED:
                 pairs.append((i, j, rows))
-    return Revisits(pairs, [Sightings(*each) for each in zip(shown, found, strict=True)])
+    return MapRevisits(pairs, [Sightings(*each) for each in zip(shown, found, strict=True)])
 
 
 def _offsets_of_alike(
