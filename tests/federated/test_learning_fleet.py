@@ -35,7 +35,7 @@ SETTINGS = {
     "gate": {"fewest_pairs": 20, "margin": 0.5},  # far fewer than 200, which only a test may do
     "teach_every_s": 2.0,
     "federated": {
-        "rounds": 2, "local_steps": 30, "judge_every": 1, "minimum_robots": 3, "compatible": 0.0, "smoothing": 0.0,
+        "rounds": 2, "local_steps": 60, "judge_every": 1, "minimum_robots": 3, "compatible": 0.0, "smoothing": 0.0,
     },
 }  # fmt: skip
 BROKEN_LAYER, NOISE = "body.code_head.0.0.weight", 6.0
@@ -169,5 +169,5 @@ def newest(log):
 
 def taught(log):
     """Whether a robot has learned from codes of others."""
-    learns = [line for line in log.read_text().splitlines() if " taught; " in line]
-    return any(", 0 taught; " not in line for line in learns)
+    learns = [line for line in log.read_text().splitlines() if " taught, " in line]
+    return any(", 0 taught, " not in line for line in learns)
