@@ -18,20 +18,15 @@ from fcslam.features.detector import GreyImage
 from fcslam.learning.local_training import (
     LocalTrainingPlan,
     LocalTrainingResult,
-    continued_optimiser,
-    freeze_all_but,
     layer_names,
-    local_rate,
-    local_result,
     network_from_state,
-    proximal_term,
+    train_layers,
 )
 from fcslam.learning.network import Description, KeypointNetwork
 from fcslam.learning.objective import rehearsal_loss, revisit_objective
 from fcslam.learning.rehearsal import draw_rehearsal, draw_views
 from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.training_step import descend
 
 _IMAGES_AT_ONCE: Final = 8
 
@@ -101,16 +96,10 @@ def train_codes(
         raise TrainingError("codes are trained on places that were seen again, and there are none; set trained to all")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
-    freeze_all_but(network, layer_names(network, network.code_layers))
     known = inputs.of(network, revisits.images, settings.seed if plan.compatible else None, device)
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
-    proximal = proximal_term(network, plan)
-    optimiser = continued_optimiser(network, optimiser_state)
-    sums: dict[str, float] = {}
-    for done in range(1, plan.steps + 1):
-        step = plan.first_step + done - 1
-        for group in optimiser.param_groups:
-            group["lr"] = local_rate(settings, step, done, optimiser_state is None)
+
+    def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
         batch = draw_revisits(revisits, settings.seed, step).to(device)
         described = _described(known[batch.images], network, before)
         total, losses = revisit_objective(*described, batch, settings.loss)
@@ -119,13 +108,9 @@ def train_codes(
             described = _described(known[len(revisits.images) + views.numbers], network, before)
             losses["compatible"] = rehearsal_loss(*described, views.points)
             total = total + plan.compatible * losses["compatible"]
-        if proximal is not None:
-            total = total + proximal.loss(network)
-        descend(network, optimiser, total, step)
-        for name, loss in losses.items():
-            sums[name] = sums.get(name, 0.0) + float(loss.detach())
-        on_step(done)
-    return local_result(network, optimiser, sums, plan)
+        return total, losses
+
+    return train_layers(network, network.code_layers, losses_of, settings, plan, on_step, optimiser_state)
 
 
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:

@@ -16,6 +16,7 @@ from fcslam.learning.training_step import (
     LegacyDetector,
     ProximalTerm,
     create_optimiser,
+    descend,
     get_optimiser_state,
     learning_rate,
     restore_optimiser_state,
@@ -95,6 +96,49 @@ def local_training(
         )
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss)
+        on_step(done)
+    return local_result(network, optimiser, sums, plan)
+
+
+def train_layers(
+    network: KeypointNetwork,
+    layers: Sequence[nn.Module],
+    losses_of: Callable[[int], tuple[Tensor, dict[str, Tensor]]],
+    settings: TrainingSettings,
+    plan: LocalTrainingPlan,
+    on_step: Callable[[int], None] = lambda _steps: None,
+    optimiser_state: Mapping[str, Tensor] | None = None,
+) -> LocalTrainingResult:
+    """Train some layers of a network in place by losses of the caller's, with the batch statistics as they are.
+
+    Args:
+        network: in evaluation mode.
+        layers: to train; all others stay as they are.
+        losses_of: the loss to descend at a step of the whole run, and its parts by name.
+        settings: of the whole run; the learning rate falls towards the end of its steps.
+        plan: which steps are done, and how.
+        on_step: called with the number of steps done.
+        optimiser_state: result of an earlier local training, to continue it. If it is that of other layers, these
+            begin without moments.
+
+    Raises:
+        TrainingError: ``optimiser_state`` belongs to another network, or training diverged.
+    """
+    freeze_all_but(network, layer_names(network, layers))
+    proximal = proximal_term(network, plan)
+    optimiser = continued_optimiser(network, optimiser_state)
+    is_new = not any(optimiser.state.get(value) for value in network.parameters() if value.requires_grad)
+    sums: dict[str, float] = {}
+    for done in range(1, plan.steps + 1):
+        step = plan.first_step + done - 1
+        for group in optimiser.param_groups:
+            group["lr"] = local_rate(settings, step, done, is_new)
+        total, losses = losses_of(step)
+        if proximal is not None:
+            total = total + proximal.loss(network)
+        descend(network, optimiser, total, step)
+        for name, loss in losses.items():
+            sums[name] = sums.get(name, 0.0) + float(loss.detach())
         on_step(done)
     return local_result(network, optimiser, sums, plan)
 

@@ -15,20 +15,14 @@ from fcslam.errors import TrainingError
 from fcslam.learning.local_training import (
     LocalTrainingPlan,
     LocalTrainingResult,
-    continued_optimiser,
-    freeze_all_but,
-    layer_names,
-    local_rate,
-    local_result,
     network_from_state,
-    proximal_term,
+    train_layers,
 )
 from fcslam.learning.losses import detector_loss
 from fcslam.learning.network import cell_probabilities
 from fcslam.learning.objective import grid_shift, shift_grid
 from fcslam.learning.revisit_batches import RevisitExamples, VotedImage, draw_voted
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.training_step import descend
 from fcslam.records import FloatArray
 
 MOST_GAIN: Final = 20.0
@@ -69,16 +63,8 @@ def train_points(
         )
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
-    freeze_all_but(network, layer_names(network, network.point_layers))
-    proximal = proximal_term(network, plan)
-    optimiser = continued_optimiser(network, optimiser_state)
-    # The state may be that of the training of the codes, without moments of these layers.
-    is_new = not any(optimiser.state.get(value) for value in network.parameters() if value.requires_grad)
-    sums = {"votes": 0.0}
-    for done in range(1, plan.steps + 1):
-        step = plan.first_step + done - 1
-        for group in optimiser.param_groups:
-            group["lr"] = local_rate(settings, step, done, is_new)
+
+    def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
         voted = draw_voted(revisits, settings.seed, step)
         grey = np.stack([revisits.images[each.image] for each in voted]).astype(np.float32) / 255.0
         images = torch.from_numpy(grey).unsqueeze(1).to(device).contiguous(memory_format=torch.channels_last)
@@ -90,11 +76,9 @@ def train_points(
         logits, initial = shift_grid((logits.float(), initial.float()), shift)
         wanted = voted_targets(np.asarray(cell_probabilities(initial).cpu()), voted, shift)
         loss = detector_loss(logits, torch.from_numpy(wanted).to(device), torch.ones_like(logits, dtype=torch.bool))
-        total = loss if proximal is None else loss + proximal.loss(network)
-        descend(network, optimiser, total, step)
-        sums["votes"] += float(loss.detach())
-        on_step(done)
-    return local_result(network, optimiser, sums, plan)
+        return loss, {"votes": loss}
+
+    return train_layers(network, network.point_layers, losses_of, settings, plan, on_step, optimiser_state)
 
 
 def voted_targets(probabilities: FloatArray, voted: Sequence[VotedImage], shift: tuple[int, int]) -> FloatArray:
