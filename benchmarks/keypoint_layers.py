@@ -1,0 +1,197 @@
+"""Can the bundled detector find its keypoints more exactly? Its keypoint layers train further on photographs.
+
+    python benchmarks/keypoint_layers.py --fleets FOLDER [--keep ROWS.jsonl] [--steps 1500] [--networks FOLDER]
+
+Only the layers that turn features into keypoints train; the codes of an image stay as they are. A step has four pairs
+of views of photographs under random homographies and light (BSDS500, COCO, SUN and Open Images; none is measured on).
+Every arm has the cross entropy to the bundled network's own probabilities, and beside it:
+
+- agreement: the keypoint maps of both views agree in windows (`agreement_loss` in `learning/losses.py`)
+- localisation: keypoints of both views that are mutual nearest neighbours within 2.5 px lie, by the parabola through
+  each peak, at the same point (a Huber loss of the distance)
+- both
+
+Measured on 25 pairs of photographs of other places (corrected, NMS 8 px; needs FCSLAM_DATA), and in the unseen
+buildings of `benchmarks/closure_learning.py`, which records them into FOLDER: camera alone, robots in different light.
+Intervals are 95 %, by bootstrap over buildings, of the difference to the bundled detector. --keep resumes by arm and
+building; --networks keeps the trained networks. An arm takes some ten minutes of one core.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import overload
+
+import common
+import numpy as np
+import torch
+from closure_learning import (
+    COLUMNS,
+    FORGETTING,
+    ROBOTS,
+    SCENES,
+    TEST,
+    UNSEEN,
+    building_row,
+    gains,
+    kept_networks,
+    means,
+    photograph_rows,
+    recorded,
+)
+from torch import Tensor
+from torch.nn import functional as F
+
+from fcslam.errors import TrainingError
+from fcslam.features.dense import find_peaks
+from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
+from fcslam.federated.codec import weights_to_network
+from fcslam.federated.initial_weights import prepare_initial_weights
+from fcslam.federated.settings import FederatedSettings
+from fcslam.learning.batches import TrainingBatch, draw_batch
+from fcslam.learning.export import export_onnx
+from fcslam.learning.images import ImageFile, find_images, read_image
+from fcslam.learning.labels import Labels
+from fcslam.learning.local_training import LocalTrainingPlan, train_layers
+from fcslam.learning.losses import agreement_loss, detector_loss
+from fcslam.learning.network import cell_probabilities
+from fcslam.learning.objective import grid_shift, shift_grid, views_aligned
+from fcslam.learning.pairs import TrainingExample
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.trainer import ExecutionOptions
+
+PHOTOGRAPHS = ("bsds500", "coco_subset", "sun_hays80", "openimages_doors")
+ARMS = {"bundled": (), "agreement": ("agreement",), "localisation": ("localisation",),
+        "both": ("agreement", "localisation")}  # fmt: skip
+SAME_POINT_PX = 2.5
+"""Peaks of both views that are farther apart are not taken for one keypoint."""
+BORDER_PX = 4
+MOST_PEAKS = 300
+LONGEST_OFFSET_PX = 0.75
+HUBER_PX = 0.5
+FLAT = 1e-6
+"""A parabola that bends less has no peak."""
+
+
+class Photographs(Sequence[TrainingExample]):
+    """Images as training examples, read when they are drawn; without labels, as no arm uses any."""
+
+    def __init__(self, files: Sequence[ImageFile]) -> None:
+        self._files = files
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    @overload
+    def __getitem__(self, index: int) -> TrainingExample: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[TrainingExample]: ...
+    def __getitem__(self, index: int | slice) -> TrainingExample | Sequence[TrainingExample]:
+        if isinstance(index, slice):
+            return Photographs(self._files[index])
+        image = read_image(self._files[index].path)
+        if image is None:
+            raise TrainingError(f"{self._files[index].path}: is no image")
+        return TrainingExample(image, Labels(np.zeros((1, 2), np.float32), np.ones(1, np.float32)))
+
+
+def main() -> None:
+    parser = common.options(__doc__ or "")
+    parser.add_argument("--fleets", type=Path, required=True, help="folder of recordings; those missing are made there")
+    parser.add_argument("--test", nargs="+", type=int, default=TEST, help="seeds of the buildings")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="which networks")
+    parser.add_argument("--steps", type=int, default=1500, help="of training")
+    parser.add_argument("--keep", type=Path, help="file that keeps finished arms; the same one resumes")
+    parser.add_argument("--networks", type=Path, default=Path("keypoint-layers"), help="folder of the networks")
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    common.recordings(*SCENES, kind="vision")
+    chosen.networks.mkdir(parents=True, exist_ok=True)
+    kept = common.Kept(chosen.keep)
+    report = common.Report(__file__, __doc__ or "", chosen)
+    settings = TrainingSettings(steps=chosen.steps, pairs=4, side_px=192, points=16, learning_rate=1e-3)
+    rows: list[tuple] = []
+    photographs: list[tuple] = []
+    for arm in (arm for arm in ARMS if arm in chosen.arms):
+        networks = kept_networks(chosen.networks / f"{arm}-{chosen.steps}", partial(trained, arm, settings))
+        photographs += kept.rows((arm, chosen.steps, "photographs"), partial(photograph_rows, arm, 1, networks))
+        for seed in chosen.test:
+            folder = recorded(seed, len(ROBOTS), chosen.fleets)
+            measure = partial(building_row, arm, 1, UNSEEN, folder, ROBOTS, networks)
+            rows += kept.rows((arm, chosen.steps, seed), measure)
+    report.table(f"Above the bundled detector, {UNSEEN}", COLUMNS, gains(rows, UNSEEN))
+    report.table(f"Means, {UNSEEN}", COLUMNS, means(rows, UNSEEN))
+    report.table("Photographs of other places", FORGETTING, photographs)
+    report.write()
+
+
+def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | None]:
+    """The network of an arm; None for the bundled one."""
+    if arm == "bundled":
+        return [None]
+    vision = common.recordings(*PHOTOGRAPHS, kind="vision")
+    examples = Photographs(find_images([vision / name for name in PHOTOGRAPHS]))
+    start = FederatedSettings(normalisation="frozen", trained="codes")
+    weights = prepare_initial_weights(BUNDLED_NETWORK, folder, start, ExecutionOptions(), lambda *_: None)
+    network, before = (weights_to_network(weights, settings.encoder) for _ in range(2))
+
+    def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        batch = draw_batch(examples, settings, step)
+        with torch.no_grad():
+            wanted = cell_probabilities(before(batch.images).point_logits)
+        logits = network(batch.images).point_logits
+        shift = grid_shift(settings.encoder, settings.seed, step)
+        parts = {"initial": detector_loss(*shift_grid((logits, wanted, batch.seen), shift))}
+        if "agreement" in ARMS[arm]:
+            parts["agreement"] = agreement_loss(*views_aligned(logits.sigmoid(), batch))
+        if "localisation" in ARMS[arm]:
+            parts["localisation"] = localisation_loss(logits.sigmoid(), batch)
+        return torch.stack(list(parts.values())).sum(), parts
+
+    train_layers(network, network.point_layers, losses_of, settings, LocalTrainingPlan(0, settings.steps))
+    export_onnx(network, folder / "0.onnx")
+    return [folder / "0.onnx"]
+
+
+def localisation_loss(scores: Tensor, batch: TrainingBatch) -> Tensor:
+    """How far keypoints of the second views (2B, H, W) lie from those of the first ones, a Huber loss of the pixels."""
+    terms = [distance_loss(*pair) for pair in zip(*scores.chunk(2), batch.homographies, strict=True)]
+    every = torch.cat(terms)
+    return every.mean() if len(every) else scores.new_zeros(())
+
+
+def distance_loss(first: Tensor, second: Tensor, homography: Tensor) -> Tensor:
+    """The loss of each keypoint that two maps (H, W) share, shape (N,)."""
+    here, there = peaks(first), peaks(second)
+    moved = torch.cat((here, torch.ones_like(here[:, :1])), dim=1) @ homography.T
+    moved = moved[:, :2] / moved[:, 2:]
+    gaps = torch.cdist(moved, there)
+    if not gaps.numel():
+        return gaps.new_zeros(0)
+    nearest, back = gaps.argmin(1), gaps.argmin(0)
+    rows = torch.arange(len(moved))
+    shared = (back[nearest] == rows) & (gaps[rows, nearest] < SAME_POINT_PX)
+    return F.smooth_l1_loss(moved[shared], there[nearest[shared]], beta=HUBER_PX, reduction="none").sum(1)
+
+
+def peaks(scores: Tensor) -> Tensor:
+    """Positions (N, 2) of a map's keypoints, as `find_peaks` finds them, as functions of the map (H, W)."""
+    config = OnnxConfig()
+    found, _ = find_peaks(scores.detach().numpy(), config.least_score, config.nms_px, MOST_PEAKS)
+    pixels = np.rint(found).astype(np.int64)
+    last = np.array(scores.shape[::-1]) - 1 - BORDER_PX
+    x, y = torch.from_numpy(pixels[((pixels >= BORDER_PX) & (pixels <= last)).all(axis=1)]).unbind(1)
+    middle = scores[y, x]
+
+    def offset(before: Tensor, behind: Tensor) -> Tensor:
+        bend = 2.0 * middle - before - behind
+        vertex = 0.5 * (behind - before) / bend.clamp(min=FLAT)
+        return torch.where(bend > FLAT, vertex, 0.0).clamp(-LONGEST_OFFSET_PX, LONGEST_OFFSET_PX)
+
+    dx = offset(scores[y, x - 1], scores[y, x + 1])
+    dy = offset(scores[y - 1, x], scores[y + 1, x])
+    return torch.stack((x + dx, y + dy), dim=1)
+
+
+if __name__ == "__main__":
+    main()
