@@ -110,7 +110,7 @@ PAIRS_A_BUILDING = 120
 ALONE = 3
 """Robots that train alone; each building of the test measures the network of one of them."""
 ARMS = ("bundled", "homographies", "own map", "keypoints too", "closures", "poisoned", "central", "alone")
-REPEATED = ("own map",)
+REPEATED = ("own map", "keypoints too")
 """Arms with all training seeds; the others have the first."""
 LATER_DRIVEN = ("bundled", "own map", "keypoints too", "closures")
 """Arms that are also measured on later drives."""
