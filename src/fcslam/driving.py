@@ -16,7 +16,7 @@ from typing import Any, Final
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError
-from fcslam.processes import obey_parent, start_method
+from fcslam.processes import needing_semaphores, obey_parent, start_method
 from fcslam.records import Keyscan, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
@@ -71,8 +71,9 @@ def side_by_side(processes: int) -> Drive:
                 yield robots
             return
         context = start_method()
-        channel = context.Queue()
-        turns = context.BoundedSemaphore(processes)
+        with needing_semaphores():
+            channel = context.Queue()
+            turns = context.BoundedSemaphore(processes)
         workers = [
             context.Process(target=_work, args=(number, source, config, channel, turns), daemon=True)
             for number, source in enumerate(sources)

@@ -5,9 +5,13 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
+
+from fcslam.errors import InputError
 
 NICENESS = 10
 """Increment of the niceness of a task in a copy of this process: what the process itself does goes first."""
@@ -34,6 +38,31 @@ Start = Callable[[Callable[[], None]], Background]
 def start_method() -> Any:
     """The context of quick workers: copies of this process, which has loaded all code, where such copies are safe."""
     return multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+
+
+def worker_pool(start: Callable[[], None]) -> ProcessPoolExecutor:
+    """An executor with one worker, another process that calls ``start`` first.
+
+    Raises:
+        InputError: the host gives processes no semaphores.
+    """
+    with needing_semaphores():
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start)
+
+
+@contextmanager
+def needing_semaphores() -> Iterator[None]:
+    """Create queues and semaphores of processes in this block.
+
+    Raises:
+        InputError: the host has none, such as a container without a writable /dev/shm.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"/dev/shm: more than one process needs semaphores, which cannot be made there ({error}); make it writable"
+        ) from error
 
 
 def obey_parent() -> None:

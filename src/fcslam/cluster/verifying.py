@@ -1,13 +1,11 @@
 """Closures are verified by the chosen processes, which live as long as a block."""
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
-from multiprocessing import get_context
 
 from fcslam.cluster.workers import Workers
 from fcslam.lidar.pair_verification import VerificationPool, VerifyPairs, verify_here
-from fcslam.processes import obey_parent
+from fcslam.processes import obey_parent, worker_pool
 
 
 @contextmanager
@@ -19,7 +17,8 @@ def verifying(workers: Workers, must_connect: bool = True) -> Iterator[VerifyPai
         must_connect: whether a cluster must be there now; otherwise this process verifies until it is.
 
     Raises:
-        InputError: the choice is not valid, or the cluster is not there or refused.
+        InputError: the choice is not valid, the cluster is not there or refused, or the host gives processes no
+            semaphores.
     """
     workers.check()
     with ExitStack() as stack:
@@ -29,8 +28,7 @@ def verifying(workers: Workers, must_connect: bool = True) -> Iterator[VerifyPai
             cluster = stack.enter_context(DaskCluster(workers, must_connect))
             yield VerificationPool(cluster.executors)
         elif (others := int(workers.where) - 1) > 0:
-            context = get_context("spawn")
-            pools = [stack.enter_context(ProcessPoolExecutor(1, context, obey_parent)) for _ in range(others)]
+            pools = [stack.enter_context(worker_pool(obey_parent)) for _ in range(others)]
             yield VerificationPool(lambda: pools)
         else:
             yield verify_here

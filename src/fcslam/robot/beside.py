@@ -9,12 +9,11 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Protocol
 
 from fcslam.errors import FeatureError
-from fcslam.processes import obey_parent
+from fcslam.processes import obey_parent, worker_pool
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionConfig
 from fcslam.wire.messages import Body
 
@@ -65,8 +64,12 @@ class Beside:
 
 
 def worker_process() -> ProcessPoolExecutor:
-    """An executor with one worker, another process with a lower priority than this one."""
-    return ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+    """An executor with one worker, another process with a lower priority than this one.
+
+    Raises:
+        InputError: the host gives processes no semaphores.
+    """
+    return worker_pool(_start_worker)
 
 
 @contextmanager
