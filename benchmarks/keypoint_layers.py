@@ -17,10 +17,8 @@ Intervals are 95 %, by bootstrap over buildings, of the difference to the bundle
 building; --networks keeps the trained networks. An arm takes some ten minutes of one core.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import overload
 
 import common
 import numpy as np
@@ -42,7 +40,6 @@ from closure_learning import (
 from torch import Tensor
 from torch.nn import functional as F
 
-from fcslam.errors import TrainingError
 from fcslam.features.dense import find_peaks
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
 from fcslam.federated.codec import weights_to_network
@@ -50,7 +47,7 @@ from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.batches import TrainingBatch, draw_batch
 from fcslam.learning.export import export_onnx
-from fcslam.learning.images import ImageFile, find_images, read_image
+from fcslam.learning.images import find_images, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.local_training import LocalTrainingPlan, train_layers
 from fcslam.learning.losses import agreement_loss, detector_loss
@@ -71,28 +68,8 @@ LONGEST_OFFSET_PX = 0.75
 HUBER_PX = 0.5
 FLAT = 1e-6
 """A parabola that bends less has no peak."""
-
-
-class Photographs(Sequence[TrainingExample]):
-    """Images as training examples, read when they are drawn; without labels, as no arm uses any."""
-
-    def __init__(self, files: Sequence[ImageFile]) -> None:
-        self._files = files
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    @overload
-    def __getitem__(self, index: int) -> TrainingExample: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[TrainingExample]: ...
-    def __getitem__(self, index: int | slice) -> TrainingExample | Sequence[TrainingExample]:
-        if isinstance(index, slice):
-            return Photographs(self._files[index])
-        image = read_image(self._files[index].path)
-        if image is None:
-            raise TrainingError(f"{self._files[index].path}: is no image")
-        return TrainingExample(image, Labels(np.zeros((1, 2), np.float32), np.ones(1, np.float32)))
+UNLABELLED = Labels(np.zeros((1, 2), np.float32), np.ones(1, np.float32))
+"""No arm uses labels."""
 
 
 def main() -> None:
@@ -113,7 +90,8 @@ def main() -> None:
     rows: list[tuple] = []
     photographs: list[tuple] = []
     for arm in (arm for arm in ARMS if arm in chosen.arms):
-        networks = kept_networks(chosen.networks / f"{arm}-{chosen.steps}", partial(trained, arm, settings))
+        place = chosen.networks / f"{arm}-{chosen.steps}-{common.commit()}"
+        networks = kept_networks(place, partial(trained, arm, settings))
         photographs += kept.rows((arm, chosen.steps, "photographs"), partial(photograph_rows, arm, 1, networks))
         for seed in chosen.test:
             folder = recorded(seed, len(ROBOTS), chosen.fleets)
@@ -130,7 +108,8 @@ def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | N
     if arm == "bundled":
         return [None]
     vision = common.recordings(*PHOTOGRAPHS, kind="vision")
-    examples = Photographs(find_images([vision / name for name in PHOTOGRAPHS]))
+    files = find_images([vision / name for name in PHOTOGRAPHS])
+    examples = [TrainingExample(image, UNLABELLED) for file in files if (image := read_image(file.path)) is not None]
     start = FederatedSettings(normalisation="frozen", trained="codes")
     weights = prepare_initial_weights(BUNDLED_NETWORK, folder, start, ExecutionOptions(), lambda *_: None)
     network, before = (weights_to_network(weights, settings.encoder) for _ in range(2))
@@ -154,7 +133,7 @@ def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | N
 
 
 def localisation_loss(scores: Tensor, batch: TrainingBatch) -> Tensor:
-    """How far keypoints of the second views (2B, H, W) lie from those of the first ones, a Huber loss of the pixels."""
+    """How far keypoints of both views lie from each other, a Huber loss of the pixels, from maps (2B, H, W)."""
     terms = [distance_loss(*pair) for pair in zip(*scores.chunk(2), batch.homographies, strict=True)]
     every = torch.cat(terms)
     return every.mean() if len(every) else scores.new_zeros(())

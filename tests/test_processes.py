@@ -1,5 +1,6 @@
 """A host without semaphores for processes, such as a container without /dev/shm, gets one clear line."""
 
+import errno
 from multiprocessing import synchronize
 
 import pytest
@@ -13,12 +14,16 @@ from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import Recording
 
 
-@pytest.fixture
-def no_semaphores(monkeypatch):
+def let_semaphores_fail(monkeypatch, number):
     def refuse(*_args, **_kwargs):
-        raise PermissionError(13, "Permission denied")
+        raise OSError(number, "refused")
 
     monkeypatch.setattr(synchronize.SemLock, "__init__", refuse)
+
+
+@pytest.fixture
+def no_semaphores(monkeypatch):
+    let_semaphores_fail(monkeypatch, errno.EACCES)
 
 
 def verify():
@@ -40,3 +45,9 @@ def test_workers(no_semaphores, start):
 def test_robots_side_by_side(no_semaphores, tmp_path):
     with pytest.raises(InputError, match="/dev/shm: more than one process needs semaphores"):
         drive(tmp_path)
+
+
+def test_too_many_open_files_say_so(monkeypatch):
+    let_semaphores_fail(monkeypatch, errno.EMFILE)
+    with pytest.raises(OSError, match="refused"):
+        worker_process()

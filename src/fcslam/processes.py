@@ -1,5 +1,6 @@
 """Processes that end with the process that started them, however that ends: workers, and tasks beside it."""
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,9 @@ from fcslam.errors import InputError
 
 NICENESS = 10
 """Increment of the niceness of a task in a copy of this process: what the process itself does goes first."""
+
+_NO_SEMAPHORES = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.ENOSYS})
+"""Errors of a host that has none, and not of a process with too many open files, for example."""
 
 
 class Background(Protocol):
@@ -60,8 +64,11 @@ def needing_semaphores() -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno not in _NO_SEMAPHORES:
+            raise
         raise InputError(
-            f"/dev/shm: more than one process needs semaphores, which cannot be made there ({error}); make it writable"
+            f"/dev/shm: more than one process needs semaphores, which cannot be made there ({error}); "
+            "mount it writable, with free space"
         ) from error
 
 
