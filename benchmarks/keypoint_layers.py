@@ -8,7 +8,7 @@ Every arm has the cross entropy to the bundled network's own probabilities, and 
 
 - agreement: the keypoint maps of both views agree in windows (`agreement_loss` in `learning/losses.py`)
 - localisation: keypoints of both views that are mutual nearest neighbours within 2.5 px lie, by the parabola through
-  each peak, at the same point (a Huber loss of the distance)
+  each peak, at the same point (`localisation_loss` in `learning/localisation.py`)
 - both
 
 Measured on 25 pairs of photographs of other places (corrected, NMS 8 px; needs FCSLAM_DATA), and in the unseen
@@ -38,18 +38,17 @@ from closure_learning import (
     recorded,
 )
 from torch import Tensor
-from torch.nn import functional as F
 
-from fcslam.features.dense import find_peaks
-from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
+from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.federated.codec import weights_to_network
 from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.settings import FederatedSettings
-from fcslam.learning.batches import TrainingBatch, draw_batch
+from fcslam.learning.batches import draw_batch
 from fcslam.learning.export import export_onnx
 from fcslam.learning.images import find_images, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.local_training import LocalTrainingPlan, train_layers
+from fcslam.learning.localisation import localisation_loss
 from fcslam.learning.losses import agreement_loss, detector_loss
 from fcslam.learning.network import cell_probabilities
 from fcslam.learning.objective import grid_shift, shift_grid, views_aligned
@@ -60,14 +59,6 @@ from fcslam.learning.trainer import ExecutionOptions
 PHOTOGRAPHS = ("bsds500", "coco_subset", "sun_hays80", "openimages_doors")
 ARMS = {"bundled": (), "agreement": ("agreement",), "localisation": ("localisation",),
         "both": ("agreement", "localisation")}  # fmt: skip
-SAME_POINT_PX = 2.5
-"""Peaks of both views that are farther apart are not taken for one keypoint."""
-BORDER_PX = 4
-MOST_PEAKS = 300
-LONGEST_OFFSET_PX = 0.75
-HUBER_PX = 0.5
-FLAT = 1e-6
-"""A parabola that bends less has no peak."""
 UNLABELLED = Labels(np.zeros((1, 2), np.float32), np.ones(1, np.float32))
 """No arm uses labels."""
 
@@ -124,52 +115,12 @@ def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | N
         if "agreement" in ARMS[arm]:
             parts["agreement"] = agreement_loss(*views_aligned(logits.sigmoid(), batch))
         if "localisation" in ARMS[arm]:
-            parts["localisation"] = localisation_loss(logits.sigmoid(), batch)
+            parts["localisation"] = localisation_loss(logits.sigmoid(), batch.homographies)
         return torch.stack(list(parts.values())).sum(), parts
 
     train_layers(network, network.point_layers, losses_of, settings, LocalTrainingPlan(0, settings.steps))
     export_onnx(network, folder / "0.onnx")
     return [folder / "0.onnx"]
-
-
-def localisation_loss(scores: Tensor, batch: TrainingBatch) -> Tensor:
-    """How far keypoints of both views lie from each other, a Huber loss of the pixels, from maps (2B, H, W)."""
-    terms = [distance_loss(*pair) for pair in zip(*scores.chunk(2), batch.homographies, strict=True)]
-    every = torch.cat(terms)
-    return every.mean() if len(every) else scores.new_zeros(())
-
-
-def distance_loss(first: Tensor, second: Tensor, homography: Tensor) -> Tensor:
-    """The loss of each keypoint that two maps (H, W) share, shape (N,)."""
-    here, there = peaks(first), peaks(second)
-    moved = torch.cat((here, torch.ones_like(here[:, :1])), dim=1) @ homography.T
-    moved = moved[:, :2] / moved[:, 2:]
-    gaps = torch.cdist(moved, there)
-    if not gaps.numel():
-        return gaps.new_zeros(0)
-    nearest, back = gaps.argmin(1), gaps.argmin(0)
-    rows = torch.arange(len(moved))
-    shared = (back[nearest] == rows) & (gaps[rows, nearest] < SAME_POINT_PX)
-    return F.smooth_l1_loss(moved[shared], there[nearest[shared]], beta=HUBER_PX, reduction="none").sum(1)
-
-
-def peaks(scores: Tensor) -> Tensor:
-    """Positions (N, 2) of a map's keypoints, as `find_peaks` finds them, as functions of the map (H, W)."""
-    config = OnnxConfig()
-    found, _ = find_peaks(scores.detach().numpy(), config.least_score, config.nms_px, MOST_PEAKS)
-    pixels = np.rint(found).astype(np.int64)
-    last = np.array(scores.shape[::-1]) - 1 - BORDER_PX
-    x, y = torch.from_numpy(pixels[((pixels >= BORDER_PX) & (pixels <= last)).all(axis=1)]).unbind(1)
-    middle = scores[y, x]
-
-    def offset(before: Tensor, behind: Tensor) -> Tensor:
-        bend = 2.0 * middle - before - behind
-        vertex = 0.5 * (behind - before) / bend.clamp(min=FLAT)
-        return torch.where(bend > FLAT, vertex, 0.0).clamp(-LONGEST_OFFSET_PX, LONGEST_OFFSET_PX)
-
-    dx = offset(scores[y, x - 1], scores[y, x + 1])
-    dy = offset(scores[y - 1, x], scores[y + 1, x])
-    return torch.stack((x + dx, y + dy), dim=1)
 
 
 if __name__ == "__main__":
