@@ -44,6 +44,43 @@ def test_reading_ends_with_the_last_image_that_is_wanted(tmp_path):
     assert read(None) == (5, 1)
 
 
+def teach(folder, name, size=8, seed=0):
+    """A file of a teacher with descriptors of this size."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    keypoints, scores = rng.uniform(10, 100, (20, 2)), rng.uniform(size=20)
+    np.savez(folder / f"{name}.npz", keypoints=keypoints, scores=scores, descriptors=rng.normal(size=(20, size)))
+
+
+def labelled_with_teacher(folder):
+    from fcslam.learning.settings import TrainingSettings
+    from fcslam.learning.stages import read_labelled_images
+
+    files, settings = find_images([folder / "x"]), TrainingSettings(label_copies=0)
+    return read_labelled_images(files, folder / "labels", settings, None, folder / "teacher", lambda *_: None).train
+
+
+def test_files_of_two_teachers_are_refused(tmp_path):
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    for seed, size in ((1, 8), (2, 8), (3, 16)):
+        write(tmp_path / "x" / f"{seed}.png", textured(seed))
+        teach(tmp_path / "teacher" / "x", f"{seed}.png", size)
+    with pytest.raises(TrainingError, match=r"3\.png\.npz: has descriptors of another size .*8 and 16"):
+        labelled_with_teacher(tmp_path)
+
+
+def test_another_teacher_gives_other_labels(tmp_path):
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    for seed in (1, 2):
+        write(tmp_path / "x" / f"{seed}.png", textured(seed))
+        teach(tmp_path / "teacher" / "x", f"{seed}.png", seed=1)
+    first, again = (labelled_with_teacher(tmp_path)[0].labels.keypoints for _ in range(2))
+    teach(tmp_path / "teacher" / "x", "1.png", seed=2)
+    other = labelled_with_teacher(tmp_path)[0].labels.keypoints
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
 def test_folders_of_one_name_with_the_same_files_are_refused(tmp_path):
     for place in ("here", "there"):
         write(tmp_path / place / "photos" / "1.png", textured(1))

@@ -137,16 +137,25 @@ def read_labelled_images(
         most: usable images to train on; reading ends with the last of them. None for all.
 
     Raises:
-        TrainingError: too few images are usable, or a teacher's file is missing or broken.
+        TrainingError: too few images are usable, or a teacher's file is missing, broken, or of another teacher.
         OutputError: labels cannot be written.
     """
     train: list[TrainingExample] = []
     held_out: list[TrainingExample] = []
     skipped = 0
+    sizes: set[int] = set()
     for index, file in enumerate(files):
         image = read_image(file.path)
         if image is not None and is_usable(image):
-            teacher_of_image = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
+            teacher_of_image = None
+            if teacher is not None:
+                teacher_of_image = read_teacher(teacher / f"{file.name}.npz")
+                sizes.add(teacher_of_image.descriptors.shape[1])
+                if len(sizes) > 1:
+                    raise TrainingError(
+                        f"{teacher / file.name}.npz: has descriptors of another size than the files before "
+                        f"({' and '.join(map(str, sorted(sizes)))}); make all files with one teacher"
+                    )
             place = cache / f"{file.name}.npz"
             (held_out if is_held_out(file.name) else train).append(
                 TrainingExample(image, _labels(image, place, settings, detector, teacher_of_image), teacher_of_image)
@@ -171,12 +180,13 @@ def _labels(
     detector: Callable[[GreyImage], Response] | None,
     teacher: Teacher | None,
 ) -> Labels:
-    """Labels of an image, from the cache if they were made from the same pixels."""
-    key = zlib.crc32(image.tobytes())
+    """Labels of an image, from the cache if they were made from the same pixels and teacher."""
+    pixels = zlib.crc32(image.tobytes())
+    key = pixels if teacher is None else zlib.crc32(teacher.keypoints.tobytes(), pixels)
     known = read_labels(place, key)
     if known is not None:
         return known
-    rng = np.random.default_rng([settings.seed, key])
+    rng = np.random.default_rng([settings.seed, pixels])
     corners = peaks(adapt(harris, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
     if teacher is not None:
         others = teacher.keypoints
