@@ -10,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.ndimage import binary_dilation
 
 from fcslam.config import load as load_config
 from fcslam.features.classical import OrbConfig
-from fcslam.features.dense import find_peaks
-from fcslam.features.detector import OnnxConfig
 from fcslam.geometry import se2
 from fcslam.mission import MissionConfig
 from fcslam.records import Channel
@@ -179,21 +177,3 @@ def test_each_detector_alone_describes_the_camera_places(camera_detectors, tmp_p
     assert [str(robot.views.detector) for robot in robots] == ["orb", "onnx", "onnx"]
     assert [robot.views.onnx.weights for robot in robots] == [None, *paths]
     assert robots[0].views.orb == OrbConfig()
-
-
-def test_keypoints_of_two_views_are_compared_where_the_detector_finds_them(common):
-    torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-    keypoint_layers = load(FOLDER / "keypoint_layers.py")
-    scores = gaussian_filter(np.random.default_rng(1).random((64, 64), np.float32), 2.0)
-    scores = (scores - scores.min()) ** 2
-    moved = np.roll(scores, 1, axis=1)  # by a pixel in x
-    expected, _ = find_peaks(scores, OnnxConfig().least_score, OnnxConfig().nms_px, keypoint_layers.MOST_PEAKS)
-    expected = expected[((np.rint(expected) >= 4) & (np.rint(expected) <= 59)).all(axis=1)]
-    first, second = torch.from_numpy(scores), torch.from_numpy(moved)
-    assert len(expected) > 20
-    assert np.allclose(keypoint_layers.peaks(first).numpy(), expected, atol=1e-3)
-    right, wrong = torch.eye(3), torch.eye(3)
-    right[0, 2] = 1.0
-    assert float(keypoint_layers.distance_loss(first, second, right).max()) == pytest.approx(0.0, abs=1e-5)
-    # A pixel off: Huber's loss of 1 px, beyond 0.5 px.
-    assert float(keypoint_layers.distance_loss(first, second, wrong).median()) == pytest.approx(0.75, abs=1e-3)
