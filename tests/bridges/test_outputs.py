@@ -63,6 +63,24 @@ def test_of_a_large_map_what_differs_from_the_last_whole_one_goes_out(network, p
     assert len(network.sent["/robot1/map"]) == 2
 
 
+def test_a_cell_that_changes_back_is_free_at_every_subscriber(network, published, monkeypatch):
+    """A person stands in a large map and walks on, while another part of it changes."""
+    monkeypatch.setattr(outputs, "SMALL_MAP_CELLS", 1)
+    cells = [np.full((6, 8), Occupancy.FREE, np.uint8) for _ in range(3)]
+    cells[1][1, 1] = Occupancy.OCCUPIED
+    cells[2][4, 6] = Occupancy.OCCUPIED
+    for stamp, each in enumerate(cells):
+        published.map(stamp, occupancy(each))
+    (whole,) = network.sent["/robot1/map"]
+    early = whole.data.reshape(6, 8).copy()
+    for update in network.sent["/robot1/map_updates"]:
+        rows, columns = slice(update.y, update.y + update.height), slice(update.x, update.x + update.width)
+        early[rows, columns] = update.data.reshape(update.height, update.width)
+    late = whole.data.reshape(6, 8).copy()
+    late[rows, columns] = update.data.reshape(update.height, update.width)
+    assert np.argwhere(early == 100).tolist() == np.argwhere(late == 100).tolist() == [[4, 6]]
+
+
 def test_grids_that_cover_other_cells_have_no_region():
     grid = Grid(np.zeros((2, 3), np.int8), 0.05, (0.0, 0.0))
     assert changed_region(grid, grid) == Region(0, 0, 1, 1)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fcslam.bridges import sensors
 from fcslam.bridges.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
 from fcslam.bridges.topics import SensorTopics
 from fcslam.errors import NetworkError
@@ -171,6 +172,41 @@ def test_the_scans_of_two_lasers_come_in_the_order_of_their_stamps():
     assert [record.laser.T_base_laser[0] for record in robot.records[:2]] == pytest.approx([LASER_POSE[0], -0.3])
 
 
+def late_by(robot, laser_stops_s, until_s):
+    """How late each record of a drive comes, if the rear laser stops at a time."""
+    late = []
+    for step in range(1, int(10 * until_s)):
+        robot.now_s = now_s = 0.1 * step
+        before = len(robot.records)
+        robot.hears("/odom", odometry(now_s, (now_s, 0.0, 0.0)))
+        robot.hears("/scan", scan(now_s - 0.02, RANGES))
+        if now_s < laser_stops_s:
+            robot.hears("/rear", scan(now_s - 0.01, RANGES, "rear"))
+        late += [(now_s, now_s - record.stamp) for record in robot.records[before:]]
+    return late
+
+
+def test_a_laser_that_stops_does_not_delay_the_other():
+    robot = two_lasers()
+    late = late_by(robot, laser_stops_s=5.0, until_s=15.0)
+    assert max(delay for now_s, delay in late if 1.0 < now_s < 5.0) < 0.15
+    assert max(delay for now_s, delay in late if now_s > 6.0) < 0.15
+    assert robot.said == ["/rear is silent; the robot goes on with its other lasers"]
+    assert robot.stamps == sorted(robot.stamps)
+
+
+def test_a_laser_that_starts_again_is_merged_again():
+    robot = two_lasers()
+    late_by(robot, laser_stops_s=2.0, until_s=4.0)
+    for stamp in np.arange(5.0, 9.0, 0.1):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
+        robot.hears("/rear", scan(stamp - 0.01, RANGES, "rear"))
+        robot.hears("/scan", scan(stamp - 0.02, RANGES))
+    again = [record for record in robot.records if record.stamp > 5.2]
+    assert [record.stamp for record in again] == sorted(record.stamp for record in again)
+    assert sum(record.laser.T_base_laser[0] == pytest.approx(-0.3) for record in again) > 30
+
+
 def test_two_lasers_of_one_frame_are_refused():
     robot = two_lasers()
     for stamp in np.arange(1.0, 9.0):
@@ -194,21 +230,42 @@ def test_tf_is_not_decoded_once_the_mounting_is_known(robot):
     assert robot.said == []
 
 
-@pytest.fixture
-def camera_robot():
-    """A robot with a camera of raw images that is ready."""
-    robot = Robot(kinds={**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}, camera="/image", info="/camera_info")
+def with_camera():
+    """A robot with a camera of raw images that waits for its mountings."""
+    return Robot(kinds={**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}, camera="/image", info="/camera_info")
+
+
+def mounted(robot):
     robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
     robot.hears("/tf_static", transform(0.0, "base_link", "camera", (0.1, 0.0, 0.0)))
-    robot.hears("/camera_info", camera_info(0.0))
-    return robot.drives(np.arange(1.0, 7.0))
+    return robot.hears("/camera_info", camera_info(0.0)).drives(np.arange(1.0, 7.0))
+
+
+@pytest.fixture
+def camera_robot():
+    """The robot with its mountings."""
+    return mounted(with_camera())
+
+
+def images_of(robot):
+    return [record for record in robot.records if isinstance(record, CameraImage)]
+
+
+def test_few_images_wait_for_a_mounting(monkeypatch):
+    monkeypatch.setattr(sensors, "_IMAGES_KEPT", 3)
+    robot = with_camera()
+    for step in range(9):
+        robot.now_s = 0.5 * step
+        robot.hears("/odom", odometry(0.1 * step, (0.0, 0.0, 0.0))).hears("/image", image(0.1 * step))
+    mounted(robot)
+    assert [image.stamp for image in images_of(robot)] == pytest.approx([0.6, 0.7, 0.8])
 
 
 def test_raw_images_become_records_at_a_rate_that_is_enough(camera_robot):
     for step in range(10):
         camera_robot.now_s = 0.1 * step
         camera_robot.hears("/image", image(6.0))
-    images = [record for record in camera_robot.records if isinstance(record, CameraImage)]
+    images = images_of(camera_robot)
     assert len(images) == 3
     assert images[0].T_odom_base == pytest.approx([6.0, 0.0, 0.0])
     assert images[0].camera.T_base_camera.translation_m == pytest.approx((0.1, 0.0, 0.0))

@@ -6,21 +6,29 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from fcslam.bridges.parameters import NodeParameters
+from fcslam.bridges.topics import SensorTopics
 from fcslam.cli import live, main
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.cli.robot import _watch
+from fcslam.errors import CloudError, StateError
 from fcslam.live.records import RobotStatus
+from fcslam.live.robot import Robot
 from fcslam.robot.outbox import WaitingPackets
 from fcslam.runs import read_tum
-from fcslam.sources import write_carmen
+from fcslam.sources import BagOptions, write_carmen
+from fcslam.sources.bags.codec import ODOMETRY, SCAN
 from fcslam.wire.packets import decode
 from tests import small_fleet
+from tests.bridges.memory_network import MemoryNetwork
+from tests.live.same_thread import SameThread
 from tests.robot.fake_cloud import FakeCloud
 from tests.robot.http_cloud import serving
 
@@ -201,3 +209,54 @@ def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypat
             watch(scan, SimpleNamespace(stamp=float(scan), T_odom_base=np.array((x, 0.0, 0.0)), T_map_base=np.zeros(3)))
             watch(scan, None)  # another record, of no scan
     assert told == [("plan", "anna"), "keyframes are placed", 3, None, "closed"]
+
+
+@pytest.mark.parametrize("failure", [CloudError("the token is not known (401)"), StateError("the disk is full")])
+def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp_path, capsys, failure):
+    """Whatever the server or the outbox says, the drive is written; the error comes after it."""
+    scans = list(small_fleet.draw(1, path_length_m=6.0).robots[0].scans())
+
+    class Turned(Robot):
+        def finish(self, *arguments):
+            super().finish(*arguments)
+            raise failure
+
+    def run(node, _watch):
+        for scan in scans:
+            node._map(scan)
+
+    kinds = {"/scan": SCAN, "/odom": ODOMETRY}
+    topics = SensorTopics(kinds, ("/scan",), "/odom", ("/tf", "/tf_static"))
+    monkeypatch.setattr("fcslam.bridges.addresses.open_network", lambda *_: MemoryNetwork())
+    monkeypatch.setattr("fcslam.bridges.node.await_sensors", lambda *_: topics)
+    monkeypatch.setattr("fcslam.bridges.node.RobotNode.run", run)
+    start = partial(Turned, executor=SameThread())
+    arguments = ("ros2:/anna", None, start, BagOptions(), None, NodeParameters(), tmp_path / "run")
+    with pytest.raises(type(failure), match=re.escape(str(failure))):
+        live.map_live(*arguments, Console(file=io.StringIO()), None)
+    assert read_tum(tmp_path / "run" / "trajectories" / "anna.tum")[0].size == len(scans)
+    assert f"{len(scans)} scans, 1 sessions" in capsys.readouterr().out
+
+
+def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
+    told = []
+
+    class Process:
+        def __init__(self, *_):
+            """No process."""
+
+        def set_idle(self, first_epoch):
+            told.append(first_epoch)
+
+        def close(self):
+            """Nothing to close."""
+
+    def stand_still():
+        raise CloudError("the token is not known (401)")
+
+    monkeypatch.setattr("fcslam.federated.learning_beside.LearningBeside", Process)
+    robot = SimpleNamespace(name="anna", first_epoch=3, stand_still=stand_still)
+    with live._learning("plan", robot, told.append) as follow:
+        for scan in range(1, 30):
+            follow(SimpleNamespace(stamp=float(scan), T_odom_base=np.zeros(3), T_map_base=np.zeros(3)))
+    assert 3 not in told

@@ -1,5 +1,7 @@
 """A live robot in a finished map: found, followed and lost as a recording is, and no pose waits for the search."""
 
+from concurrent.futures import BrokenExecutor
+
 import numpy as np
 import pytest
 
@@ -162,3 +164,22 @@ def test_a_process_of_its_own_finds_the_robot(fleet, building, scans):
         assert pose.is_localized
         off = se2.between(small_fleet.truth_at(fleet.robots[2], [pose.stamp])[0], pose.T_map_base)
         assert np.hypot(off[0], off[1]) < 0.1
+
+
+def test_a_pose_that_is_given_after_the_worker_ended_raises_nothing(building, scans):
+    """The thread that takes it receives all messages of a robot."""
+
+    class Dead(SameThread):
+        is_dead = False
+
+        def submit(self, *arguments):
+            if self.is_dead:
+                raise BrokenExecutor("a process ended abruptly")
+            return super().submit(*arguments)
+
+    worker = Dead()
+    with robot_in(building, scans, worker) as robot:
+        drive(robot, scans[:3])
+        worker.is_dead = True
+        robot.suggest_pose(np.zeros(3))
+        assert not drive(robot, scans[3:6])[-1].is_localized

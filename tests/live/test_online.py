@@ -13,7 +13,7 @@ from fcslam.geometry import se2
 from fcslam.live.playback import PlaybackPace, play
 from fcslam.live.records import EventKind, LocalizationState
 from fcslam.live.robot import Playback, Robot
-from fcslam.records import Channel, Place
+from fcslam.records import Channel, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.runs import Occupancy
@@ -279,6 +279,21 @@ def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, 
     assert len(cloud.stored) == len(alone)
 
 
+def test_a_full_disk_does_not_fill_the_memory(scans, tmp_path, monkeypatch):
+    def put(_self, _packets):
+        raise StateError("disk full")
+
+    monkeypatch.setattr(Outbox, "put", put)
+    with Robot("alice", scans[0].laser, state=tmp_path, executor=SameThread()) as robot:
+        for scan in scans:
+            robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
+        with pytest.raises(StateError, match="disk full"):
+            robot.finish()
+        assert robot._keyscans > 5
+        assert not robot._uplink._unstored
+        assert len(robot.save(tmp_path / "run").trajectories) == 1
+
+
 def test_a_recording_is_played_by_its_own_clock():
     now, slept = 100.0, []
 
@@ -311,6 +326,26 @@ def test_the_own_map_lies_where_the_server_puts_it(scans):
     assert drawn.origin_xy != before.origin_xy or pose.map_index is not None
     column, row = np.floor((path.T_map_base[-1, :2] - drawn.origin_xy) / drawn.resolution_m).astype(int)
     assert drawn.cells[row, column] == Occupancy.FREE, "where the robot stands"
+
+
+@pytest.mark.parametrize("is_away", [True, False])
+def test_own_closures_move_the_pose_while_the_server_is_away(scans, monkeypatch, is_away):
+    """And never the map. While the server is there, its next correction has the closure."""
+    with Robot("alice", scans[0].laser, executor=SameThread()) as robot:
+        for scan in scans[:-2]:
+            robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
+        monkeypatch.setattr(robot, "_is_server_away", lambda: is_away)
+        robot._correct_by_server(0, replace(CORRECTION, T_map_odom=frozen([10.0, 0.0, 0.0])))
+        before = robot.add_scan(scans[-2].ranges_m, scans[-2].stamp, scans[-2].T_odom_base)
+        drawn = robot.map()
+        own = robot._localizers[0][0].correction
+        closed = se2.compose(np.array([-2.0, 0.0, 0.0]), own.T_map_odom)
+        robot._correct(0, replace(own, version=own.version + 1, T_map_odom=frozen(closed)))
+        after = robot.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
+        moved = after.T_map_base[:2] - before.T_map_base[:2]
+        driven = after.T_odom_base[:2] - before.T_odom_base[:2]
+        assert np.linalg.norm(moved - driven - [-2.0 * is_away, 0.0]) < 0.1
+        assert np.allclose(robot.map().origin_xy, drawn.origin_xy, atol=0.5)
 
 
 def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_path):

@@ -94,6 +94,20 @@ def test_map_and_trajectory_are_there_at_any_time(robot, scans):
     assert drawn.cells[row, column] == fcslam.Occupancy.FREE, "where the robot stands"
 
 
+def test_a_robot_that_drives_on_while_its_path_is_asked_for(robot, scans, monkeypatch):
+    drive(robot, scans[:10])
+    poses = robot._own.poses
+
+    def poses_later(session):
+        drive(robot, scans[10:])
+        return poses(session)
+
+    monkeypatch.setattr(robot._own, "poses", poses_later)
+    assert len(robot.trajectory().stamps) == 10
+    monkeypatch.undo()
+    assert len(robot.trajectory().stamps) == len(scans)
+
+
 def test_poses_do_not_wait_for_the_worker(scans):
     executor = SameThread()
     with fcslam.Robot("anna", scans[0].laser, executor=executor) as robot:

@@ -259,8 +259,8 @@ class RobotNode:
             drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
             try:
                 self.publish_map()
-            except FcslamError as error:
-                self._tell_once(f"no map is published any more: {error}")
+            except Exception as error:  # this thread also tells the state of the robot, so it must not end
+                self._tell_once(f"a map cannot be published: {error or type(error).__name__}")
 
     def _diagnose(self) -> None:
         pose, state = self._pose, self._state

@@ -149,19 +149,21 @@ class Outputs:
     def map(self, stamp_ns: int, occupancy: OccupancyMap) -> bool:
         """Publish the map if it changed; returns whether it did.
 
-        A small map goes out whole. Of a large map, only the cells go out that differ from the last whole one. So a
-        late subscriber, who gets that one, is complete after any update.
+        A small map goes out whole. Of a large map, only the cells go out that differ from the last whole one or from
+        the last update. So a late subscriber, who gets the whole one, is complete after any update, and one who got all
+        updates keeps no cell that changed back.
         """
         grid = grid_of(occupancy)
         with self._lock:
             if self._shown is not None and _is_same(self._shown, grid):
                 return False
-            whole, self._shown = self._whole, grid
-            region = None if whole is None else changed_region(whole, grid)
-            if region is None or grid.values.size <= SMALL_MAP_CELLS:
+            before, self._shown = (self._whole, self._shown), grid
+            of_whole, of_shown = (None if each is None else changed_region(each, grid) for each in before)
+            if of_whole is None or of_shown is None or grid.values.size <= SMALL_MAP_CELLS:
                 self._whole = grid
                 self._send(self._map, GRID, self._grid_message(stamp_ns, grid))
             else:
+                region = _bounding(of_whole, of_shown)
                 self._send(self._updates, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
             return True
 
@@ -232,6 +234,13 @@ def changed_region(before: Grid, after: Grid) -> Region | None:
         return Region(0, 0, 1, 1)
     x, y = int(columns[0]), int(rows[0])
     return Region(x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1)
+
+
+def _bounding(first: Region, second: Region) -> Region:
+    """The smallest rectangle around two."""
+    x, y = min(first.x, second.x), min(first.y, second.y)
+    right, top = (max(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
+    return Region(x, y, right - x, top - y)
 
 
 def nanoseconds(stamp: float) -> int:

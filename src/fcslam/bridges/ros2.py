@@ -7,6 +7,7 @@ A service is a topic of requests and one of responses. Cyclone DDS puts the iden
 Fast DDS puts it where Cyclone DDS cannot write it. So a call from Fast DDS takes effect, but gets no response.
 """
 
+import logging
 import os
 import re
 import threading
@@ -20,6 +21,8 @@ from fcslam.bridges.dds_names import dds_type, kind_of
 from fcslam.bridges.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
 from fcslam.errors import NetworkError
 from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec
+
+_log = logging.getLogger(__name__)
 
 INSTALL: Final = "pip install 'fcslam[ros2]'"
 _PARTICIPANTS: Final = 32
@@ -165,7 +168,10 @@ class Ros2Network:
                 for sample in reader.take(_MESSAGES_TAKEN):
                     payload = getattr(sample, "payload", None)  # None: the publisher has gone
                     if payload is not None:
-                        deliver(payload)
+                        try:
+                            deliver(payload)
+                        except Exception:  # this thread receives everything, so it must not end
+                            _log.exception("a message cannot be taken; the next ones are")
 
 
 @cache

@@ -11,7 +11,7 @@ from math import inf
 from fcslam.bridges.topics import SensorTopics
 from fcslam.errors import NetworkError
 from fcslam.records import Beams, SensorRecord
-from fcslam.sources.bags.camera import Calibration, calibration_of, image_of
+from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -54,6 +54,8 @@ PATIENCE_S = 5.0
 calibration."""
 ODOMETRY_PATIENCE_S = 1.0
 """Time that a scan waits for its odometry."""
+MERGING_PATIENCE_S = 0.3
+"""Time that scans of one laser wait for those of another, so a laser that stops does not delay the pose."""
 RAW_IMAGE_PERIOD_S = 0.4
 """Least time between two raw images that are read; places are a metre apart, and an image takes 10 ms to encode."""
 STEPS_BACK_FOR_RESTART = 3
@@ -62,6 +64,8 @@ _SCANS_KEPT = 100
 """Most first scans of a laser that decide."""
 _LONGEST_WAIT = 10_000
 """Most first messages that wait for the mounting."""
+_IMAGES_KEPT = 200
+"""Most images among them: they are large, and the first ones show little."""
 
 Notify = Callable[[str], None]
 """Takes one line for the user; what repeats a line is not said again."""
@@ -95,6 +99,7 @@ class LiveSensors:
         self._misplaced = 0
         self._next_image_s = -inf
         self._waiting_since: float | None = None
+        self._merging_since: float | None = None
         self._beams: list[Beams] = []
         """Usual beams of each laser, once they are known."""
 
@@ -133,7 +138,7 @@ class LiveSensors:
             return
         for item in items:
             if self._rig is None:
-                self._early.append((self._counts[topic], item))
+                self._keep_early(self._counts[topic], item)
             else:
                 yield from self._read(self._counts[topic], item)
         yield from self.wait(now_s)
@@ -152,6 +157,7 @@ class LiveSensors:
             self._begin()
             while self._early:
                 yield from self._read(*self._early.popleft())
+        yield from self._skip_silent(now_s)
         if not self._pairing.waiting:
             self._waiting_since = None
         elif self._waiting_since is None:
@@ -179,6 +185,14 @@ class LiveSensors:
             self._next_image_s = now_s + RAW_IMAGE_PERIOD_S
         # Once the mountings are known, tf has nothing but the odometry.
         return self._rig is not None and self._topics.odometry is not None and kind in (TRANSFORMS, OLD_TRANSFORMS)
+
+    def _keep_early(self, number: int, item: Message) -> None:
+        """Keep a message until the mounting is known; of images, the newest."""
+        self._early.append((number, item))
+        if isinstance(item, ImageMessage):
+            images = [index for index, (_, each) in enumerate(self._early) if isinstance(each, ImageMessage)]
+            if len(images) > _IMAGES_KEPT:
+                del self._early[images[0]]
 
     def _begin(self) -> None:
         """Begin to read scans; those before have no part in it."""
@@ -299,9 +313,27 @@ class LiveSensors:
     def _read(self, number: int, item: Message) -> Iterator[SensorRecord]:
         self._watch_clock(item)
         for merged, message in self._merger.add(number, item):
-            for paired, entry in self._pairing.add(merged, message):
-                self._waiting_since = None
-                yield from self._recorded(paired, entry)
+            yield from self._paired(merged, message)
+
+    def _paired(self, number: int, message: Message) -> Iterator[SensorRecord]:
+        """Give the next message in order its odometry."""
+        for paired, entry in self._pairing.add(number, message):
+            self._waiting_since = None
+            yield from self._recorded(paired, entry)
+
+    def _skip_silent(self, now_s: float) -> Iterator[SensorRecord]:
+        """Wait no longer for a laser that has stopped while another one goes on."""
+        awaited = self._merger.awaited
+        if not awaited:
+            self._merging_since = None
+        elif self._merging_since is None:
+            self._merging_since = now_s
+        elif now_s > self._merging_since + MERGING_PATIENCE_S:
+            self._merging_since = None
+            for laser in awaited:
+                self._notify(f"{self._topics.scans[laser]} is silent; the robot goes on with its other lasers")
+            for number, message in self._merger.give_up():
+                yield from self._paired(number, message)
 
     def _watch_clock(self, item: Message) -> None:
         """Start again if the clock stepped back and stays there, as when a bag is played again."""

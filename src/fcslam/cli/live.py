@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.bridges.parameters import NodeParameters
+    from fcslam.errors import FcslamError
     from fcslam.federated.learning_beside import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
@@ -94,14 +95,29 @@ def map_live(
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
                 return
+            failure = None
             if isinstance(robot, LocalizedRobot):
                 robot.finish()
-            elif not robot.finish(SERVER_PATIENCE_S):
-                notify("the server does not have everything; the rest is sent at the next start with the same --state")
+            else:
+                failure = _finish(robot, notify)
             node.publish_map()
             run = robot.save(output)
         print_faults(console, {robot.name: node.sensors.audit.faults()})
     print_line(answers(), f"{node.scans} scans, {len(run.trajectories)} sessions: {output}")
+    if failure is not None:
+        raise failure
+
+
+def _finish(robot: "Robot", notify: Callable[[str], None]) -> "FcslamError | None":
+    """End the recording; returns why the server or the state folder cannot be used. The run is written all the same."""
+    from fcslam.errors import CloudError, StateError
+
+    try:
+        if not robot.finish(SERVER_PATIENCE_S):
+            notify("the server does not have everything; the rest is sent at the next start with the same --state")
+    except (CloudError, StateError) as error:
+        return error
+    return None
 
 
 @contextmanager
@@ -114,13 +130,17 @@ def _learning(
     if plan is None or isinstance(robot, LocalizedRobot):
         yield lambda _pose: None
         return
+    from fcslam.errors import CloudError, StateError
     from fcslam.federated.learning_beside import LearningBeside
     from fcslam.live.standstill import Standstill
 
     with closing(LearningBeside(plan, robot.name, notify)) as learning:
 
         def stop() -> None:
-            robot.stand_still()
+            try:
+                robot.stand_still()
+            except (CloudError, StateError):  # it was told when it happened; the robot maps on, but does not learn
+                return
             learning.set_idle(robot.first_epoch)
 
         yield Standstill(stop, lambda: learning.set_idle(None)).follow

@@ -51,8 +51,7 @@ class OwnMap:
     @property
     def backlog(self) -> int:
         """Number of batches of packets that are not applied yet."""
-        while self._applying and self._applying[0].done():
-            self._applying.popleft()
+        self._forget_applied()
         return len(self._applying)
 
     def draw(self, session: str, T_map_own: FloatArray) -> OccupancyMap:
@@ -99,7 +98,12 @@ class OwnMap:
             failed.set_exception(error)
             return failed
 
+    def _forget_applied(self) -> None:
+        while self._applying and self._applying[0].done():
+            self._applying.popleft()
+
     def _await(self, applied: Future[list[tuple[int, Correction]]]) -> None:
+        self._forget_applied()
         self._applying.append(applied)
         applied.add_done_callback(self._take)
 

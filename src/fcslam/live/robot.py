@@ -6,6 +6,7 @@ beside it, which is another process, so no pose waits for it.
 
 import math
 import shutil
+import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
@@ -53,8 +54,6 @@ from fcslam.wire.messages import Hello, Packet
 JUMP_M, JUMP_RAD = 0.01, 0.005
 """Corrections that move the robot by less are no event."""
 
-CLOSE_S = 5.0
-"""Time that a robot whose block ends without an error waits for the server."""
 POLL_INTERVAL_S = 0.1
 """Interval at which ``finish`` looks whether the server has everything."""
 LARGEST_BACKLOG = 200
@@ -158,6 +157,9 @@ class Robot(LiveTracker):
         self._localizers: tuple[dict[int, Localizer], dict[int, Localizer]] = {}, {}
         """Corrections by part: those of the robot's own map, and those of the server. After being lost, the robot goes
         on in another part."""
+        self._T_map_own: dict[int, FloatArray] = {}
+        """By part, where the robot's own map lies in the map of the server, by its newest correction."""
+        self._correcting = threading.Lock()
         self._keyscans = self._part_base = 0
         self._is_placed = False
         """Whether the poses of all keyframes are written."""
@@ -268,7 +270,7 @@ class Robot(LiveTracker):
         self._catch_up()
         with self._lock:
             part = self._part
-        return own.draw(self._session(part), self._T_map_own(part))
+        return own.draw(self._session(part), self._own_map_pose(part))
 
     def closures(self) -> FloatArray:
         """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``.
@@ -280,7 +282,7 @@ class Robot(LiveTracker):
         own = self._require_own_map()
         with self._lock:
             part = self._part
-        return own.closures(self._session(part), self._T_map_own(part))
+        return own.closures(self._session(part), self._own_map_pose(part))
 
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost or changed its floor; it waits for the worker.
@@ -298,7 +300,8 @@ class Robot(LiveTracker):
             stamps, keyscans, offsets = track.stamps, track.keyscans, track.T_keyscan_base
             T_odom_keyscan = track.T_odom_keyscan
         known = np.empty((0, 3)) if self._own is None else self._own.poses(self._session(part))
-        known = se2.compose(self._T_map_own(part), known)
+        # The map may have got keyscans since the track was read.
+        known = se2.compose(self._own_map_pose(part), known[: len(T_odom_keyscan)])
         # Keyscans that the map does not have yet go on from the last one that it has.
         moved = self._localizer(part).T_map_base(np.zeros(3))
         T_map_odom = np.zeros(3) if moved is None else moved
@@ -446,15 +449,9 @@ class Robot(LiveTracker):
         if self._uplink is not None and self._uplink.failure is not None:
             raise self._uplink.failure
 
-    def _T_map_own(self, part: int) -> FloatArray:
+    def _own_map_pose(self, part: int) -> FloatArray:
         """Where the robot's own map lies in the map of its poses, shape (3,)."""
-        own, by_server = (localizers.get(part) for localizers in self._localizers)
-        if by_server is None or by_server.correction is None:
-            return np.zeros(3)
-        own_correction = None if own is None else own.correction
-        if own_correction is None:
-            return by_server.correction.T_map_odom
-        return se2.compose(by_server.correction.T_map_odom, se2.inverse(own_correction.T_map_odom))
+        return self._T_map_own.get(part, np.zeros(3))
 
     def _catch_up(self) -> None:
         """Wait, without keeping scans waiting, until the back end has handled everything so far."""
@@ -483,13 +480,27 @@ class Robot(LiveTracker):
             self._own.put([_in_epoch(packet, self._part_base + packet.epoch) for packet in packets])
 
     def _correct(self, epoch: int, correction: Correction) -> None:
-        """Take a correction of the robot's own map, in any thread."""
+        """Take a correction of the robot's own map, in any thread. While the server is away, it counts for the pose."""
         part = epoch - self._part_base
-        self._localizers[0].setdefault(part, Localizer(self._clock)).correct(correction)
+        with self._correcting:
+            own = self._localizers[0].setdefault(part, Localizer(self._clock))
+            own.correct(correction)
+            if part in self._T_map_own and own.correction is not None and self._is_server_away():
+                T_map_odom = se2.compose(self._T_map_own[part], own.correction.T_map_odom)
+                self._localizers[1][part].move(T_map_odom)
 
     def _correct_by_server(self, part: int, correction: Correction) -> None:
         """Take a correction of the server, in any thread."""
-        self._localizers[1].setdefault(part, Localizer(self._clock)).correct(correction)
+        with self._correcting:
+            by_server = self._localizers[1].setdefault(part, Localizer(self._clock))
+            by_server.correct(correction)
+            if by_server.correction is correction:
+                own = self._localizers[0].get(part)
+                T_own_odom = np.zeros(3) if own is None or own.correction is None else own.correction.T_map_odom
+                self._T_map_own[part] = se2.compose(correction.T_map_odom, se2.inverse(T_own_odom))
+
+    def _is_server_away(self) -> bool:
+        return self._uplink is None or self._uplink.trouble is not None
 
     def _floor(self, part: int) -> str:
         return self._floors[self._first_on_floor(part)]

@@ -1,9 +1,10 @@
 """Pose of a robot in the fleet's map: its own smooth motion, corrected by the cloud."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from fcslam.geometry import se2
-from fcslam.records import Correction, FloatArray
+from fcslam.records import Correction, FloatArray, frozen
 
 
 class Localizer:
@@ -19,6 +20,12 @@ class Localizer:
         """Apply a correction unless a newer one was applied before. Any thread may call this."""
         if self._corrected is None or correction.version > self._corrected[0].version:
             self._corrected = correction, self._clock()
+
+    def move(self, T_map_odom: FloatArray) -> None:
+        """Move ``odom`` in the map of the newest correction, as shape (3,); nothing before the first one."""
+        if self._corrected is not None:
+            correction, arrived_s = self._corrected
+            self._corrected = replace(correction, T_map_odom=frozen(T_map_odom)), arrived_s
 
     @property
     def correction(self) -> Correction | None:

@@ -70,7 +70,12 @@ class LocalizerBeside:
                 self.state = MapState(self.state.session, None, self.state.fixes, self.state.losses)
                 handled.set_exception(error)
 
-        self._executor.submit(function, self._robot, argument).add_done_callback(take)
+        try:
+            asked = self._executor.submit(function, self._robot, argument)
+        except RuntimeError as error:  # the worker has ended, or the executor was shut down
+            asked = Future()
+            asked.set_exception(error)
+        asked.add_done_callback(take)
         return handled
 
 

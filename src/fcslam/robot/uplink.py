@@ -61,6 +61,7 @@ class Uplink:
         self._unstored: deque[Future[None]] = deque()
         """Packets on their way into the outbox."""
         self._unstored_lock = threading.Lock()
+        self._storing_failure: Exception | None = None
         self._sender: Sender | None = None
         self._stop = threading.Event()
         if transport is not None:
@@ -82,8 +83,8 @@ class Uplink:
             self.before_record()
 
     def put(self, packets: Sequence[Packet]) -> None:
-        """Store the next packets of the front end, later."""
-        if packets:
+        """Store the next packets of the front end, later; none after the outbox failed."""
+        if packets and self._failure_of_storing() is None:
             self._unstored.append(self._storing.submit(self._store, packets))
 
     def close(self) -> None:
@@ -96,17 +97,12 @@ class Uplink:
     @property
     def failure(self) -> Exception | None:
         """The error that ended one of the threads: a cloud that rejects the robot, or an outbox that cannot be used."""
-        with self._unstored_lock:
-            while self._unstored and self._unstored[0].done():
-                error = self._unstored[0].exception()
-                if isinstance(error, Exception):
-                    return error
-                self._unstored.popleft()
-        return None if self._sender is None else self._sender.failure
+        failure = self._failure_of_storing()
+        return self._sender.failure if failure is None and self._sender is not None else failure
 
     @property
     def unstored(self) -> int:
-        """Number of batches of packets on their way into the outbox; those of a failed outbox stay there."""
+        """Number of batches of packets on their way into the outbox."""
         return len(self._unstored) if self.failure is None else 0
 
     @property
@@ -157,6 +153,16 @@ class Uplink:
         sender = self._sender
         found = sender.notice, sender.refused_notice, sender.removed_notice, self._detector_updates.notice
         return tuple(filter(None, found))
+
+    def _failure_of_storing(self) -> Exception | None:
+        """The error that ended the outbox; batches that were stored are forgotten, and all of them once it failed."""
+        with self._unstored_lock:
+            while self._unstored and self._unstored[0].done():
+                error = self._unstored.popleft().exception()
+                if isinstance(error, Exception):
+                    self._storing_failure = self._storing_failure or error
+                    self._unstored.clear()
+            return self._storing_failure
 
     def _store(self, packets: Sequence[Packet]) -> None:
         chosen = packets if self._budget is None else self._budget.fit(packets)
