@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from fcslam.bridges.node import await_sensors
-from fcslam.bridges.record import record
+from fcslam.bridges.record import _Inbox, record
 from fcslam.bridges.ros1 import INSTALL as INSTALL_ROS1
 from fcslam.bridges.ros1 import Ros1Network
 from fcslam.bridges.ros2 import INSTALL as INSTALL_ROS2
@@ -40,6 +40,18 @@ def test_a_recording_is_a_bag(tmp_path):
     survey = open_source(output).survey()
     assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
     assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
+
+
+def test_messages_that_the_disk_cannot_take_are_counted(monkeypatch):
+    monkeypatch.setattr("fcslam.bridges.record.LARGEST_INBOX_BYTES", 250)
+    inbox = _Inbox()
+    for number in range(4):
+        inbox.put("/image", number, bytes(100))
+    assert inbox.lost == 2
+    assert inbox.get(0.0)[1] == 0
+    inbox.put("/image", 4, bytes(100))
+    assert [inbox.get(0.0)[1] for _ in range(2)] == [1, 4]
+    assert (inbox.lost, inbox.is_empty) == (2, True)
 
 
 @pytest.mark.parametrize(

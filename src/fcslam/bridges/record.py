@@ -18,6 +18,8 @@ from fcslam.sources.bags.codec import full_name, typestore
 
 _POLL_S = 0.2
 _DEPTH = 1000
+LARGEST_INBOX_BYTES = 256_000_000
+"""Most bytes that wait for the disk; beyond, the next messages are lost."""
 
 
 def record(
@@ -35,13 +37,13 @@ def record(
     Raises:
         OutputError: the file cannot be written.
     """
-    inbox: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
+    inbox = _Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
 
     def subscribe(topic: str, kind: str, reliable: bool) -> None:
         latched = topic.rsplit("/", 1)[-1] == TF_STATIC
         quality = Quality(reliable or latched, latched, _DEPTH)
-        network.subscribe(topic, kind, quality, lambda payload: inbox.put((topic, time.time_ns(), payload)))
+        network.subscribe(topic, kind, quality, lambda payload: inbox.put(topic, time.time_ns(), payload))
 
     offered = [point for point in network.endpoints() if point.publishes]
     for topic, kind in kinds.items():
@@ -51,9 +53,9 @@ def record(
     try:
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
             with _Recording(Path(staging, output.stem), network.ros1) as recording:
-                while not stop.is_set() or not inbox.empty():
+                while not stop.is_set() or not inbox.is_empty:
                     try:
-                        topic, received_ns, payload = inbox.get(timeout=_POLL_S)
+                        topic, received_ns, payload = inbox.get(_POLL_S)
                     except queue.Empty:
                         continue
                     recording.write(topic, kinds[topic], received_ns, payload)
@@ -65,7 +67,45 @@ def record(
     for topic in (*topics.scans, *filter(None, (topics.odometry,))):
         if not counts[topic]:
             notify(f"{topic}: no message arrived")
+    if inbox.lost:
+        notify(f"the disk is slower than the messages: {inbox.lost} were lost; record fewer topics, or on another disk")
     return counts
+
+
+class _Inbox:
+    """Messages that wait for the disk. Any thread may put."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        """Messages that came while too many bytes waited."""
+        self._messages: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no message waits."""
+        return self._messages.empty()
+
+    def put(self, topic: str, received_ns: int, payload: bytes) -> None:
+        """Add the next message, or lose it if too much waits."""
+        with self._lock:
+            if self._waiting_bytes + len(payload) > LARGEST_INBOX_BYTES:
+                self.lost += 1
+                return
+            self._waiting_bytes += len(payload)
+        self._messages.put((topic, received_ns, payload))
+
+    def get(self, timeout_s: float) -> tuple[str, int, bytes]:
+        """The next message.
+
+        Raises:
+            queue.Empty: none came within the time.
+        """
+        message = self._messages.get(timeout=timeout_s)
+        with self._lock:
+            self._waiting_bytes -= len(message[2])
+        return message
 
 
 class _Recording:

@@ -40,7 +40,7 @@ from fcslam.runs.tables import (
     write_robots,
 )
 from fcslam.runs.trajectories import read_tum, write_tum
-from fcslam.storage.files import replacing_folder
+from fcslam.storage.files import bring_back, replacing_folder
 from fcslam.storage.own_files import write_own
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
@@ -122,6 +122,7 @@ def prepare_output(path: Path, force: bool = False) -> Path:
     place = path.resolve()
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
+        bring_back(place)
         occupied = place.exists() and (not place.is_dir() or any(place.iterdir()))
     except OSError as error:
         raise OutputError(f"{path}: cannot be used as the output folder ({error})") from error

@@ -1,5 +1,9 @@
-"""Atomic writes: a file or a folder holds all of its old content or all of the new one, whatever happens."""
+"""Atomic writes: a file or a folder holds all of its old content or all of the new one, also after a power cut.
 
+A folder is replaced in two steps. A process that is killed between them leaves none; ``bring_back`` undoes the first.
+"""
+
+import glob
 import os
 import shutil
 from collections.abc import Iterator
@@ -23,6 +27,8 @@ def write_file(path: Path, content: bytes | memoryview | str, *, private: bool =
         mode = 0o600 if private else 0o666
         with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
+            file.flush()
+            os.fsync(file.fileno())  # else the name may be there after a power cut, without the content
 
 
 def keep_private() -> None:
@@ -53,6 +59,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be written or replaced; the old one is unchanged.
     """
+    bring_back(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
     retired = path.with_name(f".{path.name}.{os.getpid()}.retired")
     try:
@@ -62,6 +69,18 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
         shutil.rmtree(retired, ignore_errors=True)
+
+
+def bring_back(path: Path) -> None:
+    """Give the old folder its name again if a process was killed while it replaced it.
+
+    Raises:
+        OSError: the folder cannot be renamed.
+    """
+    if not path.exists():
+        for retired in path.parent.glob(f".{glob.escape(path.name)}.*.retired"):
+            retired.rename(path)
+            return
 
 
 def _exchange(path: Path, unfinished: Path, retired: Path) -> None:
