@@ -139,7 +139,7 @@ def _learning(
         def stop() -> None:
             try:
                 robot.stand_still()
-            except (CloudError, StateError):  # it was told when it happened; the robot maps on, but does not learn
+            except (CloudError, StateError):  # an event named it; the robot maps on, but does not learn
                 return
             learning.set_idle(robot.first_epoch)
 

@@ -33,7 +33,7 @@ class NewEdit(Settings):
 
     kind: Literal["veto", "removal", "cut", "pin", "closure", "placement", "region", "floor"]
     content: dict[str, Any] = Field(
-        description="what it names, as `GET /edits` shows it; examples: docs/howto/deploy.md"
+        description="what it names, as `GET /edits` shows it; examples: docs/howto/operate.md"
     )
 
 
