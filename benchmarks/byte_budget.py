@@ -22,6 +22,7 @@ import numpy as np
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
+from fcslam.errors import EvaluationError
 from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
@@ -84,7 +85,14 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     tracks = {robot: track(frontend) for robot, (frontend, _) in robots.items()}
     with tempfile.TemporaryDirectory() as place:
         run_of(result, tracks, (), dump(config), config.map, with_local_maps=False).save(Path(place) / "run")
-        errors = evaluate_relations(Path(place) / "run", relations, RelationsQuestion(across_robots=True))
+        try:
+            errors = evaluate_relations(Path(place) / "run", relations, RelationsQuestion(across_robots=True))
+            measured = (
+                f"{errors.used} of {errors.total}", errors.translation.mean, errors.translation.maximum,
+                errors.rotation.mean,
+            )  # fmt: skip
+        except EvaluationError:  # no two robots share a map
+            measured = ("0", np.nan, np.nan, np.nan)
     sent = sum(len(encode(packet)) for stream in streams for packet in stream)
     seconds = sum(float(np.ptp(track.stamps)) for track in tracks.values())
     places = [packet.body for stream in streams for packet in stream if isinstance(packet.body, Place)]
@@ -92,8 +100,7 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     return (
         sent / seconds / 1e3, len(places),
         sum(budget.left_out for budget in budgets.values()), mean(len(place.descriptors) for place in places),
-        len(closures), len({robot.map_index for robot in result.robots}), f"{errors.used} of {errors.total}",
-        errors.translation.mean, errors.translation.maximum, errors.rotation.mean,
+        len(closures), len({robot.map_index for robot in result.robots}), *measured,
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from pydantic import Field
 
-from fcslam.config import Settings, dump, load, parse
+from fcslam.config import Settings, dump, load, parse, parse_yaml
 from fcslam.errors import ConfigError
 from fcslam.mission import MissionConfig
 
@@ -90,3 +90,15 @@ def test_files_that_are_no_configuration(tmp_path, content):
     with pytest.raises(ConfigError, match="yaml: ") as caught:
         load(Outer, path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["seed: 1\nseed: 2\n", "robot:\n  sends: words\nrobot:\n  sends: descriptors\n"])
+def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
+    path = tmp_path / "c.yaml"
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=r"c\.yaml: not valid YAML \(the key '(seed|robot)' is there twice"):
+        load(MissionConfig, path)
+
+
+def test_yaml_may_merge_mappings():
+    assert parse_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}\n")["b"] == {"x": 1, "y": 2}

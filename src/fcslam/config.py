@@ -2,6 +2,7 @@
 
 import difflib
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -65,7 +66,8 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}") from error
         if first["type"] == "value_error" and isinstance(first["input"], dict):  # keys that do not fit each other
-            raise ConfigError(f"{where}: {key}: {first['ctx']['error']}") from error
+            place = f"{where}: {key}" if key else where
+            raise ConfigError(f"{place}: {first['ctx']['error']}") from error
         raise ConfigError(
             f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})"
         ) from error
@@ -115,6 +117,18 @@ def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(model.model_fields)}"
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """Refuses a mapping that has a key twice: YAML forbids it, and the second value would win without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As of a SafeLoader."""
+        keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = next((key for key, count in Counter(keys).items() if count > 1), None)
+        if twice is not None and twice[1] != "<<":
+            raise yaml.constructor.ConstructorError(None, None, f"the key '{twice[1]}' is there twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def parse_yaml(text: str | bytes) -> Any:
     """Content of YAML text of unknown origin.
 
@@ -122,7 +136,7 @@ def parse_yaml(text: str | bytes) -> Any:
         ValueError: it is not valid YAML; the message is one line.
     """
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _UniqueKeys)
     except Exception as error:  # beside its own errors, those of its constructors: recursion, dates, numbers, ...
         raise ValueError(f"not valid YAML ({one_line(str(error))})") from error
 

@@ -12,7 +12,7 @@ import pytest
 from pydantic import Field
 
 from fcslam import __version__, cli
-from fcslam.cli import main
+from fcslam.cli import BAD_INPUT, main
 from fcslam.config import Settings, load
 from fcslam.mission import MissionConfig
 from fcslam.presets import Preset
@@ -185,3 +185,12 @@ def test_ctrl_c_is_one_line_and_130(tmp_path):
         os.close(pipe)
     assert process.returncode == 130
     assert error.strip() == "fcslam: interrupted"
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+def test_a_number_that_is_none_is_refused(tmp_path, capsys, number):
+    arguments = ["simulate", "-o", str(tmp_path / "s"), f"--path-length={number}", "--robots", "1"]
+    assert main(arguments) == BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{number}: is no finite number" in line
+    assert not (tmp_path / "s").exists()

@@ -44,8 +44,30 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
     assert main(arguments) == 0
     assert (output / "detector.onnx").read_bytes() == first
     assert "Teacher: none" in card
+    assert "none was held out" in card
+    assert "an image that was trained on" in card
+    assert "0 held out" in captured.err
     assert main([*arguments, "--steps", "3"]) == 0
     assert (output / "detector.onnx").read_bytes() != first
+    kept = (output / "detector.onnx").read_bytes(), (output / "card.md").read_text()
+    capsys.readouterr()
+    assert "has 3 steps already, more than 2" in complaint(capsys, photos, "-o", output, "--config", settings)
+    cv2.imwrite(str(photos / "later.png"), textured(9))
+    more = [photos, "-o", output, "--config", settings, "--steps", "3"]
+    assert "was trained on other images" in complaint(capsys, *more)
+    assert kept == ((output / "detector.onnx").read_bytes(), (output / "card.md").read_text())
+
+
+@pytest.mark.slow
+def test_an_output_folder_among_the_images_is_no_image(photos, tmp_path, capsys):
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1}")
+    arguments = ["train", str(photos), "-o", str(photos / "out"), "--config", str(settings), *OPTIONS]
+    assert main(arguments) == 0
+    assert "5 images" in capsys.readouterr().err
+    assert main(arguments) == 0
+    assert "5 images" in capsys.readouterr().err
 
 
 def test_bad_input_is_one_line(photos, tmp_path, capsys):
@@ -66,6 +88,8 @@ def test_a_folder_of_no_use_is_one_line(tmp_path, capsys):
     cv2.imwrite(str(folder / "wall.png"), 0 * textured(0))
     teacher = tmp_path / "teacher"
     assert "0 of 1 image files" in complaint(capsys, folder, "-o", tmp_path / "out", "--teacher", teacher)
+    assert "0 of 1 image files" in complaint(capsys, folder, "-o", tmp_path / "out")
+    assert not (tmp_path / "out" / "shapes").exists(), "it is said before the training on shapes"
 
 
 def test_without_torch_it_says_what_to_install(photos, tmp_path, capsys, monkeypatch):

@@ -71,7 +71,9 @@ def test_a_reply_that_is_none_becomes_an_error(grid):
 
 def test_a_robot_is_online_for_a_while(grid, clock):
     assert grid.get_node_ids() == []
-    assert grid.mark_online("two")
+    assert grid.admits("two")
+    assert grid.get_node_ids() == []
+    grid.mark_online("two")
     assert grid.get_node_ids() == [3]
     clock.now = ONLINE_S + 0.1
     assert grid.get_node_ids() == []
@@ -109,12 +111,12 @@ def test_who_waits_gets_the_replies(grid):
 
 
 def test_a_fleet_with_keys_has_no_other_robots(grid):
-    assert not grid.mark_online("stranger")
+    assert not grid.admits("stranger")
     assert grid.robot_names() == {2: "one", 3: "two"}
 
 
 def test_a_fleet_without_keys_has_room_for_so_many():
     grid = FleetGrid(None)
-    assert all(grid.mark_online(str(number)) for number in range(MAX_OPEN_ROBOTS))
-    assert not grid.mark_online("one more")
-    assert grid.mark_online("0")
+    assert all(grid.admits(str(number)) for number in range(MAX_OPEN_ROBOTS))
+    assert not grid.admits("one more")
+    assert grid.admits("0")

@@ -87,6 +87,15 @@ def test_a_teacher_whose_parts_do_not_fit_is_said(tmp_path):
         read_teacher(tmp_path / "x.npz")
 
 
+@pytest.mark.parametrize(
+    "scores", [np.zeros((3, 1)), np.zeros(()), np.array(["a", "b", "c"]), np.array([0.1, np.nan, 0.2])]
+)
+def test_scores_that_rank_nothing_are_refused(tmp_path, scores):
+    np.savez(tmp_path / "x.npz", keypoints=np.zeros((3, 2)), scores=scores, descriptors=np.zeros((3, 8)))
+    with pytest.raises(TrainingError, match=r"x\.npz.*do not fit"):
+        read_teacher(tmp_path / "x.npz")
+
+
 @pytest.mark.parametrize("family", dict.fromkeys(FAMILIES), ids=lambda family: family.__name__)
 def test_corners_of_shapes_are_corners(family):
     """Near most of them Harris answers more than he does almost everywhere else."""

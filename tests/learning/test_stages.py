@@ -81,6 +81,24 @@ def test_another_teacher_gives_other_labels(tmp_path):
     assert not np.array_equal(first, other)
 
 
+def test_other_settings_of_labels_give_other_labels(tmp_path):
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    from fcslam.learning.settings import TrainingSettings
+    from fcslam.learning.stages import read_labelled_images
+
+    for seed in (1, 2):
+        write(tmp_path / "x" / f"{seed}.png", textured(seed))
+
+    def keypoints(copies, cache):
+        files, settings = find_images([tmp_path / "x"]), TrainingSettings(label_copies=copies)
+        found = read_labelled_images(files, tmp_path / cache, settings, None, None, lambda *_: None)
+        return found.train[0].labels.keypoints
+
+    first = keypoints(0, "labels")
+    assert np.array_equal(keypoints(3, "labels"), keypoints(3, "new"))
+    assert not np.array_equal(first, keypoints(3, "labels"))
+
+
 def test_folders_of_one_name_with_the_same_files_are_refused(tmp_path):
     for place in ("here", "there"):
         write(tmp_path / place / "photos" / "1.png", textured(1))

@@ -11,13 +11,21 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
 from fcslam.learning.checkpoint import Checkpoint, write_checkpoint  # noqa: E402
+from fcslam.learning.curve import read_curves  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse_keypoints  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.objective import negatives, shift_grid, teacher_bits  # noqa: E402
 from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.trainer import CHECKPOINT_FILE, ExecutionOptions, TrainingRun, trained_network, validation_pairs  # noqa: E402
+from fcslam.learning.trainer import (  # noqa: E402
+    CHECKPOINT_FILE,
+    PROGRESS_FILE,
+    ExecutionOptions,
+    TrainingRun,
+    trained_network,
+    validation_pairs,
+)
 from fcslam.learning.training_step import learning_rate  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate  # noqa: E402
 from fcslam.storage.files import replacing  # noqa: E402
@@ -217,3 +225,10 @@ def test_teacher_bits_are_balanced_and_keep_angles():
     hamming = torch.cdist(bits[:50].float(), bits[:50].float()).square()
     upper = torch.triu(torch.ones(50, 50), 1) > 0
     assert torch.corrcoef(torch.stack((angles[upper], hamming[upper])))[0, 1] > 0.8
+
+
+@pytest.mark.slow
+def test_a_log_that_a_full_disk_left_empty_gets_its_head(examples, tmp_path):
+    (tmp_path / PROGRESS_FILE).touch()
+    TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
+    assert read_curves(tmp_path / PROGRESS_FILE, "joint")["detector"][0] == [1, 2, 3, 4, 5, 6]

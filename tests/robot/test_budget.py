@@ -69,28 +69,6 @@ def test_what_is_allowed_is_used(drive):
     assert Budget(float("inf")).fit(drive) == drive
 
 
-def test_a_pause_saves_no_more_than_a_burst():
-    """After an hour at rest, or a clock that is set, no more travels than after ten seconds."""
-    rate = 1000.0
-
-    def sent_after(pause):
-        budget = Budget(rate)
-        budget.fit([said(0, HELLO, 0.0)])
-        return sum(len(encode(p)) for k in range(9) for p in budget.fit([said(k + 1, PLACES[400], pause)]))
-
-    assert sent_after(3600.0) == sent_after(BURST_S) <= rate * BURST_S
-
-
-def test_a_clock_that_steps_back_stops_no_place():
-    budget = Budget(4000.0)
-    for second in range(30):
-        budget.fit([said(second, PLACES[60], 1e6 + second)])
-    left_out = budget.left_out
-    for second in range(30, 60):
-        budget.fit([said(second, PLACES[60], second)])
-    assert left_out == budget.left_out == 0
-
-
 def test_the_chain_travels_whatever_it_costs(drive):
     budget = Budget(1.0)
     kept = budget.fit(drive)

@@ -60,6 +60,8 @@ def test_the_list_shows_no_token(tokens, capsys):
         (("revoke", "ben"), "there are anna"),
         (("rotate", "ben", "-o", "x"), "there are anna"),
         (("add", "ben", "--role", "robot", "-o", "missing/x"), "cannot write"),
+        (("add", "ben", "--role", "robot", "-o", "a"), "a: exists, and would be lost"),
+        (("rotate", "anna", "-o", "tokens.yaml"), "tokens.yaml: exists, and would be lost"),
     ],
 )
 def test_wrong_requests_change_nothing_and_are_one_line(tokens, capsys, monkeypatch, arguments, told):
@@ -71,6 +73,15 @@ def test_wrong_requests_change_nothing_and_are_one_line(tokens, capsys, monkeypa
     assert told in line
     assert tokens.path.read_bytes() == before
     assert sorted(os.listdir()) == ["a", "tokens.yaml"]
+
+
+def test_a_new_token_may_replace_the_file_of_the_old_one(tokens):
+    file = str(tokens.folder / "a")
+    assert tokens("add", "anna", "--role", "robot", "-o", file) == 0
+    before = (tokens.folder / "a").read_text()
+    assert tokens("rotate", "anna", "-o", file) == 0
+    assert (tokens.folder / "a").read_text() != before
+    assert who(tokens, "a") == Identity("anna", Role.ROBOT)
 
 
 def test_mode_of_the_file_stays(tokens):

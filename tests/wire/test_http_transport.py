@@ -151,7 +151,13 @@ def test_a_network_comes_as_it_is(cloud, transport):
     assert cloud.requests[0][:2] == ("GET", "/api/v1/detectors/camera/cnn-0.3%2Br12")
 
 
-@pytest.mark.parametrize("url", ["cloud.example", "ftp://cloud.example", "https://", "8443", ""])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "cloud.example", "ftp://cloud.example", "https://", "8443", "", "http://localhost:x", "http://localhost:99999",
+        "http://localhost:-5", "http://localhost:0", "http://[::1", "http://a b:80",
+    ],
+)  # fmt: skip
 def test_an_address_must_be_one(url):
     with pytest.raises(CloudError, match="not the address of a cloud"):
         HttpTransport(url, "r", "ab" * 16)

@@ -1,5 +1,6 @@
 """The command line: one module for each command. Commands import what they need when they run, so help is quick."""
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Annotated
@@ -32,7 +33,7 @@ from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
 from fcslam.cli.examples import examples
-from fcslam.errors import FcslamError
+from fcslam.errors import FcslamError, InputError
 
 BAD_INPUT, INTERRUPTED = 2, 130
 """Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells."""
@@ -133,6 +134,22 @@ app.add_typer(federate.app, name="federate")
 app.add_typer(tokens.app, name="tokens")
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(config.app, name="config")
+
+
+def _finite(text: str) -> float:
+    """Number of an option; click takes `nan` for one in every range.
+
+    Raises:
+        InputError: it is not finite.
+        ValueError: it is no number.
+    """
+    number = float(text)
+    if not math.isfinite(number):
+        raise InputError(f"{text}: is no finite number; give one to the option")
+    return number
+
+
+click.types.FloatParamType._number_class = staticmethod(_finite)  # type: ignore[assignment]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

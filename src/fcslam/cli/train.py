@@ -86,11 +86,9 @@ def train(
     files = write_training_artifacts(network, output, settings, found, teacher)
     for file in files:
         typer.echo(str(file))
-    print_line(
-        console,
-        f"{time.perf_counter() - began:.0f} s; {len(found.train)} images, {len(found.held_out)} held out, "
-        f"{found.skipped} left out",
-    )
+    held_out = len(found.held_out) if found.are_held_out else 0
+    seconds, images_read = time.perf_counter() - began, len(found.train)
+    print_line(console, f"{seconds:.0f} s; {images_read} images, {held_out} held out, {found.skipped} left out")
 
 
 def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "TrainingSettings":

@@ -56,10 +56,15 @@ class FleetGrid(RobotGrid):
         self._issued = 0
         self._changed = threading.Condition()
 
-    def mark_online(self, robot: str) -> bool:
-        """Note that a robot has been heard of; false if the fleet has no room for it."""
+    def admits(self, robot: str) -> bool:
+        """Whether the fleet has room for a robot."""
         with self._changed:
-            return self._online(robot) is not None
+            return self._node(robot) is not None
+
+    def mark_online(self, robot: str) -> None:
+        """Note that a robot asks for requests or works on one: rounds wait for it."""
+        with self._changed:
+            self._online(robot)
 
     def next_request(self, robot: str) -> Request | None:
         """The request that the robot should work on now; None if there is none."""
@@ -142,11 +147,14 @@ class FleetGrid(RobotGrid):
         online = self.get_node_ids()
         return any(request.number in numbers for node in online for request in self._requests[node])
 
-    def _online(self, robot: str) -> int | None:
+    def _node(self, robot: str) -> int | None:
         if self._is_open and robot not in self._nodes and len(self._nodes) < MAX_OPEN_ROBOTS:
             self._nodes[robot] = FIRST_NODE + len(self._nodes)
             self._requests[self._nodes[robot]] = deque()
-        node = self._nodes.get(robot)
+        return self._nodes.get(robot)
+
+    def _online(self, robot: str) -> int | None:
+        node = self._node(robot)
         if node is not None:
             self._seen[node] = self._clock()
         return node

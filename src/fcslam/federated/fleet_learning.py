@@ -90,12 +90,13 @@ class MissionTeacher:
 
     def judge(self, mission: MissionPlaces) -> None:
         """Take the version in use back if it certainly finds fewer places than the one before."""
-        version, before = self.releases.pair
+        number, earlier = self.releases.pair
+        version, before = (self.releases.versions[each] for each in (number, earlier))
         loss = is_worse(mission.found_again(version, before), self.settings.gate, self.settings.federated.training.seed)
         if loss is not None:
-            number = self.releases.take_back()
+            in_use = self.releases.take_back(number)
             _log.warning("%s finds fewer places than %s (%+.3f): taken back", version, before, loss.mean)
-            self.tell(RELEASE, number)
+            self.tell(RELEASE, in_use)
 
     def run(self, stop: threading.Event) -> None:
         """Follow the mission until ``stop`` is set."""
@@ -168,7 +169,9 @@ def _tell(event: str, number: int) -> None:
 
 
 def _end_with_stdin() -> None:
-    sys.stdin.buffer.read()
+    # Not by sys.stdin, whose lock Python waits for when the process ends.
+    while os.read(0, 4096):
+        pass
     os._exit(0)
 
 

@@ -154,16 +154,16 @@ def serve_requests(
         TrainingError: the server does not accept the robot.
     """
 
-    with _signs_of_life(link):
-        while True:
-            found = _retried(link.fetch, on_notice, sleep)
-            if found is None:
-                continue
-            number, data = found
-            bring = partial(link.reply, number, answer(app, context, data, on_notice))
-            reason = _retried(bring, on_notice, sleep)
-            if reason is not None:
-                on_notice(f"the server does not take a reply: {reason}")
+    while True:
+        found = _retried(link.fetch, on_notice, sleep)
+        if found is None:
+            continue
+        number, data = found
+        with _signs_of_life(link):
+            reply = answer(app, context, data, on_notice)
+        reason = _retried(partial(link.reply, number, reply), on_notice, sleep)
+        if reason is not None:
+            on_notice(f"the server does not take a reply: {reason}")
 
 
 def answer(app: ClientApp, context: Context, data: bytes, on_notice: Callable[[str], None]) -> bytes:

@@ -105,7 +105,7 @@ class FleetApp:
                 robot = await run_in_threadpool(
                     self._authenticator.robot, request.method, request.url.path, request.headers
                 )
-                if not self._grid.mark_online(robot):
+                if not self._grid.admits(robot):
                     raise RefusedRequestError("the fleet is full")
             except RefusedRequestError as error:
                 return self._refusal(request, 401, str(error))
@@ -133,11 +133,13 @@ class FleetApp:
             await asyncio.sleep(POLL_S)
         return Response(status_code=204)
 
-    async def _alive(self, request: Request, _robot: str) -> Response:
+    async def _alive(self, request: Request, robot: str) -> Response:
         await self._body(request, 0)
+        self._grid.mark_online(robot)
         return Response(status_code=204)
 
     async def _reply(self, request: Request, robot: str) -> Response:
+        self._grid.mark_online(robot)
         number = int(request.path_params["number"])
         limit = self._grid.reply_limit(robot, number)
         if limit == 0:

@@ -66,6 +66,12 @@ class RobotLearningSettings(Settings):
     )
 
 
+class LiveTraining(TrainingSettings):
+    """Training settings with the rate of the study."""
+
+    learning_rate: float = Field(default=1e-3, gt=0.0, description="learning rate after the warm-up, its highest value")
+
+
 class LiveRounds(FederatedSettings):
     """Federated settings whose defaults are the recipe of the study of closures as teachers."""
 
@@ -85,8 +91,8 @@ class LiveRounds(FederatedSettings):
         description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
         "weights give them, so that they stay compatible and less is forgotten; 0 for off",
     )
-    training: TrainingSettings = Field(
-        default_factory=lambda: TrainingSettings(learning_rate=1e-3),
+    training: LiveTraining = Field(
+        default_factory=LiveTraining,
         description="training on each robot; its steps are replaced by rounds times local_steps",
     )
 

@@ -66,9 +66,10 @@ class Releases:
         return self.in_use > 0
 
     @property
-    def pair(self) -> tuple[str, str]:
-        """The version in use and the one before it that was not taken back."""
-        return self.versions[self.in_use], self.versions[self._before()]
+    def pair(self) -> tuple[int, int]:
+        """Numbers of the version in use and of the one before it that was not taken back."""
+        with self._lock:
+            return self.in_use, self._before(self.in_use)
 
     def add(self, version: str, detector: bytes, weights: Weights) -> int:
         """Keep a released version, which is in use from now on; returns its number.
@@ -88,14 +89,14 @@ class Releases:
             self._write()
             return number
 
-    def take_back(self) -> int:
-        """Go back to the version before the one in use; returns its number."""
+    def take_back(self, number: int) -> int:
+        """Take a version back; if it is in use, the one before it is from now on. Returns the number of that in use."""
         with self._lock:
-            before = self._before()
-            self.taken_back.add(self.in_use)
-            self.in_use = before
+            self.taken_back.add(number)
+            if self.in_use == number:
+                self.in_use = self._before(number)
             self._write()
-            return before
+            return self.in_use
 
     def fallback(self, version: str, initial: Weights) -> Weights | None:
         """The weights to go on from if a version was taken back; None if it was not.
@@ -109,8 +110,8 @@ class Releases:
                 return None
             return _weights(self.folder / f"{self.in_use}.npz") if self.in_use else initial
 
-    def _before(self) -> int:
-        return max(number for number in range(self.in_use) if number not in self.taken_back)
+    def _before(self, number: int) -> int:
+        return max((each for each in range(number) if each not in self.taken_back), default=0)
 
     def _write(self) -> None:
         index = {"versions": self.versions, "taken_back": sorted(self.taken_back), "in_use": self.in_use}

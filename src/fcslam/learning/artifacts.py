@@ -48,14 +48,15 @@ def _card(
     version: str, settings: TrainingSettings, images: TrainingImages, teacher: Path | None, figures: dict[str, float]
 ) -> str:
     taught = "none" if teacher is None else f"keypoints and descriptors in {teacher.name}"
+    held_out = f"{len(images.held_out)} others were held out" if images.are_held_out else "none was held out"
+    judged = "held-out images" if images.are_held_out else "an image that was trained on"
     lines = [
         f"# Detector {version}",
         "",
-        f"Trained on {len(images.train)} images; {len(images.held_out)} others were held out, {images.skipped} left "
-        "out.",
+        f"Trained on {len(images.train)} images; {held_out}, {images.skipped} left out.",
         f"Teacher: {taught}.",
         "",
-        "| on pairs of held-out images, 320 x 240, warped and lit at random | |",
+        f"| on pairs of views of {judged}, 320 x 240, warped and lit at random | |",
         "|---|---|",
         *(f"| {SHOWN_METRICS[name]} | {value:.3f} |" for name, value in figures.items()),
         "",

@@ -28,6 +28,8 @@ class Checkpoint:
     """Of the run; a run with other settings does not continue from this checkpoint."""
     tensors: dict[str, Tensor]
     """All tensors of network, averaged network and optimiser, by name."""
+    examples: int = 0
+    """Checksum of what is trained on; a run on something else does not continue from this checkpoint."""
 
     def part(self, prefix: str) -> dict[str, Tensor]:
         """The tensors whose names begin with ``prefix``, by the rest of their names."""
@@ -45,6 +47,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "stage": checkpoint.stage,
         "step": checkpoint.step,
         "settings": checkpoint.settings,
+        "examples": checkpoint.examples,
     }
     arrays: dict[str, Any] = {_HEADER: np.array(json.dumps(header))}
     arrays |= {name: tensor.detach().cpu().numpy() for name, tensor in checkpoint.tensors.items()}
@@ -67,7 +70,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         header = json.loads(str(arrays.pop(_HEADER)))
         if header["format"] == FORMAT:
             tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-            return Checkpoint(header["stage"], header["step"], header["settings"], tensors)
+            return Checkpoint(header["stage"], header["step"], header["settings"], tensors, header.get("examples", 0))
         found = header["format"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TrainingError(f"{path}: is no checkpoint of a training run ({error}); remove it") from error

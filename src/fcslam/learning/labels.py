@@ -74,15 +74,20 @@ def read_teacher(path: Path) -> Teacher:
     """
     try:
         arrays = read_arrays(path)
-        keypoints, scores, descriptors = arrays["keypoints"], arrays["scores"], arrays["descriptors"]
-        order = np.argsort(-scores, kind="stable")
-        teacher = Teacher(keypoints[order].astype(np.float32), descriptors[order].astype(np.float16))
-        sound = keypoints.shape == (len(scores), 2) and descriptors.ndim == 2 and len(descriptors) == len(scores)
-    except (OSError, ValueError, KeyError, IndexError) as error:
+        keypoints, scores, descriptors = (arrays[name] for name in ("keypoints", "scores", "descriptors"))
+    except (OSError, ValueError, KeyError) as error:
         raise TrainingError(f"{path}: is no file of a teacher's points ({error})") from error
-    if not sound or not np.isfinite(teacher.keypoints).all() or not np.isfinite(teacher.descriptors).all():
+    sides = (scores.ndim, keypoints.ndim, keypoints.shape[1:], descriptors.ndim) == (1, 2, (2,), 2)
+    sound = sides and len(keypoints) == len(scores) == len(descriptors)
+    if not sound or not all(is_finite(array) for array in (keypoints, scores, descriptors)):
         raise TrainingError(f"{path}: keypoints (N, 2), scores (N,) and descriptors (N, D) do not fit together")
-    return teacher
+    order = np.argsort(-scores.astype(np.float64), kind="stable")
+    return Teacher(keypoints[order].astype(np.float32), descriptors[order].astype(np.float16))
+
+
+def is_finite(array: NDArray[np.generic]) -> bool:
+    """Whether an array holds finite numbers only."""
+    return array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
 
 
 def write_labels(path: Path, labels: Labels, key: int) -> None:

@@ -54,6 +54,20 @@ class TrainingImages:
     skipped: int
     """Number of files that are no images, too small, or have too few corners."""
 
+    @property
+    def are_held_out(self) -> bool:
+        """Whether the images for validation are not trained on."""
+        return self.held_out[0] is not self.train[0]
+
+    def checksum(self) -> int:
+        """Of all that training reads, so that another run's checkpoint is not taken for one of these images."""
+        key = 0
+        for example in (*self.train, *self.held_out):
+            key = zlib.crc32(example.image.tobytes(), zlib.crc32(example.labels.keypoints.tobytes(), key))
+            if example.teacher is not None:
+                key = zlib.crc32(example.teacher.descriptors.tobytes(), key)
+        return key
+
 
 class SyntheticShapes(Sequence[TrainingExample]):
     """Synthetic shapes; the same index always gives the same picture."""
@@ -103,14 +117,16 @@ def train_detector(
             run.
         OutputError: a file cannot be written; everything written before stays.
     """
-    files = find_images(roots)
+    own = folder.resolve()
+    files = [file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)]
+    _check_usable(files)
     start: dict[str, Tensor] | None = None
     detector: Callable[[GreyImage], Response] | None = None
     if teacher is None:
         first = train_on_shapes(folder / "shapes", settings, options, on_progress)
         start, detector = first.state_dict(), keypoint_response(first, torch.device(options.device))
     images = read_labelled_images(files, folder / "labels", settings, detector, teacher, on_progress, most_images)
-    run = TrainingRun(settings, "joint", _created(folder / "joint"), options, start)
+    run = TrainingRun(settings, "joint", _created(folder / "joint"), options, start, images.checksum())
     return run.train(
         images.train, images.held_out, _teacher_bits(images.train, settings.seed), partial(on_progress, "joint")
     ), images
@@ -166,11 +182,30 @@ def read_labelled_images(
         if len(train) == most:
             break
     if len(train) < FEWEST_IMAGES:
-        raise TrainingError(
-            f"only {len(train)} of {len(files)} image files can be trained on: the others are no images, "
-            "smaller than 96 px or have too few corners; give more images"
-        )
+        raise _too_few(len(train), len(files))
     return TrainingImages(train, held_out or train[:1], skipped)
+
+
+def _check_usable(files: Sequence[ImageFile]) -> None:
+    """Look before the long work whether there are enough images.
+
+    Raises:
+        TrainingError: there are not.
+    """
+    usable = 0
+    for file in files:
+        image = read_image(file.path)
+        usable += image is not None and is_usable(image) and not is_held_out(file.name)
+        if usable >= FEWEST_IMAGES:
+            return
+    raise _too_few(usable, len(files))
+
+
+def _too_few(usable: int, files: int) -> TrainingError:
+    return TrainingError(
+        f"only {usable} of {files} image files can be trained on: the others are no images, smaller than 96 px or have "
+        "too few corners; give more images"
+    )
 
 
 def _labels(
@@ -180,9 +215,13 @@ def _labels(
     detector: Callable[[GreyImage], Response] | None,
     teacher: Teacher | None,
 ) -> Labels:
-    """Labels of an image, from the cache if they were made from the same pixels and teacher."""
+    """Labels of an image, from the cache if pixels, teacher and settings are those that they were made with.
+
+    A network that labels is not compared: a robot keeps the labels of the first one.
+    """
     pixels = zlib.crc32(image.tobytes())
-    key = pixels if teacher is None else zlib.crc32(teacher.keypoints.tobytes(), pixels)
+    key = zlib.crc32(f"{settings.seed} {settings.label_copies}".encode(), pixels)
+    key = key if teacher is None else zlib.crc32(teacher.keypoints.tobytes(), key)
     known = read_labels(place, key)
     if known is not None:
         return known

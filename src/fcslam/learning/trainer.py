@@ -85,7 +85,9 @@ class TrainingRun:
         folder: Path,
         options: ExecutionOptions,
         start: dict[str, Tensor] | None = None,
+        examples: int = 0,
     ) -> None:
+        """``examples`` is a checksum of what is trained on; a checkpoint of something else is refused."""
         self.settings, self.stage, self.folder, self.options = settings, stage, folder, options
         self.device = torch.device(options.device)
         with torch.random.fork_rng(devices=[]):
@@ -99,6 +101,7 @@ class TrainingRun:
         self.average.eval()
         self.optimiser = create_optimiser(self.network)
         self.step = 0
+        self._examples = examples
         self._saved = time.monotonic()
 
     def train(
@@ -170,6 +173,12 @@ class TrainingRun:
         fixed = self.settings.model_dump(mode="json") | {"steps": checkpoint.settings.get("steps")}
         if checkpoint.settings != fixed or checkpoint.stage != self.stage:
             raise TrainingError(f"{path}: belongs to a run with other settings; give the same or another --output")
+        if checkpoint.examples != self._examples:
+            raise TrainingError(f"{path}: was trained on other images or by another teacher; give another --output")
+        if checkpoint.step > self.settings.steps:
+            raise TrainingError(
+                f"{path}: has {checkpoint.step} steps already, more than {self.settings.steps}; give another --output"
+            )
         try:
             self._load(checkpoint)
         except (KeyError, RuntimeError, ValueError) as error:
@@ -186,16 +195,16 @@ class TrainingRun:
         tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
         tensors |= {f"{OPTIMISER}{name}": value for name, value in get_optimiser_state(self.optimiser).items()}
         settings = self.settings.model_dump(mode="json")
-        write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
+        checkpoint = Checkpoint(self.stage, self.step, settings, tensors, self._examples)
+        write_checkpoint(self.folder / CHECKPOINT_FILE, checkpoint)
         self._saved = time.monotonic()
 
     def _log(self, metrics: Mapping[str, float]) -> None:
         path = self.folder / PROGRESS_FILE
         try:
-            new = not path.exists()
             with path.open("a", newline="", encoding="utf-8") as file:
                 rows = csv.writer(file)
-                if new:
+                if not file.tell():
                     rows.writerow(("stage", "step", "name", "value"))
                 rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
         except OSError as error:

@@ -25,10 +25,8 @@ class Budget:
 
     def __init__(self, bytes_per_s: float) -> None:
         self._bytes_per_s = bytes_per_s
-        self._room = BURST_S * bytes_per_s
-        """Bytes that may be sent at ``_time``; below 0 after more than that was sent."""
-        self._time: float | None = None
-        """Stamp of the newest packet."""
+        self._began: float | None = None
+        self._spent = 0
         self.left_out = 0
         """Number of places that were not sent."""
 
@@ -36,25 +34,20 @@ class Budget:
         """Select what to send of the next packets of the front end; descriptors are sorted, strongest first."""
         kept = []
         for packet in packets:
-            self._earn(packet.time)
+            if self._began is None:
+                self._began = packet.time
             place = packet.body
             chosen = self._thinned(packet, place) if isinstance(place, Place | WordPlace) else packet
             if chosen is None:
                 self.left_out += 1
                 continue
-            self._room -= len(encode(chosen))
+            self._spent += len(encode(chosen))
             kept.append(chosen)
         return kept
 
-    def _earn(self, time: float) -> None:
-        """Add what the time since the last packet allows, at most a burst; a clock that steps back adds nothing."""
-        if self._time is not None and time > self._time:
-            earned = (time - self._time) * self._bytes_per_s
-            self._room = min(self._room + earned, BURST_S * self._bytes_per_s)
-        self._time = time
-
     def _thinned(self, packet: Packet, place: Place | WordPlace) -> Packet | None:
-        room = self._room - ENVELOPE_BYTES
+        seconds = packet.time - (packet.time if self._began is None else self._began)
+        room = self._bytes_per_s * (seconds + BURST_S) - self._spent - ENVELOPE_BYTES
         described = CODE_BYTES if isinstance(place, Place) else BYTES_PER_WORD
         fitting = room / (described + BYTES_PER_AXIS * KEYPOINT_AXES[place.channel])
         if fitting >= len(place.keypoints):

@@ -33,13 +33,13 @@ def add_token(path: Path, holder: TokenHolder, token_file: Path) -> None:
 
     Raises:
         ConfigError: the file of tokens cannot be read.
-        ServiceError: there is a token of this name.
+        ServiceError: there is a token of this name, or ``token_file`` is there.
         OSError: a file cannot be written.
     """
     entries = read_tokens(path) if path.exists() else ()
     if any(entry.name == holder.name for entry in entries):
         raise ServiceError(f"{path}: '{holder.name}' has a token; rotate it, or revoke it first")
-    _write(path, [*entries, _made(holder, token_file)])
+    _write(path, [*entries, _made(holder, token_file, None)])
 
 
 def rotate_token(path: Path, name: str, expires: datetime | None, token_file: Path) -> None:
@@ -47,11 +47,11 @@ def rotate_token(path: Path, name: str, expires: datetime | None, token_file: Pa
 
     Raises:
         ConfigError: the file of tokens cannot be read.
-        ServiceError: there is no token of this name.
+        ServiceError: there is no token of this name, or ``token_file`` is there and does not hold the old token.
         OSError: a file cannot be written.
     """
     entries, row = _find(path, name)
-    entries[row] = _made(TokenHolder(name, entries[row].role, expires), token_file)
+    entries[row] = _made(TokenHolder(name, entries[row].role, expires), token_file, entries[row])
     _write(path, entries)
 
 
@@ -76,11 +76,18 @@ def _find(path: Path, name: str) -> tuple[list[TokenEntry], int]:
     return entries, names.index(name)
 
 
-def _made(holder: TokenHolder, token_file: Path) -> TokenEntry:
+def _made(holder: TokenHolder, token_file: Path, old: TokenEntry | None) -> TokenEntry:
+    """Write a new token. The file may be there only if it holds the old one: all tokens and keys are the only copy."""
+    if token_file.exists() and not (old is not None and token_file.is_file() and _hash(token_file) == old.sha256):
+        raise ServiceError(f"{token_file}: exists, and would be lost; name a new file")
     token = secrets.token_urlsafe(TOKEN_BYTES)
     write_file(token_file, f"{token}\n", private=True)
     hashed = hashlib.sha256(token.encode()).hexdigest()
     return TokenEntry(name=holder.name, role=holder.role, sha256=hashed, expires=holder.expires)
+
+
+def _hash(token_file: Path) -> str:
+    return hashlib.sha256(token_file.read_bytes().strip()).hexdigest()
 
 
 def _write(path: Path, entries: Sequence[TokenEntry]) -> None:

@@ -274,8 +274,13 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
 
 
 def _check_url(url: str, token: str | None, own: tuple[Path, Path] | None) -> None:
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.hostname:
+    try:
+        parts = urlsplit(url)
+        has_place = parts.hostname and parts.port != 0 and not any(map(str.isspace, url))
+        is_address = parts.scheme in ("http", "https") and has_place
+    except ValueError:  # the port, or a bracket of IPv6
+        is_address = False
+    if not is_address or not parts.hostname:
         raise CloudError(f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443")
     if token and parts.scheme == "http" and not _is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be sent unencrypted; use https")

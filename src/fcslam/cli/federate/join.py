@@ -46,7 +46,7 @@ def join(
     if not images.is_dir():
         raise TrainingError(f"{images}: is no folder; give the folder of the robot's images")
     check_robot_security(ca, robot_key, insecure)
-    default_name = images.resolve().name if robot_key is None else robot_key.name
+    default_name = images.resolve().name if robot_key is None else robot_key.stem
     robot_name = default_name if name is None else name
     if not (0 < len(robot_name) <= MAX_NAME_LENGTH and robot_name.isprintable()):
         raise TrainingError(
