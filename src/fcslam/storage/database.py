@@ -77,9 +77,13 @@ class Database:
                 # A commit takes as long as the disk does. A second connection lets readers see the state before it.
                 self._reading = _connected(path, "query_only=ON")
         with self.transaction() as connection:
-            if not shape(connection)[1]:
+            is_new = not shape(connection)[1]
+            if is_new:
                 _make(connection, schema, version)
             _check_shape(path, connection, schema, version)
+        if is_new:
+            with translate_errors(path):  # a damaged log is repaired from the pages of the file
+                self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:
         """Close the file, and seal its pages if no other process has it open."""

@@ -8,6 +8,7 @@ import sqlite3
 import struct
 from collections.abc import Iterator
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,8 @@ def mend_log(path: Path) -> Path | None:
     if not log.exists() or _is_in_use(path):
         return None
     with translate_errors(path):
-        found = log.read_bytes()
-        mended = _mended(found)
+        found, content = log.read_bytes(), path.read_bytes()
+        mended = _mended(found, content)
         if mended is None:
             raise StoreError(f"{path}: transactions in its write-ahead log are damaged")
         if mended == found:
@@ -63,8 +64,13 @@ def _is_in_use(path: Path) -> bool:
     return False
 
 
-def _mended(found: bytes) -> bytes | None:
-    """The log as it was; None if more is damaged than one bit of its header or of a frame."""
+def _mended(found: bytes, content: bytes) -> bytes | None:
+    """The log as it was; None if more is damaged than one bit of its header or of a frame.
+
+    Args:
+        found: the log.
+        content: the file of the database.
+    """
     if len(found) < LOG_HEADER + _FRAME:
         return found
     header = next((tried for tried in _with_flips(found[:LOG_HEADER]) if _is_header(tried)), None)
@@ -79,6 +85,8 @@ def _mended(found: bytes) -> bytes | None:
     for k in range(count):
         following = frames[k + 1] if k + 1 < count else None
         candidates = list(_candidates(frames[k], before, salts, order))
+        if len(candidates) > 1:
+            candidates = _likeliest_first(candidates, frames, k, content)
         right = next((tried for tried in candidates if _leads(tried, following, order)), None)
         if right is None and candidates:  # the next frame has more damage, or was being written
             right = candidates[0]
@@ -108,6 +116,31 @@ def _candidates(frame: bytes, before: Sum, salts: bytes, order: str) -> Iterator
     right = computed.astype(">u4").tobytes()
     if _bits_between(right, frame[_SUM]) == 1:
         yield frame[:16] + right + frame[FRAME_HEADER:]
+
+
+def _likeliest_first(candidates: list[bytes], frames: list[bytes], k: int, content: bytes) -> list[bytes]:
+    """Several bits explain an error in the high bits of a sum: those that make frame ``k`` differ less from the other
+    versions of its page are likelier.
+    """
+
+    def nearest(number: int, side: range) -> bytes:
+        return next((frames[j][FRAME_HEADER:] for j in side if _page_number(frames[j]) == number), b"")
+
+    @cache
+    def versions(number: int) -> list[np.ndarray]:
+        before, after = nearest(number, range(k - 1, -1, -1)), nearest(number, range(k + 1, len(frames)))
+        of_file = content[max(number - 1, 0) * PAGE_BYTES : number * PAGE_BYTES]
+        return [np.frombuffer(page, np.uint8) for page in (before, after, of_file) if len(page) == PAGE_BYTES]
+
+    def difference(tried: bytes) -> int:
+        page = np.frombuffer(tried, np.uint8, offset=FRAME_HEADER)
+        return min((int((page != other).sum()) for other in versions(_page_number(tried))), default=PAGE_BYTES)
+
+    return sorted(candidates, key=difference)
+
+
+def _page_number(frame: bytes) -> int:
+    return int.from_bytes(frame[:4], "big")
 
 
 def _leads(frame: bytes, following: bytes | None, order: str) -> bool:
