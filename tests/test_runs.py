@@ -1,6 +1,7 @@
 """The run folder: what is written is read back, and nothing half written ever looks whole."""
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -320,6 +321,23 @@ def test_a_broken_description_of_a_map_is_refused(description):
     with pytest.raises(EvaluationError, match=r"map\.pgm is broken") as raised:
         parse_map("map.pgm", PGM, description)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [("resolution: 0.05", "res: 0.05", "`resolution` in the description is missing"),
+     ("0.05", "fine", "`resolution` in the description is no finite number"),
+     ("0.65", "[1]", "`occupied_thresh` in the description is no finite number"),
+     ("3.5, 0.0", "3.5", "`origin` in the description must be"), ("negate: 0", "negate: 1", "needs `negate` 0")],
+)  # fmt: skip
+def test_the_message_names_the_key_that_is_wrong(old, new, message):
+    assert old in DESCRIPTION
+    with pytest.raises(EvaluationError, match=re.escape(message)):
+        parse_map("map.pgm", PGM, DESCRIPTION.replace(old, new))
+
+
+def test_yaml_reads_5e_2_as_text_and_a_map_as_a_number():
+    assert parse_map("map.pgm", PGM, DESCRIPTION.replace("0.05", "5e-2")).resolution_m == 0.05
 
 
 def test_a_run_says_which_map_is_broken(run):

@@ -170,6 +170,23 @@ def test_faults_of_the_program_are_not_hidden(monkeypatch):
         main(["--version"])
 
 
+def test_a_full_disk_behind_stdout_is_one_line():
+    command = [sys.executable, "-m", "fcslam.cli", "evaluate", "--help"]
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "fcslam: standard output cannot be written (No space left on device); make room\n"
+
+
+def test_a_closed_pipe_behind_stdout_is_silent():
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "fcslam.cli", "--version"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_ctrl_c_is_one_line_and_130(tmp_path):
     """The installed entry point, interrupted while it waits for the relations on a pipe that nobody writes."""
     Run({}).save(tmp_path / "run")

@@ -142,3 +142,13 @@ def test_regions_count_in_a_map_of_words_and_a_removed_stretch_stays_in_it(with_
     assert before.cells[row, column] == 1
     assert after.cells[row, column] == 0
     assert (run / "local" / f"{name}.pgm").read_bytes() == (edited / "local" / f"{name}.pgm").read_bytes()
+
+
+def test_a_file_of_another_kind_is_not_replaced(with_descriptors, tmp_path, capsys):
+    recording = tmp_path / "robot1.bag"
+    recording.write_bytes(b"a recording")
+    assert main(["vocabulary", str(with_descriptors), "-o", str(recording)]) == 2
+    assert recording.read_bytes() == b"a recording"
+    assert "is no vocabulary, so it stays" in capsys.readouterr().err
+    words = tmp_path / "building.words"
+    assert [main(["vocabulary", str(with_descriptors), "-o", str(words), "--words", "16"]) for _ in range(2)] == [0, 0]

@@ -67,5 +67,7 @@ def test_what_cannot_be_used_is_told():
         frozen_map(empty, "hall")
     with pytest.raises(SourceError, match=r"hall: cells of 0.5 m are too coarse"):
         frozen_map(room(0.5), "hall")
+    with pytest.raises(SourceError, match=r"hall: cells of 0.001 m are too fine"):
+        frozen_map(room(0.001, width_m=0.2, depth_m=0.2), "hall")
     with pytest.raises(SourceError, match=r"hall: extends over 500 m"):
         frozen_map(room(0.25, width_m=500.0), "hall")

@@ -1,7 +1,10 @@
 """The command line: one module for each command. Commands import what they need when they run, so help is quick."""
 
+import errno
+import io
 import math
 import os
+import sys
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -35,8 +38,8 @@ from fcslam.cli import warm_up as warming
 from fcslam.cli.examples import examples
 from fcslam.errors import FcslamError, InputError
 
-BAD_INPUT, INTERRUPTED = 2, 130
-"""Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells."""
+BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
+"""Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells, 1 for a closed pipe as in click."""
 PROGRAM = "fcslam"
 COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
@@ -159,10 +162,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if COMPLETION_VARIABLE in os.environ:
         _leave_paths_to_the_shell()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal may lack a letter of a robot's name
     try:
         code = app(arguments, prog_name=PROGRAM, standalone_mode=False) or 0
+        sys.stdout.flush()
     except FcslamError as error:
         return _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
+            raise
+        _drop_stdout()
+        if error.errno == errno.EPIPE:
+            return READER_GONE
+        return _fail(f"standard output cannot be written ({error.strerror}); make room", BAD_INPUT)
     except click.ClickException as error:
         error.show()
         return error.exit_code
@@ -178,6 +192,11 @@ def _leave_paths_to_the_shell() -> None:
     Shells then complete files. Typer would answer with the word as it stands, which ends the completion.
     """
     click.Path.shell_complete = lambda *_: []  # type: ignore[method-assign]
+
+
+def _drop_stdout() -> None:
+    """Let what is still to be written go nowhere: Python writes it at its end, and would complain."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> int:

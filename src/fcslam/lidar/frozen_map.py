@@ -20,8 +20,8 @@ ADJACENT_CELLS = 1.5
 """An occupied cell is part of a surface if a free cell is this near, in cells; what lies behind it is never seen."""
 WIDEST_M = TABLE * TILE * CELL_M - 2.0
 """Largest extent of a map in x or y."""
-COARSEST_M = 0.25
-"""Largest side of a cell."""
+FINEST_M, COARSEST_M = 0.002, 0.25
+"""Smallest and largest side of a cell."""
 
 
 def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
@@ -32,11 +32,14 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
         name: what messages call it.
 
     Raises:
-        SourceError: it shows no wall beside free space, is too large, or its cells are too coarse to match scans with.
+        SourceError: it shows no wall beside free space, is too large, or its cells are too coarse or too fine to match
+            scans with.
     """
     side = occupancy.resolution_m
     if side > COARSEST_M:
         raise SourceError(f"{name}: cells of {side:g} m are too coarse; localisation needs {COARSEST_M:g} m or finer")
+    if side < FINEST_M:
+        raise SourceError(f"{name}: cells of {side:g} m are too fine; localisation needs {FINEST_M:g} m or coarser")
     surface = _surface(occupancy)
     if not len(surface):
         raise SourceError(f"{name}: shows no wall beside free space; is it the right map?")

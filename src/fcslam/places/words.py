@@ -83,8 +83,9 @@ def write_vocabularies(vocabularies: Sequence[WordVocabulary], path: Path) -> No
     """Write a file of vocabularies, at most one of each channel. Equal vocabularies give equal files.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written, or ``path`` is a file of another kind.
     """
+    _check_replaceable(path)
     arrays: dict[str, NDArray[np.uint8]] = {}
     for vocabulary in vocabularies:
         arrays[f"{vocabulary.channel}.centres"] = vocabulary.centres
@@ -95,6 +96,15 @@ def write_vocabularies(vocabularies: Sequence[WordVocabulary], path: Path) -> No
         write_file(path, content.getvalue())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
+
+
+def _check_replaceable(path: Path) -> None:
+    if not path.exists():
+        return
+    try:
+        read_vocabularies(path)
+    except InputError as error:
+        raise OutputError(f"{path}: exists and is no vocabulary, so it stays; choose another name") from error
 
 
 def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:

@@ -169,15 +169,29 @@ def _size(pgm: bytes) -> tuple[int, int, int]:
 
 def _described(description: str) -> tuple[float, tuple[float, float], float, float]:
     """Resolution, origin, threshold of occupied cells, threshold of free cells."""
-    try:
-        content: Any = parse_yaml(description)
-        resolution_m, occupied, free = (float(content[key]) for key in ("resolution", "occupied_thresh", "free_thresh"))
-        x, y, theta = map(float, content["origin"])
-        plain = not content.get("negate", 0) and content.get("mode", "trinary") == "trinary" and theta == 0.0
-    except (KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise ValueError("the description lacks resolution, origin, occupied_thresh or free_thresh") from error
-    if not (0.0 < resolution_m < math.inf and math.isfinite(x) and math.isfinite(y) and 0.0 <= free <= occupied <= 1.0):
-        raise ValueError("the description has a resolution, an origin or a threshold that is out of range")
-    if not plain:
-        raise ValueError("the image is negated, rotated or not in the mode trinary")
+    content: Any = parse_yaml(description)
+    if not isinstance(content, dict):
+        raise ValueError("the description is no YAML mapping")
+    resolution_m, occupied, free = (
+        _number(key, content.get(key)) for key in ("resolution", "occupied_thresh", "free_thresh")
+    )
+    origin = content.get("origin")
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise ValueError("`origin` in the description must be [x, y, theta]")
+    x, y, theta = (_number("origin", value) for value in origin)
+    if not (resolution_m > 0.0 and 0.0 <= free <= occupied <= 1.0):
+        raise ValueError("the description needs `resolution` > 0 and 0 <= `free_thresh` <= `occupied_thresh` <= 1")
+    if content.get("negate", 0) or content.get("mode", "trinary") != "trinary" or theta != 0.0:
+        raise ValueError("the description needs `negate` 0, `mode` trinary and a theta of 0 in `origin`")
     return resolution_m, (x, y), occupied, free
+
+
+def _number(key: str, value: object) -> float:
+    """A finite number of the description; YAML 1.1 reads ``5e-2`` as text."""
+    try:
+        number = float(value) if isinstance(value, int | float | str) else math.nan
+    except (ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"`{key}` in the description {'is missing' if value is None else 'is no finite number'}")
+    return number
