@@ -77,7 +77,7 @@ def run(robots, folder, chosen=None, grid=None, start=START, **given):
         **{
             "version": version,
             "evaluate_fn": lambda _weights: {"repeatability": 0.5, "mma_3px": 0.5},
-            "on_round": lambda report, _best: reports.append(report),
+            "on_round": reports.append,
         }
         | given
     )

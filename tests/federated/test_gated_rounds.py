@@ -65,16 +65,29 @@ def test_a_robot_whose_report_is_no_report_does_not_count(tmp_path):
 
 
 def test_after_a_version_was_taken_back_training_goes_on_from_the_one_before(tmp_path):
-    taken_back = []
+    released = []
 
-    def fallback(released):
-        return TRAINED if released in taken_back else None
+    def fallback(best):
+        return TRAINED if best in released[1:2] else None
 
-    def on_round(report, best):
-        if report.round_number == 2:
-            taken_back.append(version(best))
+    def on_release(weights):
+        released.append(version(weights))
 
-    state, _ = gated([Judge(f"r{k}") for k in range(3)], tmp_path, rounds=3, fallback=fallback, on_round=on_round)
-    assert taken_back
+    state, _ = gated([Judge(f"r{k}") for k in range(3)], tmp_path, rounds=3, fallback=fallback, on_release=on_release)
+    assert len(released) == 3
     assert float(state.best["a.weight"][0, 0]) == pytest.approx(1.1)
     assert float(state.weights["a.weight"][0, 0]) == pytest.approx(1.1), "one step from the start, not three"
+
+
+def test_a_release_survives_a_kill_between_the_checkpoint_and_its_announcement(tmp_path):
+    fleet, released = [Judge(f"r{k}") for k in range(3)], []
+
+    def killed(_weights):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        gated(fleet, tmp_path, rounds=1, on_release=killed)
+    state, reports = gated(fleet, tmp_path, rounds=1, on_release=released.append)
+    assert not reports, "the round is done"
+    assert [version(weights) for weights in released] == [version(state.best)]
+    assert state.best_round == 1

@@ -53,8 +53,12 @@ class CoordinatorHooks:
     """Gives the detector version of weights."""
     evaluate_fn: EvaluateFn | None = None
     """Evaluates weights on public images; if None, the robots evaluate on images that they held out."""
-    on_round: Callable[[RoundReport, Weights], None] = lambda _report, _best: None
-    """Called after each round with its report and the best weights so far, once both are on disk."""
+    on_round: Callable[[RoundReport], None] = lambda _report: None
+    """Called with the report of each round, once its results are on disk."""
+    on_release: Callable[[Weights], None] = lambda _weights: None
+    """Called with the weights of each released version, before ``on_round``. A start calls it again with the newest
+    ones, as the one before may have been killed before it called.
+    """
     wait: Callable[[str], None] | None = None
     """Called with the reason when a round cannot be completed; returns when to try again. If None, training fails."""
     gate: GateSettings | None = None
@@ -96,12 +100,16 @@ class Coordinator:
             OutputError: a file cannot be written; everything written before stays.
         """
         state, rows = self._resume()
+        if state.best_round > 0:
+            self._hooks.on_release(state.best)
         while state.rounds_done < self._settings.rounds:
             state, report = self._round(self._fallen_back(state))
             rows.append(report.row())
             write_rows(self._folder / ROUNDS_FILE, rows)
             write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
-            self._hooks.on_round(report, state.best)
+            if report.released:
+                self._hooks.on_release(state.best)
+            self._hooks.on_round(report)
         return state
 
     def _resume(self) -> tuple[CoordinatorState, list[Row]]:

@@ -125,14 +125,15 @@ def run(
     encoder, options = settings.federated.training.encoder, ExecutionOptions(device="cpu", threads=1)
     initial = prepare_initial_weights(releases.detector(0), output, settings.federated, options, lambda *_: None)
 
-    def release(report: RoundReport, weights: Weights) -> None:
-        number = releases.add(weights_version(weights, encoder), (output / DETECTOR).read_bytes(), weights)
-        _log.info("round %d: %s is released: %s", report.round_number, report.version, report.reason)
-        tell(RELEASE, number)
+    def release(weights: Weights) -> None:
+        version = weights_version(weights, encoder)
+        if version not in releases.versions:
+            tell(RELEASE, releases.add(version, (output / DETECTOR).read_bytes(), weights))
 
     def report(done: RoundReport) -> None:
-        if done.reason and not done.released:
-            _log.info("round %d: not released: %s", done.round_number, done.reason)
+        decision = f"{done.version} is released" if done.released else "not released"
+        if done.reason:
+            _log.info("round %d: %s: %s", done.round_number, decision, done.reason)
 
     job = FederatedJob(
         output, settings.federated, releases.detector(0), gate=settings.gate,

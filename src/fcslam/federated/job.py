@@ -57,8 +57,8 @@ class ProgressCallbacks:
     """With a robot's name and the steps that it has done in the round."""
     rounds: Callable[[RoundReport], None] = lambda _report: None
     """With the report of a round."""
-    released: Callable[[RoundReport, Weights], None] = lambda _report, _weights: None
-    """With the report of a round that released a version, and its weights; its detector is written."""
+    released: Callable[[Weights], None] = lambda _weights: None
+    """With the weights of a released version; its detector is written. A start that continues a run calls it again."""
 
 
 def run_job(
@@ -91,15 +91,15 @@ def run_job(
     initial = prepare_initial_weights(job.start, job.output, job.settings, options, callbacks.stage, images)
     encoder = job.settings.training.encoder
 
-    def on_round(report: RoundReport, best: Weights) -> None:
-        if report.released:
-            export_onnx(weights_to_network(best, encoder), job.output / DETECTOR)
-            callbacks.released(report, best)
-        callbacks.rounds(report)
+    def on_release(weights: Weights) -> None:
+        export_onnx(weights_to_network(weights, encoder), job.output / DETECTOR)
+        callbacks.released(weights)
 
     version = partial(weights_version, encoder=encoder)
     evaluate = public_evaluation(images, encoder, options.device)
-    hooks = CoordinatorHooks(version, evaluate, on_round, wait, job.gate, job.fallback, job.strategy)
+    hooks = CoordinatorHooks(
+        version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.fallback, job.strategy
+    )
     state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
     _write_config(job, job.output / CONFIG_FILE, again=True)
     judged_on = (

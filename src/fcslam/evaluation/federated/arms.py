@@ -110,7 +110,7 @@ def train_arm(context: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork
         partial(weights_version, encoder=settings.training.encoder),
         # Without metrics no version is better than another: the last one counts, as in the other arms.
         evaluate_fn=lambda _weights: {},
-        on_round=lambda report, _best: context.on_progress(name, report.round_number, settings.rounds),
+        on_round=lambda report: context.on_progress(name, report.round_number, settings.rounds),
     )
     grid = InProcessGrid(build_client_app(client_of), len(clients))
     state = Coordinator(grid, settings, context.start, folder, hooks).run()
