@@ -63,6 +63,7 @@ def test_an_edit_survives_as_text(content):
         ("cut", '{"session": "a b", "first_s": 1, "last_s": 2}'),
         ("closure", f'{{"robot_i": "a", "robot_j": "b", "stamp_j": 2, {T}, "tolerance": [0, 1]}}'),
         ("closure", f'{{"robot_i": "a", "robot_j": "a", "stamp_j": 1, {T}, "tolerance": [1, 1]}}'),
+        ("closure", f'{{"robot_i": "a", "robot_j": "b", "stamp_j": 2, {T}, "tolerance": [1e300, 1]}}'),
         ("placement", '{"session": "a", "stamp": 1, "pose": [1e9, 0, 0]}'),
         ("region", '{"use": "erase", "name": "", "session": "a", "stamp": 1, "polygon": [[0, 0], [1, 0]]}'),
         ("floor", '{"session": "a", "floor": ""}'), ("floor", '{"session": "a", "floor": "seventeen-letters"}'),

@@ -14,6 +14,8 @@ from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import uvicorn
     from fastapi import FastAPI
 
@@ -150,7 +152,7 @@ def serve(
         gc.freeze()  # collecting these objects again and again would delay packets
         pages = (page_router(), documentation_router()) if docs else (page_router(),)
         app = create_app(state, pages, local_names=is_open, named=None if store is None else NAMED)
-        server = _server(app, tls_certificate, tls_key, client_ca)
+        server = _server(app, tls_certificate, tls_key, client_ca, state.close)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address
@@ -158,7 +160,9 @@ def serve(
         server.run(sockets=[listening])
 
 
-def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None) -> "uvicorn.Server":
+def _server(
+    app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None, on_exit: "Callable[[], None]"
+) -> "uvicorn.Server":
     import ssl
 
     import uvicorn
@@ -179,7 +183,8 @@ def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_c
             server_header=False,
             timeout_graceful_shutdown=10,
             h11_max_incomplete_event_size=64 * 1024,
-        )
+        ),
+        on_exit,
     )
 
 

@@ -42,6 +42,8 @@ MOST_CORNERS: Final = 1000
 LONGEST_NAME: Final = 100
 LEAST_TOLERANCE: Final = (1e-3, 1e-4)
 """Metres and radians: no hand, map or LiDAR is more precise."""
+MOST_TOLERANCE: Final = (1e3, 10.0)
+"""Metres and radians: more says nothing."""
 
 _KINDS: Final[dict[str, type[Change | Undo]]] = {
     "veto": Veto,
@@ -188,8 +190,12 @@ def check_edit(content: Change | Undo) -> None:
 
 def _check_closure(closure: ManualClosure) -> None:
     _check_coordinates(closure.T_i_j[:2])
-    if any(given < least for given, least in zip(closure.tolerance, LEAST_TOLERANCE, strict=True)):
-        raise EditError(f"the tolerance must be at least {LEAST_TOLERANCE[0]} m and {LEAST_TOLERANCE[1]} rad")
+    if any(
+        not least <= given <= most
+        for given, least, most in zip(closure.tolerance, LEAST_TOLERANCE, MOST_TOLERANCE, strict=True)
+    ):
+        (least_m, least_rad), (most_m, most_rad) = LEAST_TOLERANCE, MOST_TOLERANCE
+        raise EditError(f"the tolerance must be {least_m} to {most_m:g} m and {least_rad} to {most_rad:g} rad")
     if closure.robot_i == closure.robot_j and closure.stamp_i == closure.stamp_j:
         raise EditError("a closure connects two different keyscans")
 

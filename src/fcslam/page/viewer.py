@@ -41,6 +41,10 @@ class ReadOnly:
         """Nothing."""
         return []
 
+    def admits(self, *_: object) -> bool:
+        """Everybody."""
+        return True
+
 
 def viewer_app(state: ReadOnly) -> FastAPI:
     """The page and what it asks; while it runs, its events follow the run folder."""

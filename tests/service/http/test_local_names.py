@@ -23,8 +23,7 @@ def test_other_names_are_not(host):
     assert not is_local_name(host)
 
 
-@pytest.mark.parametrize(("host", "status"), [("localhost:1", 204), ("evil.example", 421)])
-def test_they_get_no_further(host, status):
+def answer(method, host, headers=()):
     async def app(scope, receive, send):
         await send({"type": "http.response.start", "status": 204, "headers": []})
         await send({"type": "http.response.body"})
@@ -32,6 +31,31 @@ def test_they_get_no_further(host, status):
     async def ask():
         transport = httpx.ASGITransport(app=LocalNames(app))
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
-            return await client.get("/")
+            return await client.request(method, "/", headers=dict(headers))
 
-    assert asyncio.run(ask()).status_code == status
+    return asyncio.run(ask()).status_code
+
+
+@pytest.mark.parametrize(("host", "status"), [("localhost:1", 204), ("evil.example", 421)])
+def test_they_get_no_further(host, status):
+    assert answer("GET", host) == status
+
+
+OWN, OTHER = "http://localhost:1", "http://127.0.0.2:38171"
+
+
+@pytest.mark.parametrize(
+    ("method", "headers", "status"),
+    [
+        ("POST", {}, 204),
+        ("POST", {"Origin": OWN}, 204),
+        ("POST", {"Origin": OTHER}, 403),
+        ("POST", {"Origin": "null"}, 403),
+        ("DELETE", {"Origin": OTHER, "Sec-Fetch-Site": "cross-site"}, 403),
+        ("POST", {"Origin": OTHER, "Sec-Fetch-Site": "same-site"}, 403),
+        ("POST", {"Origin": "https://behind.a.proxy", "Sec-Fetch-Site": "same-origin"}, 204),
+        ("GET", {"Origin": OTHER, "Sec-Fetch-Site": "cross-site"}, 204),
+    ],
+)
+def test_a_page_of_another_site_changes_nothing(method, headers, status):
+    assert answer(method, "localhost:1", headers.items()) == status

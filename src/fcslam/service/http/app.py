@@ -53,7 +53,7 @@ def create_app(
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
-        state.closing = True
+        state.close()
         state.audit.flush()
         state.missions.close()
 

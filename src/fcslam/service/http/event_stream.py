@@ -1,9 +1,10 @@
 """Events as they happen, as server-sent events."""
 
+import asyncio
 import json
 from collections.abc import AsyncIterator
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
 from fcslam.service.http.authentication import Role
@@ -11,21 +12,39 @@ from fcslam.service.http.responses import content, refusals
 from fcslam.service.http.state import ViewerState
 
 EVENTS = "text/event-stream"
+VIEWERS = Role.VIEWER, Role.ADMIN
+BEAT_S = 5.0
+"""Something comes at least so often, so that a client notices a dead connection."""
+LOOK_S = 0.25
+"""How often a stream asks whether it may go on."""
 
 
 def event_router(state: ViewerState) -> APIRouter:
     """One stream."""
-    router = APIRouter(
-        tags=["viewers"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503)
-    )
+    router = APIRouter(tags=["viewers"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503))
 
-    async def lines() -> AsyncIterator[str]:
-        async for event in state.events.watch():
-            yield f"event: {event.kind}\ndata: {json.dumps({'number': event.number})}\n\n"
+    async def lines(request: Request) -> AsyncIterator[str]:
+        loop, events = asyncio.get_running_loop(), state.events.watch()
+        said_s, following = loop.time(), asyncio.ensure_future(anext(events))
+        try:
+            while state.admits(request, *VIEWERS):
+                await asyncio.wait({following}, timeout=LOOK_S)
+                if following.done():
+                    event = following.result()
+                    said_s, following = loop.time(), asyncio.ensure_future(anext(events))
+                    yield f"event: {event.kind}\ndata: {json.dumps({'number': event.number})}\n\n"
+                elif loop.time() - said_s >= BEAT_S:
+                    said_s = loop.time()
+                    yield ": nothing new\n\n"
+        finally:
+            following.cancel()
 
     @router.get("/events", response_class=Response, responses={200: content(EVENTS)})
-    async def get_events() -> StreamingResponse:
-        """``live``: there is a new live run; ``finalized``: a result was written."""
-        return StreamingResponse(lines(), media_type=EVENTS)
+    async def get_events(request: Request) -> StreamingResponse:
+        """``live``: there is a new live run; ``finalized``: a result was written. A comment comes at least every 5 s.
+
+        The stream ends when the service stops, or when the token is no longer valid.
+        """
+        return StreamingResponse(lines(request), media_type=EVENTS)
 
     return router

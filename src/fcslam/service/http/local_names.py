@@ -1,4 +1,7 @@
-"""Against DNS rebinding: a web page whose own name was pointed to this machine reads and writes in its user's name."""
+"""Against web pages that read and write in the name of the user who opened them.
+
+A page may have its own name pointed to this machine (DNS rebinding), or send a form to it (cross-site request forgery).
+"""
 
 from ipaddress import ip_address
 from urllib.parse import urlsplit
@@ -8,9 +11,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from fcslam.service.http.problems import problem
 
+READING = ("GET", "HEAD", "OPTIONS")
+"""Methods that change nothing."""
+
 
 class LocalNames:
-    """Refuses requests that name this machine neither by an address nor as localhost.
+    """Refuses requests that name this machine neither by an address nor as localhost, and changes from other pages.
 
     A service that knows nobody's token needs it: a browser sends the name of the page that asks.
     """
@@ -20,11 +26,25 @@ class LocalNames:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
-        if scope["type"] == "http" and not is_local_name(Headers(scope=scope).get("host", "")):
-            text = "a service without tokens answers to localhost and to addresses only; ask it by one of these"
-            await problem(421, text)(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
+        app = self._app
+        if scope["type"] == "http":
+            headers = Headers(scope=scope)
+            if not is_local_name(headers.get("host", "")):
+                text = "a service without tokens answers to localhost and to addresses only; ask it by one of these"
+                app = problem(421, text)
+            elif scope["method"] not in READING and is_cross_site(headers):
+                app = problem(
+                    403, "a page of another site sends this; a service without tokens takes no changes from it"
+                )
+        await app(scope, receive, send)
+
+
+def is_cross_site(headers: Headers) -> bool:
+    """Whether a browser sends a request for a page that is not of this service; other programs send neither header."""
+    if (site := headers.get("sec-fetch-site")) is not None:  # absent over http from other machines
+        return site not in ("same-origin", "none")
+    origin = headers.get("origin")
+    return origin is not None and urlsplit(origin).netloc != headers.get("host")
 
 
 def is_local_name(host: str) -> bool:

@@ -5,7 +5,9 @@ import resource
 import socket
 import ssl
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
+from types import FrameType
 from typing import Any
 
 import uvicorn
@@ -34,7 +36,19 @@ def allow_many_connections() -> None:
 
 
 class GuardedServer(uvicorn.Server):
-    """uvicorn's server with a limit for TLS handshakes, which come before a protocol; theirs is a minute."""
+    """uvicorn's server with a limit for TLS handshakes, which come before a protocol; theirs is a minute.
+
+    ``on_exit`` is called when it is asked to stop, before it waits for the answers in progress.
+    """
+
+    def __init__(self, config: uvicorn.Config, on_exit: Callable[[], None] = lambda: None) -> None:
+        super().__init__(config)
+        self._on_exit = on_exit
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """A signal asks to stop."""
+        self._on_exit()
+        super().handle_exit(sig, frame)
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
         """Serve until the server is stopped."""

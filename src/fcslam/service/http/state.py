@@ -13,7 +13,7 @@ from fastapi.security import HTTPBearer
 
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
-from fcslam.service.http.authentication import Authenticator, Role
+from fcslam.service.http.authentication import Authenticator, Identity, Role
 from fcslam.service.http.events import Watched
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
@@ -52,6 +52,9 @@ class ViewerState(Protocol):
     def require(self, *roles: Role) -> list[Dependency]:
         """Dependencies of a route that only these roles may ask."""
 
+    def admits(self, request: Request, *roles: Role) -> bool:
+        """Whether a long answer may go on: the service is not stopping, and who asked still has one of the roles."""
+
 
 @dataclass(slots=True)
 class ServiceState:
@@ -71,6 +74,10 @@ class ServiceState:
     """Whether the service is stopping and takes no new requests."""
     changing: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Held while missions are created, opened or imported."""
+
+    def close(self) -> None:
+        """Take no new requests, and end the streams of events."""
+        self.closing = True
 
     @property
     def read_only(self) -> bool:
@@ -99,8 +106,7 @@ class ServiceState:
             if self.authenticator.is_open:
                 self._note(request, ANYBODY, roles)
                 return
-            tls = request.scope.get("extensions", {}).get("tls", {})
-            who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
+            who = self._who(request)
             if who is None:
                 wait_s = self.unknown.wait_s("", 1.0)
                 if wait_s > 0.0:
@@ -120,6 +126,17 @@ class ServiceState:
 
         # the second one tells OpenAPI of tokens, and does nothing else
         return [Depends(check)] if self.authenticator.is_open else [Depends(check), Security(_BEARER)]
+
+    def admits(self, request: Request, *roles: Role) -> bool:
+        """As in ``ViewerState``."""
+        if self.closing:
+            return False
+        who = None if self.authenticator.is_open else self._who(request)
+        return self.authenticator.is_open or (who is not None and who.role in roles)
+
+    def _who(self, request: Request) -> Identity | None:
+        tls = request.scope.get("extensions", {}).get("tls", {})
+        return self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
 
     @staticmethod
     def _note(request: Request, name: str, roles: Sequence[Role]) -> None:

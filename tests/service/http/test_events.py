@@ -1,0 +1,42 @@
+"""The stream of events: it never falls silent, and ends with the token or the service."""
+
+import pytest
+
+from fcslam.service.http import event_stream
+from tests.service.http.desk import ENTRIES, Desk
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    monkeypatch.setattr(event_stream, "BEAT_S", 0.0)
+    with Desk(tmp_path / "data") as opened:
+        yield opened
+
+
+def stream(desk):
+    return desk.client.stream("GET", "/api/v1/events", headers={"Authorization": "Bearer token of eye"})
+
+
+def test_a_comment_comes_when_nothing_happens(desk):
+    with stream(desk) as response:
+        lines = response.iter_lines()
+        assert [next(lines) for _ in range(4)] == [": nothing new", "", ": nothing new", ""]
+        desk.state.events.publish("live", 7)
+        assert "event: live" in lines
+        assert next(lines) == 'data: {"number": 7}'
+
+
+def test_a_stream_ends_with_its_token(desk):
+    with stream(desk) as response:
+        lines = response.iter_lines()
+        next(lines)
+        desk.state.authenticator.replace([entry for entry in ENTRIES if entry.name != "eye"])
+        assert {*lines} <= {": nothing new", ""}
+
+
+def test_a_stream_ends_with_the_service(desk):
+    with stream(desk) as response:
+        lines = response.iter_lines()
+        next(lines)
+        desk.state.close()
+        assert {*lines} <= {": nothing new", ""}
