@@ -293,6 +293,64 @@ def test_the_keyboard_is_enough(page, mapped):
     says(page, "#message", "(veto) is stored")
 
 
+def colour_of(page, robot):
+    row = page.locator("#robots li").filter(has_text=f"{robot}:")
+    return row.locator(".swatch").evaluate("swatch => swatch.style.background")
+
+
+def test_an_edit_shows_at_once_and_what_it_removes_is_gone(page, packets, tmp_path):
+    tiles = []
+    page.on("request", lambda request: tiles.append(request.url) if "/tiles/" in request.url else None)
+    with closing(Service(tmp_path / "data")) as service:
+        play(service.url, packets, ("robot_2",))
+        page.goto(service.url)
+        says(page, "#robots", "robot_2")
+        colour = colour_of(page, "robot_2")
+        play(service.url, packets, ("robot_1",))
+        until(page, lambda: options(page, "#maps") == ["0: robot_2, robot_1"], "one map")
+        assert colour_of(page, "robot_2") == colour, "a robot keeps its colour, whoever comes before it in the list"
+        between = page.locator("#list option").filter(has_text=re.compile("robot_2 . robot_1"))
+        page.locator("#list").select_option(between.first.get_attribute("value"))
+        says(page, "#facts-of-closure", "robot_2 (blue) and robot_1 (orange)")
+        until(page, lambda: painted(page) >= 3, "the map")
+        before = len(tiles)
+        removal = {"kind": "removal", "content": {"robot": "robot_2"}}
+        assert httpx.post(f"{service.url}{API}/edits", json=removal, timeout=60.0).status_code == 201
+        says(page, "#robots", "robot_2: removed")
+        says(page, "#message", "The selected closure is no longer there")
+        assert not page.locator("#closure").is_visible()
+        until(page, lambda: len(tiles) > before, "the tiles of the edited map")
+
+
+def test_a_connection_that_falls_silent_is_noticed(page, mapped):
+    page.route("**/api/v1/events", lambda _: None)  # nothing ever comes
+    page.goto(mapped.url)
+    says(page, "#status", "no connection; trying again")
+    page.unroute("**/api/v1/events")
+    says(page, "#status", "live")
+
+
+def test_a_fault_of_the_service_is_said(page, mapped):
+    fault = {"error": "the disk is full or broken; free some space"}
+    page.route("**/api/v1/edits", lambda route: route.fulfill(status=507, body=json.dumps(fault)))
+    page.goto(mapped.url)
+    says(page, "#status", "the disk is full or broken; free some space; trying again")
+    page.unroute("**/api/v1/edits")
+    says(page, "#status", "live")
+
+
+def test_shortcuts_of_the_browser_are_left_to_it_and_the_pointer_has_coordinates(page, mapped):
+    page.goto(mapped.url)
+    until(page, lambda: painted(page) >= 3, "the map")
+    page.locator("#map").focus()
+    taken = """key => !document.getElementById("map").dispatchEvent(
+        new KeyboardEvent("keydown", { key, ctrlKey: true, cancelable: true }))"""
+    assert [page.evaluate(taken, key) for key in ("0", "-", "+")] == [False] * 3
+    page.locator("#map").hover()
+    assert re.fullmatch(r"x -?\d+\.\d\d m, y -?\d+\.\d\d m", page.locator("#pointer").inner_text())
+    assert re.fullmatch(r"[\d.]+ m", page.locator("#metres").inner_text())
+
+
 def test_a_robot_with_a_hostile_name_is_text(page, mapped):
     """No robot can have such a name; a page must not rely on that."""
     evil = "<script>window.evil=1</script><img src=x onerror=window.evil=1>"

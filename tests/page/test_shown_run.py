@@ -243,8 +243,8 @@ def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
     assert [text for attributes, text in elements.of("p") if attributes.get("id") == "status"] == ["read-only"]
     assert [text for _, text in elements.of("title")] == ["fcslam: run"]
     assert [text.strip() for _, text in elements.of("option")][:2] == ["0: a, a+1", "1: b"]
-    shown_robots = [attributes.get("data-robot") for attributes, _ in elements.of("input")]
-    assert [name for name in shown_robots if name] == ["box a", "box a+1", "box b"]
+    labels = [attributes.get("aria-label", "") for attributes, _ in elements.of("button")]
+    assert [label for label in labels if label.startswith("Follow")] == ["Follow a", "Follow a+1", "Follow b"]
 
 
 def test_a_report_holds_every_path_that_the_page_names():

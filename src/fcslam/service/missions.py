@@ -76,7 +76,8 @@ class OpenMission:
 
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""
-        return PacketCounts(self.intake.ready_count(), self.store.applied(), self.intake.waiting_count())
+        counts = self.intake.ready_count(), self.store.applied(), self.intake.waiting_count()
+        return PacketCounts(*counts, self.worker.is_ready)
 
     def edit(self, content: Change | Undo, author: str) -> Edit:
         """Append an edit to the mission's log; the worker follows it.

@@ -19,6 +19,8 @@ class PacketCounts(NamedTuple):
     """That took effect."""
     waiting: int
     """That wait for an earlier one."""
+    worker_ready: bool = True
+    """Whether the mission's worker can apply packets now."""
 
 
 class ViewedMission(Protocol):

@@ -4,6 +4,9 @@ const LIVE_S = 15; // a robot that was heard so recently is live
 const LISTED = 200; // closures in the list; the newest ones
 const NEAR_M = 5; // closures with both ends so near each other see the same place
 const LOOK_MS = 5000; // how often the page asks whether robots are still heard
+const SILENT_MS = 15000; // the service says something every 5 s: after so long, the connection is dead
+const MOST_CLOSURES = 5000; // that the page asks for
+const BAR_PX = 120; // longest scale bar
 const CLICK_PX = 8; // a click this near a closure selects it
 // as in maps/palette.py
 const COLOURS = ["#0072b2", "#e66100", "#009e73", "#7b4fb5", "#e0a800", "#56b4e9", "#8c564b", "#607d3b"];
@@ -14,11 +17,15 @@ const at = (id) => document.getElementById(id);
 
 let token = sessionStorage.getItem("token") ?? "";
 class Refused extends Error {}
+class Failed extends Error { // the service answered, and says what is wrong
+  constructor(message, status) { super(message); this.status = status; }
+}
 
 // A report holds the responses itself and asks nobody.
 const report = at("responses") && JSON.parse(at("responses").textContent);
 function reported(path) {
-  if (path === "events") return new Response(new ReadableStream()); // nothing changes any more
+  if (path === "events") // nothing changes any more
+    return new Response(new ReadableStream({ start: (stream) => stop.signal.addEventListener("abort", () => stream.error(new Error("ended"))) }));
   const { texts, pictures } = report;
   if (path in texts) return new Response(texts[path]);
   if (path in pictures) return new Response(Uint8Array.from(atob(pictures[path]), (c) => c.charCodeAt(0)));
@@ -26,21 +33,23 @@ function reported(path) {
 }
 
 async function ask(path, { method = "GET", body } = {}) {
+  const signal = method === "GET" ? stop.signal : undefined; // what nobody waits for any more must not wait for a dead connection
   if (report) return reported(path);
   const headers = { ...(token && { Authorization: `Bearer ${token}` }), ...(body && { "Content-Type": "application/json" }) };
-  const answer = await fetch(API + path, { method, headers, body: body && JSON.stringify(body) });
+  const answer = await fetch(API + path, { method, headers, body: body && JSON.stringify(body), signal });
   if (answer.ok) return answer;
   if (answer.status === 401 || (answer.status === 403 && method === "GET")) {
     at("login").hidden = false;
     throw new Refused("needs a token that is valid");
   }
-  throw new Error((await answer.json().catch(() => ({}))).error ?? `${path}: ${answer.status}`);
+  throw new Failed((await answer.json().catch(() => ({}))).error ?? `${path}: ${answer.status}`, answer.status);
 }
 const json = async (path) => (await ask(path)).json();
 
 // ---- State ----
 
-let version = 0, release = null, readOnly = false;
+let version = 0; // of the map: the page counts its changes, of which an edit is one
+let mission = null, release = null, readOnly = false, connected = false;
 let robots = [], accepted = [], listed = [], selected = null, followed = null;
 let trails = new Map(), maps = [], regions = [];
 let until = Infinity; // the moment that paths and closures are shown of
@@ -72,7 +81,8 @@ function pose(name, stamp) {
 
 const mapOf = (name) => robots.find((r) => r.session === name)?.map;
 const keyOf = (c) => [c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j].map(encodeURIComponent).join("/");
-const colourOf = (name) => COLOURS[Math.max(0, robots.findIndex((r) => r.session === name)) % COLOURS.length];
+const colours = new Map(); // a robot keeps its colour, whoever comes after it
+const colourOf = (name) => { if (!colours.has(name)) colours.set(name, COLOURS[colours.size % COLOURS.length]); return colours.get(name); };
 
 // The closure with both ends in the map; `map` is null if they are in different ones.
 function placed(c, maps) {
@@ -80,24 +90,49 @@ function placed(c, maps) {
   return { ...c, ends, map: map === maps.get(c.robot_j) && ends.every(Boolean) ? map ?? null : null };
 }
 
-async function update(number) {
+// Another mission was opened: the page forgets what it knows of the one before.
+function forget() {
+  before = selected = followed = opened = view = null;
+  until = Infinity; at("moment").value = at("moment").max; moved = false;
+  for (const known of [received, hidden, tiles, colours, items]) known.clear();
+  at("closure").hidden = true;
+}
+
+// One update at a time, and another one after it if something happened meanwhile: no answer overtakes a later one.
+let updating = null, isOld = false;
+function refresh() {
+  isOld = true;
+  updating ??= (async () => { try { while (isOld) { isOld = false; await update(); } } finally { updating = null; } })();
+  return updating;
+}
+
+// Maps get other numbers when they join or part: the one in which the same robot is stays open.
+function stayOpen() {
+  const now = maps.find((m) => m.robots.includes(opened)) ?? maps[0];
+  if (opened !== null && !now?.robots.includes(opened)) moved = false;
+  mapIndex = now?.map ?? 0;
+}
+
+async function update() {
   const counts = await json("fleet");
   release ??= counts.version;
   if (counts.version !== release) { at("reload").hidden = false; throw new Error("The service has another version: reload the page."); }
-  const [now, apart, fleet, closures, edits] = await Promise.all([json("maps"), json("separations"), json("robots"), json("closures?status=accepted&limit=5000"), json("edits")]);
+  const [now, apart, fleet, closures, edits] = await Promise.all([json("maps"), json("separations"), json("robots"), json(`closures?status=accepted&limit=${MOST_CLOSURES}`), json("edits")]);
+  if (mission !== null && counts.mission !== mission) forget();
+  mission = counts.mission;
   const seen = fleet.filter((r) => r.T_map_base);
   const paths = await Promise.all(seen.map((r) => trail(r.session)));
   trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   maps = now;
-  if (!maps.some((m) => m.map === mapIndex)) mapIndex = maps[0]?.map ?? 0;
   readOnly = counts.read_only; robots = fleet;
+  for (const robot of robots) colourOf(robot.session);
+  stayOpen();
   const of = new Map(fleet.map((r) => [r.session, r.map]));
   accepted = closures.map((c) => placed(c, of));
-  version = number;
   document.title = `fcslam: ${counts.mission}`;
   for (const element of document.querySelectorAll(".live")) element.hidden = readOnly;
   regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
-  showMaps(apart); showRobots(counts); showPairs(); showEdits(edits);
+  showStatus(counts); showMaps(apart); showRobots(counts); showPairs(); showEdits(edits);
   tellChanges({ maps, robots, accepted, edits });
   await refreshClosures();
   if (at("learning").open) showLearning();
@@ -154,23 +189,37 @@ function stateOf(robot) {
   return `${where}, ${robot.last_heard_s < LIVE_S ? "live" : "offline"}, heard ${robot.last_heard_s.toFixed(0)} s ago`;
 }
 
+function showStatus({ worker_ready }) {
+  at("status").textContent = readOnly ? "read-only" : worker_ready ? "live" : "the worker is starting; the map stays as it was";
+}
+
+// The list of robots changes every few seconds. Its elements stay, or a slow click would find another one below it.
+const items = new Map();
+function itemOf(name) {
+  const item = element("li"), label = element("label"), swatch = element("span", "", { className: "swatch" });
+  const box = element("input", "", { type: "checkbox", checked: true }), state = element("span"), more = element("span", "", { className: "small" });
+  const button = element("button", "Follow", { ariaLabel: `Follow ${name}`, hidden: readOnly });
+  box.addEventListener("change", () => { if (box.checked) hidden.delete(name); else hidden.add(name); redraw(); });
+  button.addEventListener("click", () => { followed = followed === name ? null : name; refresh().catch(fail); });
+  swatch.style.background = colourOf(name);
+  label.append(box, swatch, state);
+  item.append(label, " ", button, more);
+  const made = { item, state, more, button };
+  items.set(name, made);
+  return made;
+}
+
 function showRobots({ metrics, packets, waiting, applied }) {
   at("load").textContent = `${packets} packets, ${packets - applied} not applied yet, ${waiting} waiting for an earlier one`;
-  const focus = document.activeElement?.dataset?.robot; // the lists are made anew, and the keyboard stays where it was
-  at("robots").replaceChildren(...robots.map((robot) => {
-    const name = robot.session, item = element("li"), label = element("label"), swatch = element("span", "", { className: "swatch" });
-    const box = element("input", "", { type: "checkbox", checked: !hidden.has(name) });
-    const button = element("button", "Follow", { ariaPressed: String(followed === name), ariaLabel: `Follow ${name}` });
+  const list = at("robots"), shown = robots.map((robot) => {
+    const name = robot.session, { item, state, more, button } = items.get(name) ?? itemOf(name);
     const bytes = robot.epoch ? 0 : metrics[`uplink_bytes_${robot.robot}`], detectors = Object.entries(robot.detectors).map(([channel, made]) => `${channel}: ${made}`);
-    box.dataset.robot = `box ${name}`; button.dataset.robot = `button ${name}`;
-    box.addEventListener("change", () => { if (box.checked) hidden.delete(name); else hidden.add(name); redraw(); });
-    button.addEventListener("click", () => { followed = followed === name ? null : name; update(version).catch(fail); });
-    swatch.style.background = colourOf(name);
-    label.append(box, swatch, `${name}: ${stateOf(robot)}`);
-    item.append(label, " ", ...(readOnly ? [] : [button]), element("span", [`${robot.path_length_m.toFixed(0)} m`, `${robot.keyscans} keyscans`, ...(bytes ? [`${(bytes / 1000).toFixed(0)} kB sent in all`] : []), ...detectors].join(", "), { className: "small" }));
+    state.textContent = `${name}: ${stateOf(robot)}`;
+    more.textContent = [`${robot.path_length_m.toFixed(0)} m`, `${robot.keyscans} keyscans`, ...(bytes ? [`${(bytes / 1000).toFixed(0)} kB sent in all`] : []), ...detectors].join(", ");
+    button.ariaPressed = String(followed === name);
     return item;
-  }));
-  if (focus) document.querySelector(`[data-robot="${CSS.escape(focus)}"]`)?.focus();
+  });
+  if (shown.length !== list.children.length || shown.some((item, k) => item !== list.children[k])) list.replaceChildren(...shown);
 }
 
 function showPairs() {
@@ -204,15 +253,18 @@ function shape(tag, attributes, text = "") {
 async function refreshClosures() {
   const state = at("state").value;
   const of = new Map(robots.map((r) => [r.session, r.map]));
-  listed = state === "accepted" ? accepted : (await json(`closures?status=${state}&limit=5000`)).map((c) => placed(c, of));
+  listed = state === "accepted" ? accepted : (await json(`closures?status=${state}&limit=${MOST_CLOSURES}`)).map((c) => placed(c, of));
   const newest = listed.slice(-LISTED).reverse();
-  at("closures").textContent = `${listed.length} ${state}, ${listed.filter((c) => c.robot_i !== c.robot_j).length} of them between robots${listed.length > LISTED ? `; the newest ${LISTED} are listed` : ""}`;
+  at("closures").textContent = `${listed.length === MOST_CLOSURES ? "the newest " : ""}${listed.length} ${state}, ${listed.filter((c) => c.robot_i !== c.robot_j).length} of them between robots${listed.length > LISTED ? `; the newest ${LISTED} are listed` : ""}`;
   const label = (c) => `${c.robot_i} – ${c.robot_j}, ${c.channel}, ${c.stamp_i.toFixed(1)} s – ${c.stamp_j.toFixed(1)} s`;
   fill(at("list"), newest.map(keyOf), () => newest.map((c) => new Option(label(c), keyOf(c))));
   if (selected) {
-    const now = report ? selected : await json(`closures/${keyOf(selected)}`).catch(() => selected);
-    selected = placed(now, of);
-    showClosure();
+    const asked = selected;
+    const now = report ? asked : await json(`closures/${keyOf(asked)}`).catch((error) => { if (error.status !== 404) throw error; });
+    if (selected !== asked) return; // another one by now
+    selected = now ? placed(now, of) : null;
+    if (selected) showClosure();
+    else { at("closure").hidden = true; at("message").textContent = "The selected closure is no longer there: one of its robots was removed."; }
   }
 }
 
@@ -297,8 +349,9 @@ function tellChanges(now) {
       else if (was.quality === 0 && robot.quality > 0) tell(`others confirm where ${robot.session} is`);
       for (const [channel, made] of Object.entries(robot.detectors)) if (was?.detectors[channel] && was.detectors[channel] !== made) tell(`${robot.session} has another ${channel} detector: ${made}`);
     }
-    if (now.maps.length < before.maps.length) tell(`maps joined, ${now.maps.length} left`);
-    if (now.maps.length > before.maps.length && before.maps.length) tell(`${now.maps.length} maps now`);
+    const were = (m) => new Set(m.robots.map((name) => known.get(name)?.map).filter((map) => map !== null && map !== undefined)).size;
+    if (now.maps.some((m) => were(m) > 1)) tell(`maps joined, ${now.maps.length} left`);
+    else if (now.maps.length !== before.maps.length && before.maps.length) tell(`maps now: ${now.maps.length}`);
     const lost = before.accepted.filter((c) => c.robot_i !== c.robot_j && !still.has(keyOf(c))).length;
     if (lost) tell(`closures between robots no longer accepted: ${lost}`);
     for (const edit of now.edits.slice(before.edits.length)) tell(`${edit.author}: ${edit.kind}`);
@@ -344,41 +397,64 @@ async function showLearning() {
 
 const canvas = at("map"), pen = canvas.getContext("2d"), tiles = new Map();
 let view = null, mapIndex = 0, queued = false, moved = false; // until the user moves the map, all of it is shown
+let opened = null; // a robot of the open map
 
-// The view of all paths of a map; undefined if there are none.
+// The view of a whole map, or of its paths while it has no cells; undefined if there are none.
 function whole(index, width, height) {
-  const low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-  for (const robot of robots) for (const p of robot.map === index ? trails.get(robot.session) ?? [] : [])
+  const extent = maps.find((m) => m.map === index)?.extent;
+  const low = extent ? extent.slice(0, 2) : [Infinity, Infinity], high = extent ? extent.slice(2) : [-Infinity, -Infinity];
+  if (!extent) for (const robot of robots) for (const p of robot.map === index ? trails.get(robot.session) ?? [] : [])
     for (const k of [0, 1]) { low[k] = Math.min(low[k], p[1 + k]); high[k] = Math.max(high[k], p[1 + k]); }
   if (low[0] > high[0]) return undefined;
-  const scale = Math.min(width / (high[0] - low[0] + 10), height / (high[1] - low[1] + 10));
+  const scale = Math.min(width / (high[0] - low[0] + 2), height / (high[1] - low[1] + 2));
   return { x: (low[0] + high[0]) / 2, y: (low[1] + high[1]) / 2, scale };
 }
 function fit() { view = whole(mapIndex, canvas.clientWidth, canvas.clientHeight) ?? view; }
 function openMap(index) {
   mapIndex = index;
+  opened = maps.find((m) => m.map === index)?.robots[0] ?? null;
   at("maps").value = index;
   for (const button of at("previews").children) button.ariaPressed = String(Number(button.dataset.map) === index);
 }
 function choose(index) { openMap(index); moved = false; followed = null; fit(); redraw(); }
 
-// Until the moment: the poses of a path, and whether a closure was possible.
-const pathOf = (name) => (trails.get(name) ?? []).filter((p) => p[0] <= until);
+// The path of a robot until the moment, in metres of the map, and its last pose. Poses nearer than a pixel are left out.
+const ways = new Map();
+function wayOf(name) {
+  const all = trails.get(name), level = Math.ceil(Math.log2(view.scale)), known = ways.get(name);
+  if (known && known.all === all && known.until === until && known.level === level) return known;
+  const way = { all, until, level, path: new Path2D(), last: undefined }, near = 2 ** -level;
+  let drawn = null;
+  for (const p of all ?? []) {
+    if (p[0] > until) break;
+    if (!drawn || Math.hypot(p[1] - drawn[1], p[2] - drawn[2]) >= near) { way.path.lineTo(p[1], p[2]); drawn = p; }
+    way.last = p;
+  }
+  if (way.last) way.path.lineTo(way.last[1], way.last[2]);
+  ways.set(name, way);
+  return way;
+}
+// Whether a closure was possible until the moment.
 const isPast = (c) => Math.max(c.stamp_i, c.stamp_j) <= until;
 
 // metres to pixels of the canvas
 const onScreen = (x, y) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 
-// The newest picture of a tile; while another version of the map is on its way, that of the last one.
+// The newest picture of a tile that has come; a newer one is asked for once, and replaces it whatever happens meanwhile.
 function tile(index, z, x, y) {
   const key = `${index}/${z}/${x}/${y}`;
-  const kept = tiles.get(key) ?? { picture: null, version: -1 };
+  const kept = tiles.get(key) ?? { picture: null, version: -1, isAsked: false };
   tiles.delete(key); tiles.set(key, kept); // the last one of all: those that are not drawn leave first
-  if (kept.version !== version) {
-    const asked = kept.version = version;
+  if (kept.version < version && !kept.isAsked) {
+    const asked = version;
+    kept.isAsked = true;
     ask(`maps/${index}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
-      .then((picture) => { if (kept.version === asked || !kept.picture) { kept.picture = picture; redraw(); } })
-      .catch(() => { if (!report) setTimeout(() => { kept.version = -1; redraw(); }, RETRY_MS); }); // a report has no more of them
+      .then((picture) => { kept.picture?.close(); kept.picture = picture; kept.version = asked; })
+      .catch((error) => {
+        if (!report && !(error instanceof Refused)) return new Promise((done) => setTimeout(done, RETRY_MS));
+        kept.version = asked; // a report has no more of them, and a refused token gets none
+      })
+      .finally(() => { kept.isAsked = false; redraw(); });
   }
   return kept.picture;
 }
@@ -428,15 +504,24 @@ function draw() {
   pen.globalAlpha = 1;
   for (const robot of robots) {
     if (robot.map !== mapIndex || !robot.T_map_base || hidden.has(robot.session)) continue;
-    const colour = colourOf(robot.session), path = pathOf(robot.session);
-    if (!path.length) continue;
-    const [x, y, heading] = until === Infinity ? robot.T_map_base : path.at(-1).slice(1), [px, py] = onScreen(x, y);
-    lines([path.map((p) => [p[1], p[2]])], colour);
+    const colour = colourOf(robot.session), { path, last } = wayOf(robot.session);
+    if (!last) continue;
+    const [x, y, heading] = until === Infinity ? robot.T_map_base : last.slice(1), [px, py] = onScreen(x, y);
+    pen.save(); pen.translate(w / 2 - view.x * view.scale, h / 2 + view.y * view.scale); pen.scale(view.scale, -view.scale);
+    pen.strokeStyle = colour; pen.lineWidth = 2 / view.scale; pen.stroke(path); pen.restore();
     pen.save(); pen.translate(px, py); pen.rotate(-heading); pen.fillStyle = colour;
     pen.beginPath(); pen.moveTo(11, 0); pen.lineTo(-7, 6); pen.lineTo(-7, -6); pen.fill(); pen.restore();
   }
   for (const region of regions) drawRegion(region);
   if (selected) drawSelected();
+  showScale();
+}
+
+// The longest bar of 1, 2 or 5 times a power of ten metres that is short enough.
+function showScale() {
+  const most = BAR_PX / view.scale, power = 10 ** Math.floor(Math.log10(most)), metres = power * [5, 2, 1].find((k) => k * power <= most);
+  at("bar").style.width = `${metres * view.scale}px`;
+  at("metres").textContent = `${metres < 1 ? metres.toPrecision(1) : metres} m`;
 }
 
 // Areas and keep-out regions are drawn where the keyscan that they are tied to is now.
@@ -501,6 +586,7 @@ canvas.addEventListener("pointerdown", (e) => {
 });
 canvas.addEventListener("pointermove", (e) => {
   const old = fingers.get(e.pointerId), now = [e.offsetX, e.offsetY];
+  if (view) at("pointer").textContent = `x ${(view.x + (now[0] - canvas.clientWidth / 2) / view.scale).toFixed(2)} m, y ${(view.y - (now[1] - canvas.clientHeight / 2) / view.scale).toFixed(2)} m`;
   if (!old) return;
   const other = [...fingers].find(([id]) => id !== e.pointerId)?.[1];
   fingers.set(e.pointerId, now);
@@ -513,7 +599,8 @@ canvas.addEventListener("pointerup", (e) => {
 });
 for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => { fingers.delete(e.pointerId); pressed = null; });
 canvas.addEventListener("keydown", (e) => {
-  const keys = { ArrowLeft: () => pan(60, 0), ArrowRight: () => pan(-60, 0), ArrowUp: () => pan(0, 60), ArrowDown: () => pan(0, -60), "+": () => zoom(1.4), "-": () => zoom(1 / 1.4), 0: () => { moved = false; fit(); redraw(); } };
+  if (e.ctrlKey || e.altKey || e.metaKey) return; // shortcuts of the browser
+  const keys = { ArrowLeft: () => pan(60, 0), ArrowRight: () => pan(-60, 0), ArrowUp: () => pan(0, 60), ArrowDown: () => pan(0, -60), "+": () => zoom(1.4), "=": () => zoom(1.4), "-": () => zoom(1 / 1.4), 0: () => { moved = false; fit(); redraw(); } };
   if (keys[e.key]) { e.preventDefault(); keys[e.key](); }
 });
 at("maps").addEventListener("change", (e) => choose(Number(e.target.value)));
@@ -543,41 +630,59 @@ at("login").addEventListener("submit", (e) => {
 new ResizeObserver(redraw).observe(canvas);
 
 // Silence is no event.
+let isLooking = false;
 setInterval(async () => {
-  if (readOnly || document.hidden || !robots.length || at("status").textContent !== "live") return;
+  if (readOnly || document.hidden || !robots.length || !connected || isLooking) return;
+  isLooking = true;
   try {
     const [counts, fleet] = await Promise.all([json("fleet"), json("robots")]);
     const heard = new Map(fleet.map((r) => [r.session, r.last_heard_s]));
     for (const robot of robots) robot.last_heard_s = heard.get(robot.session) ?? null;
-    showRobots(counts);
+    if (connected) { showStatus(counts); showRobots(counts); }
   } catch { /* the stream of events says so */ }
+  isLooking = false;
 }, LOOK_MS);
 
-let attempt = 0; // a new one ends those before it
+let attempt = 0, stop = new AbortController(); // a new attempt ends those before it
 async function follow() {
-  const mine = ++attempt;
-  let reader;
+  stop.abort();
+  const mine = ++attempt, ended = stop = new AbortController();
+  let fault = null, silence;
+  const heard = () => { clearTimeout(silence); silence = setTimeout(() => ended.abort(), SILENT_MS); };
+  const changed = () => {
+    version++;
+    refresh().then(() => { connected = mine === attempt; }, (error) => { fault = error; ended.abort(); });
+  };
   try {
-    reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
-    await update(version); // what is there already; events tell of changes only
-    at("status").textContent = readOnly ? "read-only" : "live";
+    if (!report) heard();
+    const reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
+    changed(); // what is there already; events tell of changes only
     let rest = "";
     for (;;) {
       const { value, done } = await reader.read();
       if (done) throw new Error("the stream ended");
-      if (mine !== attempt) return;
+      if (!report) heard();
       const parts = (rest + value).split("\n\n");
       rest = parts.pop();
-      const newest = parts.filter((p) => p.startsWith("event: live")).pop();
-      if (newest) await update(JSON.parse(newest.slice(newest.indexOf("data: ") + 6)).number);
+      if (parts.some((p) => p.startsWith("event: live"))) changed();
     }
   } catch (error) {
     if (mine !== attempt) return;
-    if (error instanceof Refused) at("status").textContent = error.message;
-    else if (!at("reload").hidden) at("status").textContent = error.message;
-    else { at("status").textContent = "no connection; trying again"; setTimeout(follow, RETRY_MS); }
+    connected = false;
+    const reason = fault ?? error;
+    if (reason instanceof Refused || !at("reload").hidden) at("status").textContent = reason.message;
+    else {
+      at("status").textContent = `${reason instanceof Failed ? reason.message : "no connection"}; trying again`;
+      setTimeout(() => { if (mine === attempt) follow(); }, RETRY_MS);
+    }
   } finally {
-    reader?.cancel().catch(() => {}); // a browser opens six connections to a host, and each stream holds one
+    clearTimeout(silence);
+    ended.abort(); // a browser opens six connections to a host, and each stream holds one
   }
 }
+// So a hidden page has no stream.
+if (!report) document.addEventListener("visibilitychange", () => {
+  if (!document.hidden) follow();
+  else { attempt++; connected = false; stop.abort(); }
+});
 follow();

@@ -70,6 +70,7 @@ class FleetSummary(Settings):
     packets: int
     applied: int = Field(description="packets that took effect")
     waiting: int = Field(description="packets that wait for an earlier one")
+    worker_ready: bool = Field(description="whether packets and edits take effect now; no: the worker is starting")
     robots: list[str]
     maps: int
     metrics: dict[str, float | None]

@@ -75,6 +75,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
             packets=counts.arrived,
             applied=counts.applied,
             waiting=counts.waiting,
+            worker_ready=counts.worker_ready,
             robots=list(run.trajectories),
             maps=len({robot.map_index for robot in run.trajectories.values()}),
             # JSON has no NaN
