@@ -440,6 +440,17 @@ const isPast = (c) => Math.max(c.stamp_i, c.stamp_j) <= until;
 // metres to pixels of the canvas
 const onScreen = (x, y) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 
+// The accepted closures of a channel in the open map, until the moment.
+const links = new Map();
+function linksOf(channel) {
+  const known = links.get(channel);
+  if (known && known.all === accepted && known.until === until && known.map === mapIndex) return known.path;
+  const path = new Path2D();
+  for (const c of accepted) if (c.channel === channel && c.map === mapIndex && isPast(c)) { const [[x, y], [u, v]] = c.ends; path.moveTo(x, y); path.lineTo(u, v); }
+  links.set(channel, { all: accepted, until, map: mapIndex, path });
+  return path;
+}
+
 // The newest picture of a tile that has come; a newer one is asked for once, and replaces it whatever happens meanwhile.
 function tile(index, z, x, y) {
   const key = `${index}/${z}/${x}/${y}`;
@@ -500,15 +511,14 @@ function draw() {
   // A tile in view stays, or each drawing would ask for it again.
   for (const key of tiles.keys()) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; tiles.delete(key); }
   pen.globalAlpha = 0.4;
-  if (at("shown").checked) for (const channel of Object.keys(CLOSURE)) lines(accepted.filter((c) => c.channel === channel && c.map === mapIndex && isPast(c)).map((c) => c.ends), CLOSURE[channel], 1);
+  if (at("shown").checked) for (const channel of Object.keys(CLOSURE)) strokeWay(linksOf(channel), CLOSURE[channel], 1);
   pen.globalAlpha = 1;
   for (const robot of robots) {
     if (robot.map !== mapIndex || !robot.T_map_base || hidden.has(robot.session)) continue;
     const colour = colourOf(robot.session), { path, last } = wayOf(robot.session);
     if (!last) continue;
     const [x, y, heading] = until === Infinity ? robot.T_map_base : last.slice(1), [px, py] = onScreen(x, y);
-    pen.save(); pen.translate(w / 2 - view.x * view.scale, h / 2 + view.y * view.scale); pen.scale(view.scale, -view.scale);
-    pen.strokeStyle = colour; pen.lineWidth = 2 / view.scale; pen.stroke(path); pen.restore();
+    strokeWay(path, colour, 2);
     pen.save(); pen.translate(px, py); pen.rotate(-heading); pen.fillStyle = colour;
     pen.beginPath(); pen.moveTo(11, 0); pen.lineTo(-7, 6); pen.lineTo(-7, -6); pen.fill(); pen.restore();
   }
@@ -541,6 +551,13 @@ function lines(ways, colour, width = 2) {
   pen.strokeStyle = colour; pen.lineWidth = width; pen.beginPath();
   for (const way of ways) way.forEach(([x, y], k) => (k ? pen.lineTo(...onScreen(x, y)) : pen.moveTo(...onScreen(x, y))));
   pen.stroke();
+}
+
+// A path in metres of the map.
+function strokeWay(path, colour, width) {
+  const [px, py] = onScreen(0, 0);
+  pen.save(); pen.translate(px, py); pen.scale(view.scale, -view.scale);
+  pen.strokeStyle = colour; pen.lineWidth = width / view.scale; pen.stroke(path); pen.restore();
 }
 
 function drawSelected() {
