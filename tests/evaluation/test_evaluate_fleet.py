@@ -11,8 +11,9 @@ from fcslam.errors import EvaluationError
 from fcslam.evaluation.fleet.closures import ClosureScope
 from fcslam.evaluation.fleet.ground_truth import read_grid
 from fcslam.evaluation.fleet.metrics import fleet_metrics
-from fcslam.evaluation.fleet.report import evaluate_fleet
+from fcslam.evaluation.fleet.report import Join, evaluate_fleet
 from fcslam.geometry import se2
+from fcslam.metrics.closures import ClosureCriteria
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 
@@ -129,6 +130,25 @@ def test_a_robot_moved_by_a_metre_is_a_false_join(folder):
     assert report.within.translation.maximum < 1e-6
     assert report.across.translation.maximum == pytest.approx(1.0)
     assert report.agreement.f1 < 1.0, "the map is moved as the trajectories are"
+
+
+def test_a_truth_in_utm_coordinates_gives_the_figures_of_a_truth_at_the_origin(folder):
+    run = changed(1, (5.0, 5.0, 1.0))
+    near = report_of(run, folder)
+    for robot in range(3):
+        poses = truth(robot) + np.array((453_000.0, 5_411_000.0, 0.0))
+        write_tum(folder.parent / "recordings" / f"r{robot}" / "ground_truth.tum", stamps(robot), poses)
+    far = report_of(run, folder)
+    assert [(join.robot_a, join.robot_b) for join in far.false_joins] == [("r0", "r1"), ("r1", "r2")]
+    for at_origin, off_origin in zip(near.joins, far.joins, strict=True):
+        assert off_origin.translation_m == pytest.approx(at_origin.translation_m, abs=1e-4)
+    for at_origin, off_origin in zip(near.robots, far.robots, strict=True):
+        assert off_origin.joint.rmse_m == pytest.approx(at_origin.joint.rmse_m, abs=1e-4)
+
+
+def test_a_join_whose_error_cannot_be_measured_is_not_counted_as_right():
+    assert Join("r0", "r1", np.nan, np.nan).is_false(ClosureCriteria())
+    assert not Join("r0", "r1", 0.5, 10.0).is_false(ClosureCriteria())
 
 
 def test_robots_in_another_map_have_an_alignment_of_their_own(folder):

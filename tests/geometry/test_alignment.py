@@ -66,6 +66,20 @@ def test_degenerate_rows_are_nan_and_the_others_are_not() -> None:
     assert np.isnan(n_point_alignment(b[0], b[0], [0.0, 0.0, 0.0])).all()
 
 
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (1e5, 0.0), (453_000.0, 5_411_000.0)])
+def test_points_in_a_room_determine_the_pose_however_far_from_the_origin_it_is(origin: tuple[float, float]) -> None:
+    b = cloud(3, 50) / 2.0
+    T_a_b = (*origin, 0.3)
+    a = se2.transform(T_a_b, b)
+    assert n_point_alignment(a, b) == pytest.approx(T_a_b, abs=1e-8)
+    k, m = np.argmin(b[:, 0]), np.argmax(b[:, 0])
+    assert two_point_alignment(a[[k, m]], b[[k, m]]) == pytest.approx(T_a_b, abs=1e-8)
+    one_place = np.tile(np.add(origin, (0.1, 0.2)), (50, 1))
+    assert np.isnan([n_point_alignment(one_place, one_place), n_point_alignment(one_place, b)]).all()
+    with pytest.raises(ValueError, match="coincident"):
+        two_point_alignment(one_place[:2], b[:2])
+
+
 @pytest.mark.parametrize(
     ("a", "b"), [([[1e3, 2.0]] * 2, [[0.0, 0.0], [1.0, 0.0]]), ([[0.0, 0.0], [1.0, 0.0]], [[0.1, 0.2]] * 2)]
 )

@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 from fcslam.geometry.se2 import Array
 
 _DEGENERATE = 1e-12
-"""Squared spread of points, relative to their squared coordinates, below which they count as one point."""
+"""Sum behind the rotation, relative to the squared spread of both sets of points, below which no rotation is best."""
+_ROUNDING = 1e-28
+"""Squared spread of points, relative to their squared coordinates, below which it is rounding: they are one point."""
 
 
 def rotation_eq5(alpha_rad: float) -> Array:
@@ -85,12 +87,14 @@ def _align(a: Array, b: Array, w: Array) -> Array:
     """Pose (..., 3) that moves the complex points b onto a, weighted; NaN where it is not determined."""
     total = w.sum(axis=-1, keepdims=True)
     mean_a, mean_b = (w * a).sum(axis=-1, keepdims=True) / total, (w * b).sum(axis=-1, keepdims=True) / total
-    turn = (w * (a - mean_a) * np.conj(b - mean_b)).sum(axis=-1)
-    scale = (w * (np.abs(a) ** 2 + np.abs(b) ** 2)).sum(axis=-1)
+    from_a, from_b = a - mean_a, b - mean_b
+    turn = (w * from_a * np.conj(from_b)).sum(axis=-1)
+    spread, size = ((w * (np.abs(p) ** 2 + np.abs(q) ** 2)).sum(axis=-1) for p, q in ((from_a, from_b), (a, b)))
     theta = np.angle(turn)
     shift = mean_a[..., 0] - np.exp(1j * theta) * mean_b[..., 0]
     pose = np.stack((shift.real, shift.imag, theta), axis=-1)
-    return np.where((np.abs(turn) > _DEGENERATE * scale)[..., None], pose, np.nan)
+    is_determined = np.abs(turn) > np.maximum(_DEGENERATE * spread, _ROUNDING * size)
+    return np.where(is_determined[..., None], pose, np.nan)
 
 
 def _complex(points: Array) -> Array:
@@ -99,4 +103,4 @@ def _complex(points: Array) -> Array:
 
 def _coincide(points: Array) -> bool:
     side = points[1] - points[0]
-    return bool(side @ side <= _DEGENERATE * (points * points).sum())
+    return bool(side @ side <= _ROUNDING * (points * points).sum())

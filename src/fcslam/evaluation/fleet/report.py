@@ -58,8 +58,8 @@ class Join:
     """Relative error of both robots, rotation."""
 
     def is_false(self, criteria: ClosureCriteria) -> bool:
-        """Whether the relative error exceeds the thresholds of a wrong closure."""
-        return self.translation_m > criteria.wrong_m or self.rotation_deg > criteria.wrong_deg
+        """Whether the relative error exceeds the thresholds of a wrong closure, or cannot be measured (NaN)."""
+        return not (self.translation_m <= criteria.wrong_m and self.rotation_deg <= criteria.wrong_deg)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class FleetReport:
 
     @property
     def false_joins(self) -> tuple[Join, ...]:
-        """Joins with a relative error above the thresholds."""
+        """Joins with a relative error above the thresholds, or without one."""
         return tuple(join for join in self.joins if join.is_false(self.criteria))
 
 
