@@ -1,11 +1,13 @@
 """The run of a result: which files it has."""
 
+import numpy as np
 import pytest
 
 from fcslam.cloud.report import LEAST_DRAWN, keyscan_track, run_of
+from fcslam.graph.g2o import read_g2o
 from fcslam.lidar.occupancy import OccupancyConfig
-from tests.scripted import rectangle, stream
-from tests.small_fleet import feed
+from tests.scripted import closures, rectangle, stream
+from tests.small_fleet import feed, in_order
 
 POSES = rectangle()
 FILES = {"map.pgm", "map.yaml", "map.png", "map_1.pgm", "map_1.yaml"}
@@ -23,3 +25,19 @@ def test_the_largest_map_has_a_picture_however_small_it_is(scripted):
     result = feed(scripted(), stream("a", POSES[:1], start_s=0.0)).finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     assert set(run_of(result, tracks, [], "", OccupancyConfig()).map_files) == {"map.pgm", "map.yaml", "map.png"}
+
+
+def test_the_pose_graph_of_two_robots_comes_back_with_its_odometry_and_closures(scripted, tmp_path):
+    """Their packets arrive by turns, so the cloud's own numbers go back and forth between the two."""
+    script = closures(("a", POSES), ("b", POSES), [(k, k) for k in (0, 8, 16, 24, 32, 40)])
+    packets = in_order([*stream("a", POSES, start_s=0.0), *stream("b", POSES, start_s=0.5)])
+    result = feed(scripted(script), packets).finalize()
+    tracks = {name: keyscan_track(robot) for name in "ba" for robot in result.robots if robot.robot == name}
+    (path := tmp_path / "pose_graph.g2o").write_text(run_of(result, tracks, [], "", OccupancyConfig()).pose_graph_g2o)
+    back = read_g2o(path)
+    assert [edge.robust for edge in back.graph.edges] == [edge.robust for edge in result.graph.edges]
+    assert sum(edge.robust for edge in back.graph.edges) == len(script)
+    count = len(POSES)
+    assert back.ids == (*range(count), *range(count + 1, 2 * count + 1)), "one id between two robots is unused"
+    written = {robot.robot: robot.T_map_base for robot in result.robots}
+    assert np.array_equal(back.graph.poses(), np.concatenate([written[name] for name in tracks]))

@@ -1,6 +1,6 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -157,6 +157,12 @@ class JointGraph:
             inside = (edge for edge in edges if kept[edge.i] and kept[edge.j])
             edges = [replace(edge, i=int(numbers[edge.i]), j=int(numbers[edge.j])) for edge in inside]
         return PoseGraph(poses[kept], edges)
+
+    def held_variables(self, robots: Collection[str]) -> dict[str, NDArray[np.int64]]:
+        """Variables of each of these robots in the graph that ``held`` makes of them, in the order of its path."""
+        variables = [self._variables[robot].values for robot in robots]
+        kept = np.sort(np.concatenate(variables)) if variables else np.empty(0, np.int64)
+        return {robot: np.searchsorted(kept, own) for robot, own in zip(robots, variables, strict=True)}
 
     def robots(self) -> dict[str, NDArray[np.int64]]:
         """Variables of every robot in the order of its path; robots in the order in which they started."""

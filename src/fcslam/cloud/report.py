@@ -73,7 +73,7 @@ def run_of(
         closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
-        pose_graph_g2o=g2o_text(result.graph),
+        pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in tracks])),
         map_files=_map_files(result, trajectories, grid),
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
     )
@@ -123,6 +123,19 @@ def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> Local
         pgm_bytes(fused),
         map_yaml(fused, name),
     )
+
+
+def _ids(robots: Sequence[MappedRobot]) -> list[int]:
+    """Id of each variable of the pose graph: robot by robot along its path, with one unused id between two robots.
+
+    Readers of g2o take an edge between consecutive ids for odometry.
+    """
+    ids, first = [0] * sum(len(robot.variables) for robot in robots), 0
+    for robot in robots:
+        for number, variable in enumerate(robot.variables.tolist(), start=first):
+            ids[variable] = number
+        first += len(robot.variables) + 1
+    return ids
 
 
 def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:

@@ -44,6 +44,8 @@ class MappedRobot:
     T_local_base: FloatArray
     """Of each stamp, in the robot's own map, made without other robots, shape (N, 3); the origin is its
     first keyscan."""
+    variables: NDArray[np.int64]
+    """Number of each keyscan in the result's pose graph, shape (N,)."""
     lasers: tuple[LaserModel, ...]
     """As the robot announced them."""
     floor: str = ""
@@ -112,6 +114,7 @@ def conclude(
     fusion = _placed(fusion, sessions, changes)
     index = map_indices(fusion.maps)
     names = [robot for robot in sessions.robots if robot in index]
+    variables = graph.held_variables(fusion.T_map_base)
     robots = tuple(
         MappedRobot(
             robot,
@@ -120,6 +123,7 @@ def conclude(
             tuple(k for k in sessions.keyscans(robot) if not is_cut(robot, k.stamp, changes)),
             fusion.T_map_base[robot],
             fusion.T_local_base[robot],
+            frozen(variables[robot], np.int64),
             sessions.lasers(robot),
             sessions.floor(robot),
             sessions.own_map(robot),

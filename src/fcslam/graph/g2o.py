@@ -70,7 +70,7 @@ def read_g2o(path: Path) -> G2oGraph:
 
 
 def g2o_text(graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> str:
-    """A graph as g2o text; reading it again gives the same numbers, bit by bit.
+    """A graph as g2o text, variables by ascending id; reading it again gives the same numbers, bit by bit.
 
     Args:
         graph: the pose graph.
@@ -83,7 +83,8 @@ def g2o_text(graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence
     names = range(len(graph)) if ids is None else ids
     if len(names) != len(graph) or len(set(names)) != len(names):
         raise ValueError(f"{len(graph)} variables need as many different ids, not {len(names)}")
-    lines = [f"VERTEX_SE2 {name} {_text(pose)}" for name, pose in zip(names, graph.poses().tolist(), strict=True)]
+    vertices = sorted(zip(names, graph.poses().tolist(), strict=True))
+    lines = [f"VERTEX_SE2 {name} {_text(pose)}" for name, pose in vertices]
     lines += [f"FIX {name}" for name in fixed]
     upper = np.triu_indices(3)
     for edge in graph.edges:
