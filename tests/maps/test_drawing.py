@@ -1,3 +1,4 @@
+import time
 from dataclasses import replace
 
 import cv2
@@ -6,8 +7,10 @@ import pytest
 
 from fcslam.maps.drawing import (
     CLOSURE,
+    CLOSURES_APART_M,
     FLOOR,
     INK,
+    LINE_HEIGHT_PX,
     LONG_SIDE_PX,
     PAPER,
     ROBOTS,
@@ -91,6 +94,26 @@ def test_closures_between_robots_are_drawn_and_counted_others_not():
     assert map_png(fused, ways, [own]) == bare
     assert len(where(seen(bare), CLOSURE)) == 0
     assert len(where(seen(map_png(fused, ways, [shared])), CLOSURE)) > 100
+
+
+def test_of_very_many_closures_the_shortest_that_lie_apart_are_drawn_and_soon():
+    fused, ways = walled(120, 300, (0.0, 0.0), 0.5), {"a": way((30, 15), (120, 15)), "b": way((30, 45), (120, 45))}
+    generator = np.random.default_rng(0)
+    starts = generator.uniform((0.0, 0.0), (150.0, 60.0), (20_000, 2))
+    ends = starts + generator.normal(size=starts.shape)
+    closures = [DrawnClosure(*both, "a", "b") for both in zip(starts, ends, strict=True)]
+    start_s = time.process_time()
+    all_of_them = seen(map_png(fused, ways, closures))
+    assert time.process_time() - start_s < 10.0
+
+    middles, kept = np.empty((0, 2)), []
+    for closure in sorted(closures, key=lambda m: np.linalg.norm(m.xy_b - m.xy_a)):
+        middle = (closure.xy_a + closure.xy_b) / 2.0
+        if (np.linalg.norm(middles - middle, axis=1) > CLOSURES_APART_M).all():
+            middles, kept = np.vstack((middles, middle)), [*kept, closure]
+    above_legend = slice(-2 * LINE_HEIGHT_PX)
+    assert 1000 < len(kept) < 10_000
+    assert np.array_equal(all_of_them[above_legend], seen(map_png(fused, ways, kept))[above_legend])
 
 
 def test_the_same_input_makes_the_same_bytes():

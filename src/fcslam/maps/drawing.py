@@ -134,12 +134,21 @@ def highlighted_png(
 
 
 def _spread(closures: Sequence[DrawnClosure]) -> list[DrawnClosure]:
-    """Select the shortest closures with at least ``CLOSURES_APART_M`` between their midpoints."""
+    """Select the shortest closures with at least ``CLOSURES_APART_M`` between their midpoints.
+
+    A closure is compared with those in the squares around its midpoint, so that many take no longer each than few.
+    """
+    side_m = CLOSURES_APART_M
     drawn: list[DrawnClosure] = []
-    for closure in sorted(closures, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
-        middle = closure.xy_a + closure.xy_b
-        if all(np.hypot(*(middle - (m.xy_a + m.xy_b))) > 2.0 * CLOSURES_APART_M for m in drawn):
+    squares: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    finite = [closure for closure in closures if np.isfinite((closure.xy_a, closure.xy_b)).all()]
+    for closure in sorted(finite, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
+        x, y = ((closure.xy_a + closure.xy_b) / 2.0).tolist()
+        column, row = int(x // side_m), int(y // side_m)
+        around = ((column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1))
+        if all(math.dist((x, y), middle) > side_m for square in around for middle in squares.get(square, ())):
             drawn.append(closure)
+            squares.setdefault((column, row), []).append((x, y))
     return drawn
 
 
