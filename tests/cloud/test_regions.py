@@ -1,6 +1,7 @@
 """Regions in the files of a map: which cells they cover, and what other programs read."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,6 +46,30 @@ def test_a_region_may_be_larger_than_the_map_or_beside_it():
     assert (erased(MAP, [region(RegionUse.ERASE, all_of_it)]).cells == Occupancy.UNKNOWN).all()
     beside = [(90.0, 0.0), (91.0, 0.0), (90.0, 1.0)]
     assert erased(MAP, [region(RegionUse.ERASE, beside)]).cells.tobytes() == MAP.cells.tobytes()
+
+
+@pytest.mark.parametrize("side_m", [0.05, 0.002, 0.001])
+@pytest.mark.parametrize("far_m", [1e2, 1e4, 1e5])
+def test_a_corner_far_away_moves_no_edge(side_m, far_m):
+    """The region is right of a slanted line through the middle of the map."""
+    fine = replace(MAP, resolution_m=side_m, origin_xy=(-30 * side_m, -20 * side_m))
+    slope = 0.3
+    corners = [(-slope * far_m, -far_m), (far_m, -far_m), (far_m, far_m), (slope * far_m, far_m)]
+    changed = erased(fine, [region(RegionUse.ERASE, corners)]).cells != fine.cells
+    y, x = ((np.arange(count) + 0.5 - count / 2.0) for count in fine.cells.shape)
+    right_of_it = x[None] - slope * y[:, None]
+    assert changed[right_of_it > 0.1].all()
+    assert not changed[right_of_it < -1.0].any()
+
+
+def test_a_far_part_of_a_region_in_two_pieces_covers_nothing_between_them():
+    """A U that is open to the right, with its bottom a kilometre to the left: two bars cross the map."""
+    bars = [(-1e5, -0.8), (1e5, -0.8), (1e5, -0.3), (-1e3, -0.3), (-1e3, 1.0), (1e5, 1.0), (1e5, 1.5), (-1e5, 1.5)]
+    changed = erased(MAP, [region(RegionUse.ERASE, bars)]).cells != MAP.cells
+    y = MAP.origin_xy[1] + (np.arange(len(changed)) + 0.5) * SIDE_M
+    covered = ((y > -0.8) & (y < -0.3)) | ((y > 1.0) & (y < 1.5))
+    assert changed[covered].all()
+    assert not changed[np.abs(y - 0.35) < 0.5].any()
 
 
 def test_only_an_erasure_erases():

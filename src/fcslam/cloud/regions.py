@@ -14,6 +14,8 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
 _FRACTION_BITS = 6
 """Of the coordinates that OpenCV takes: polygons are exact to a 64th of a cell."""
+_MARGIN_CELLS = 1000
+"""Polygons are cut off this far outside the map: 100 km in cells of 2 mm would overflow OpenCV's 32 bits."""
 
 
 def erased(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> OccupancyMap:
@@ -48,9 +50,27 @@ def _inside(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> NDArray
     mask = np.zeros(occupancy.cells.shape, np.uint8)
     for region in regions:
         cells: FloatArray = (region.polygon - occupancy.origin_xy) / occupancy.resolution_m - 0.5
-        corners = np.round(cells * (1 << _FRACTION_BITS)).astype(np.int32)  # 100 km in cells of 1 cm fit
-        cv2.fillPoly(mask, [corners], 1, shift=_FRACTION_BITS)
+        for axis in (0, 1):
+            cells = _below(cells, axis, mask.shape[1 - axis] + _MARGIN_CELLS)
+            cells = -_below(-cells, axis, _MARGIN_CELLS)
+        if len(cells):
+            corners = np.round(cells * (1 << _FRACTION_BITS)).astype(np.int32)
+            cv2.fillPoly(mask, [corners], 1, shift=_FRACTION_BITS)
     return mask.astype(bool)
+
+
+def _below(corners: FloatArray, axis: int, limit: float) -> FloatArray:
+    """The part of a polygon (N, 2) whose coordinate ``axis`` is at most ``limit``, shape (M, 2).
+
+    Of a part in several pieces, sides along the limit connect the pieces.
+    """
+    excess = corners[:, axis] - limit
+    kept = excess <= 0.0
+    crosses = kept != np.roll(kept, -1)
+    share = np.where(crosses, excess, 0.0) / np.where(crosses, excess - np.roll(excess, -1), 1.0)
+    crossings = corners + share[:, None] * (np.roll(corners, -1, axis=0) - corners)
+    part: FloatArray = np.stack((corners, crossings), axis=1)[np.stack((kept, crosses), axis=1)]
+    return part
 
 
 def _feature(area: PlacedRegion) -> dict[str, object]:
