@@ -51,9 +51,10 @@ class JointGraph:
         poses: FloatArray = self._poses.values[variables].reshape(-1, 3)
         return poses
 
-    def trajectory(self, robot: str) -> FloatArray:
-        """T_map_base of the robot's keyscans, shape (N, 3)."""
-        trajectory: FloatArray = self._poses.values[self._variables[robot].values]
+    def trajectory(self, robot: str, numbers: NDArray[np.int64] | None = None) -> FloatArray:
+        """T_map_base of the robot's keyscans, or of those with these numbers (N,), shape (N, 3)."""
+        variables = self._variables[robot].values
+        trajectory: FloatArray = self._poses.values[variables if numbers is None else variables[numbers]]
         return trajectory
 
     def path(self, robot: str, settings: DriftSettings) -> Trajectory:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
@@ -36,6 +37,8 @@ class VocabularyState(NamedTuple):
 _VocabularyKey = tuple[Channel, str, str]
 """Channel, detector version and floor; places that differ in one of these are never compared."""
 
+_NO_PLACES = np.empty((0, 2), np.int64)
+
 
 class PlaceRecognition:
     """One matcher for each channel, detector version and floor."""
@@ -52,8 +55,9 @@ class PlaceRecognition:
         self._verify_pairs = verify_pairs
         self._submaps = SubmapCache(sessions, graph, config.submaps_kept)
         self._matchers: dict[_VocabularyKey, PlaceMatcher] = {}
-        self._places: dict[tuple[_VocabularyKey, str], list[KeyscanId]] = {}
-        """By vocabulary and session."""
+        self._places: dict[tuple[_VocabularyKey, str], NDArray[np.int64]] = {}
+        """Number of the keyscan and of the arrival of each stored place, shape (N, 2), by vocabulary and session."""
+        self._arrivals = 0
 
     def match(self, place: Place, mates: Collection[str]) -> list[PlaceMatch]:
         """Compare a new place with the stored ones and store it (Algorithm 1).
@@ -63,21 +67,25 @@ class PlaceRecognition:
         key = self._key(place)
         matcher = self._matcher(key)
         matches = matcher.match(place, self._predicted(place, mates), _outside(mates))
-        self._places.setdefault((key, place.id.robot), []).append(place.id)
+        self._enter(key, place.id)
         return matches
 
     def thin(self, place: Place, mates: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
-        settings, matcher = self._config.matcher, self._matchers[self._key(place)]
-        sessions = {session for session in mates if robot_of(session) == robot_of(place.id.robot)}
+        key, robot, settings = self._key(place), robot_of(place.id.robot), self._config.matcher
+        matcher, sessions = self._matchers[key], [session for session in mates if robot_of(session) == robot]
         if len(matcher) <= settings.most_nearby and len(sessions) <= settings.most_sessions_nearby:
             return
-        ids = [i for i in matcher if i.robot in sessions]
-        positions, owners = self._graph.poses(ids)[:, :2], [i.robot for i in ids]
+        stored = [self._places.get((key, session), _NO_PLACES) for session in sessions]
+        by_arrival = np.argsort(np.concatenate(stored)[:, 1])
+        poses = [self._graph.trajectory(session, rows[:, 0]) for session, rows in zip(sessions, stored, strict=True)]
+        positions = np.concatenate(poses)[by_arrival, :2]
+        owners = np.repeat(np.arange(len(sessions)), [len(rows) for rows in stored])[by_arrival]
+        numbers = np.concatenate(stored)[by_arrival, 0]
         surplus = surplus_places(positions, settings.nearby_m, settings.most_nearby)
         old = places_of_old_sessions(positions, owners, settings.nearby_m, settings.most_sessions_nearby)
         for row in np.union1d(surplus, old):
-            matcher.forget(ids[row])
+            matcher.forget(KeyscanId(sessions[owners[row]], int(numbers[row])))
 
     def forget(self, sessions: Collection[str]) -> None:
         """Forget all places of the sessions."""
@@ -109,7 +117,7 @@ class PlaceRecognition:
             matcher = self._matcher(key)
             matcher.restore(kept, Channel(channel), version)
             for place in matcher:
-                self._places.setdefault((key, place.robot), []).append(place)
+                self._enter(key, place)
 
     def _key(self, place: Place) -> _VocabularyKey:
         return place.channel, place.detector_version, self._sessions.floor(place.id.robot)
@@ -127,9 +135,16 @@ class PlaceRecognition:
             )
         return self._matchers[key]
 
+    def _enter(self, key: _VocabularyKey, place: KeyscanId) -> None:
+        stored = self._places.get((key, place.robot), _NO_PLACES)
+        self._places[key, place.robot] = np.vstack((stored, (place.number, self._arrivals)))
+        self._arrivals += 1
+
     def _forget(self, place: Place) -> None:
         """Release what only a place needs that is never compared again."""
-        self._places[self._key(place), place.id.robot].remove(place.id)
+        vocabulary_session = self._key(place), place.id.robot
+        stored = self._places[vocabulary_session]
+        self._places[vocabulary_session] = stored[stored[:, 0] != place.id.number]
         self._submaps.drop(place)
         self._sessions.release(place)
 
@@ -138,8 +153,11 @@ class PlaceRecognition:
         pose, key = self._graph.pose(place.id), self._key(place)
         visits: dict[str, list[Visit]] = {}
         for session in mates:
-            ids = self._places.get((key, session), []) if session != place.id.robot else []
-            found = visits_near(ids, self._graph.poses(ids), pose[:2], self._config.sight_m)
+            numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
+            if session == place.id.robot or not len(numbers):
+                continue
+            poses = self._graph.trajectory(session, numbers)
+            found = visits_near(session, numbers, poses, pose[:2], self._config.sight_m)
             if found:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits, self._closures_near(visits), self._config.near_visits)

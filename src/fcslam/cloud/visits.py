@@ -6,6 +6,7 @@ from operator import attrgetter, itemgetter
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.records import FloatArray, KeyscanId
 
@@ -27,19 +28,23 @@ class Visit(NamedTuple):
     places: tuple[KeyscanId, ...]
 
 
-def visits_near(places: Sequence[KeyscanId], T_map_place: FloatArray, xy: FloatArray, within_m: float) -> list[Visit]:
+def visits_near(
+    session: str, numbers: NDArray[np.int64], T_map_place: FloatArray, xy: FloatArray, within_m: float
+) -> list[Visit]:
     """The visits of a session to the surroundings of a point (2,), in their order.
 
-    ``places``: of one session, in their order, at the poses (N, 3). Consecutive ones that are near are one visit.
+    ``numbers``: of the keyscans of its places (N,), in their order, at the poses (N, 3). Consecutive ones that are near
+    are one visit.
     """
     distance = np.hypot(T_map_place[:, 0] - xy[0], T_map_place[:, 1] - xy[1])
     close = np.flatnonzero(distance < within_m)
     stays = np.split(close, np.flatnonzero(np.diff(close) > 1) + 1) if len(close) else []
-    nearest = [int(stay[np.argmin(distance[stay])]) for stay in stays]
-    return [
-        Visit(float(distance[k]), places[k], tuple(places[row] for row in stay))
-        for k, stay in zip(nearest, stays, strict=True)
-    ]
+    visits = []
+    for stay in stays:
+        nearest = int(np.argmin(distance[stay]))
+        places = tuple(KeyscanId(session, number) for number in numbers[stay].tolist())
+        visits.append(Visit(float(distance[stay[nearest]]), places[nearest], places))
+    return visits
 
 
 def worth_comparing(visits: Mapping[str, Sequence[Visit]], closures: Counter[frozenset[str]], most: int) -> list[Visit]:

@@ -1,9 +1,7 @@
 """Which places the cloud may forget where a robot has stored very many (density limit per area)."""
 
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fcslam.records import FloatArray
 
@@ -28,16 +26,14 @@ def surplus_places(positions_m: FloatArray, side_m: float, most: int) -> NDArray
     return _in_newest_square(positions_m, side_m)[:-most]
 
 
-def places_of_old_sessions(
-    positions_m: FloatArray, sessions: Sequence[str], side_m: float, most: int
-) -> NDArray[np.int64]:
+def places_of_old_sessions(positions_m: FloatArray, sessions: ArrayLike, side_m: float, most: int) -> NDArray[np.int64]:
     """Find the places in the newest place's grid square that are not of the ``most`` newest sessions there.
 
     A robot that comes back every day thus keeps a few visits of each square, and no area loses its last place.
 
     Args:
         positions_m: as for ``surplus_places``.
-        sessions: the session of each place.
+        sessions: the session of each place, by name or number, shape (N,).
         side_m: as for ``surplus_places``.
         most: sessions whose places a square may hold, 1 or more.
 
@@ -45,8 +41,9 @@ def places_of_old_sessions(
         Rows of ``positions_m`` to forget, shape (K,), ascending.
     """
     rows = _in_newest_square(positions_m, side_m)
-    newest = list(dict.fromkeys(sessions[row] for row in rows[::-1]))[:most]
-    return np.array([row for row in rows if sessions[row] not in newest], np.int64)
+    owners = np.asarray(sessions)[rows]
+    newest = list(dict.fromkeys(owners[::-1].tolist()))[:most]
+    return rows[~np.isin(owners, newest)]
 
 
 def _in_newest_square(positions_m: FloatArray, side_m: float) -> NDArray[np.int64]:
