@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.cloud import decisions
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.joining import decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
@@ -12,7 +13,8 @@ from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, LoopClosure, Reason, ReasonCode, frozen
-from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, verified
+from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, stream, verified
+from tests.small_fleet import feed, map_of
 
 POSES = rectangle(31)
 SETTINGS = ConsistencySettings()
@@ -117,3 +119,22 @@ def test_the_ledger_books_what_geometry_says():
     assert ledger.evidence("a", "b") == [confirmed], "what the joint map predicted is no evidence for it"
     confirmed.vetoed = True
     assert ledger.evidence("a", "b") == []
+
+
+def test_sessions_that_meet_for_long_without_a_join_are_not_decided_at_every_place(scripted, monkeypatch):
+    poses, sizes = rectangle(801), []
+
+    def counted(found, *rest):
+        sizes.append(len(found))
+        return decide_join(found, *rest)
+
+    monkeypatch.setattr(decisions, "decide_join", counted)
+    a, b = ("a", poses), ("b", poses)
+    vague = closures(a, b, [(k, k) for k in range(0, 600, 4)], informative=False)
+    clear = closures(a, b, [(k, k) for k in range(600, 801, 4)])
+    cloud = feed(scripted(vague, clear), [*stream("a", poses, start_s=0.0), *stream("b", poses, start_s=1e4)])
+    assert sizes[:100] == list(range(1, 101)), "with little evidence they are"
+    grown = np.array(sizes[100:])
+    assert (grown[1:] >= 1.05 * grown[:-1]).all()
+    assert len(vague) < grown[-1] < 1.06 * len(vague), "they join soon after closures say where"
+    assert set(map_of(cloud.finalize()).values()) == {0}

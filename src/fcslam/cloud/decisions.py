@@ -40,6 +40,12 @@ CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
 the same evidence would be weighed again at every place."""
 
+DECIDED_GROWTH = 1.05
+"""Sessions whose evidence fell short are decided again when it has grown by this factor: a decision tests every pair
+of closures, and sessions that meet for hours would pay for all pairs at every place. A re-evaluation does not wait."""
+DECIDED_EACH_TIME = 100
+"""Up to this many closures, two sessions are decided at each new one."""
+
 
 class ClosureDecisions:
     """Accepts closures, joins maps, applies edits and re-evaluates all of it when evidence turns."""
@@ -51,6 +57,8 @@ class ClosureDecisions:
         self._comparison = MapComparison(sessions, config.matcher.verification, config.consistency.separation_m)
         self._examined: dict[frozenset[str], int] = {}
         """Size of the cluster when the maps of two sessions were compared last."""
+        self._short: dict[frozenset[str], int] = {}
+        """Closures of two sessions when their evidence fell short last."""
         self.closures = ClosureLog()
         self.maps: list[list[str]] = []
         """Sessions by map; maps, and the sessions in them, in the order in which they started."""
@@ -142,6 +150,7 @@ class ClosureDecisions:
         )
         self.maps = [list(sessions) for sessions in fusion.maps]
         self._apart = dict(fusion.apart)
+        self._short.clear()
         self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
         self.version += 1
         return fusion
@@ -151,6 +160,7 @@ class ClosureDecisions:
         return {
             "closures": self.closures.state(),
             "examined": [(sorted(pair), size) for pair, size in self._examined.items()],
+            "short": [(sorted(pair), size) for pair, size in self._short.items()],
             "comparison": self._comparison.state(),
             "maps": self.maps,
             "version": self.version,
@@ -164,6 +174,7 @@ class ClosureDecisions:
         """Take over a ``state``."""
         self.closures.restore(state["closures"])
         self._examined = {frozenset(pair): size for pair, size in state["examined"]}
+        self._short = {frozenset(pair): size for pair, size in state["short"]}
         self._comparison.restore(state["comparison"])
         self.maps, self.version = state["maps"], state["version"]
         changes = (read_edit(*change) for change in state["changes"])
@@ -238,11 +249,14 @@ class ClosureDecisions:
 
     def _decide_pair(self, a: str, b: str) -> None:
         """Join the maps of two sessions, or accept more closures between them, if one cluster dominates."""
-        entries = self.closures.evidence(a, b)
+        entries, pair = self.closures.evidence(a, b), frozenset((a, b))
+        if DECIDED_EACH_TIME < len(entries) < DECIDED_GROWTH * self._short.get(pair, 0):
+            return
         decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._examine)
         joined = b in self.map_of(a)
         self._contested |= joined and decision.contested
         if decision.shortfall is not None:
+            self._short[pair] = len(entries)
             _explain(entries, decision.shortfall.under(CONSISTENCY))
             return
         apart = None if joined else self._kept_apart(a, b)
