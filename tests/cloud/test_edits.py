@@ -19,6 +19,7 @@ from fcslam.records import (
     ManualClosure,
     MapRegion,
     Pin,
+    Place,
     Placement,
     RegionUse,
     Removal,
@@ -295,6 +296,26 @@ def test_a_cut_leaves_the_path_and_takes_the_scans(scripted):
     assert [keyscan.stamp for keyscan in b.keyscans] == [1000.0 + k for k in range(10)]
     held = [c.j.number for c in result.closures if c.status == "accepted"]
     assert all(number < 10 for number in held)
+
+
+def test_a_cut_takes_the_closures_of_a_place_whose_submap_has_scans_of_it(scripted):
+    """The place of a at 16 s is outside, but it was described on the scans from 12 s to 16 s."""
+    cloud = feed(scripted(closures(A, B, [(k, k) for k in range(0, 61, 4)])), map(described_on_five_scans, TWO))
+    cloud.fleet.edit([Cut("a", 14.2, 14.8)])
+    assert {c.status for c in cloud.finalize().closures} == {"accepted"}, "no scan is in that"
+    cut = Cut("a", 13.5, 15.5)
+    cloud.fleet.edit([cut])
+    assert {c.i.number for c in cloud.finalize().closures if c.status != "accepted"} == {16}
+    cloud.fleet.edit([cut, ManualClosure("a", 16.0, "b", 1016.0, (0.0, 0.0, 0.0), (0.01, 0.01))])
+    at_16 = [c.status for c in cloud.finalize().closures if c.i.number == 16]
+    assert sorted(at_16) == ["accepted", "revoked"], "a closure by hand needs no submap"
+
+
+def described_on_five_scans(packet):
+    if not isinstance(packet.body, Place):
+        return packet
+    number = packet.body.id.number
+    return replace(packet, body=replace(packet.body, first=max(0, number - 4), last=number))
 
 
 def test_a_placement_moves_the_map_and_its_robots(scripted):

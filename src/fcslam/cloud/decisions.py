@@ -23,6 +23,7 @@ from fcslam.records import (
     Change,
     ClosureStatus,
     Constraint,
+    Cut,
     KeyscanId,
     ManualClosure,
     Pin,
@@ -41,8 +42,8 @@ CONTESTED_GROWTH = 1.1
 the same evidence would be weighed again at every place."""
 
 DECIDED_GROWTH = 1.05
-"""Sessions whose evidence fell short are decided again when it has grown by this factor: a decision tests every pair
-of closures, and sessions that meet for hours would pay for all pairs at every place. A re-evaluation does not wait."""
+"""Sessions whose evidence fell short are decided again when it has grown by this factor, or in a re-evaluation. A
+decision tests every pair of closures: at each place, it would take longer than all else where robots meet for hours."""
 DECIDED_EACH_TIME = 100
 """Up to this many closures, two sessions are decided at each new one."""
 
@@ -189,13 +190,29 @@ class ClosureDecisions:
         return before != (entry.vetoed, entry.pinned)
 
     def _is_vetoed(self, entry: ClosureEntry) -> bool:
-        """Whether a veto excludes the closure, an end of it is cut or removed, or the edit that made it is undone."""
-        ends = [(end.robot, self._sessions.stamp(end)) for end in (entry.closure.i, entry.closure.j)]
+        """Whether a veto excludes the closure, an end is removed, a scan behind it is cut, or its edit is undone."""
         if entry.made_by_hand is not None and entry.made_by_hand not in self._changes:
             return True
-        return any(
-            is_removed(session, self._changes) or is_cut(session, stamp, self._changes) for session, stamp in ends
-        ) or any(veto.forbids(*ends[0], *ends[1]) for veto in self._changes if isinstance(veto, Veto))
+        i, j = ((end.robot, self._sessions.stamp(end)) for end in (entry.closure.i, entry.closure.j))
+        return (
+            is_removed(i[0], self._changes)
+            or is_removed(j[0], self._changes)
+            or any(change.forbids(*i, *j) for change in self._changes if isinstance(change, Veto))
+            or self._is_cut(entry)
+        )
+
+    def _is_cut(self, entry: ClosureEntry) -> bool:
+        """Whether users cut a scan behind the closure: of the submaps that were compared, or else of its two ends."""
+        cuts = [change for change in self._changes if isinstance(change, Cut)]
+        if not cuts:
+            return False
+        is_of_places = entry.is_between and entry.made_by_hand is None
+        for end in (entry.closure.i, entry.closure.j):
+            span = self._sessions.span(end, entry.closure.channel) if is_of_places else (end.number, end.number)
+            stamps = (self._sessions.stamp(KeyscanId(end.robot, k)) for k in range(span[0], span[1] + 1))
+            if any(is_cut(end.robot, stamp, cuts) for stamp in stamps):
+                return True
+        return False
 
     def _is_pinned(self, entry: ClosureEntry) -> bool:
         """Whether a user says that the closure is true, or made it."""

@@ -57,6 +57,8 @@ class SessionStore:
         """Numbers of their packets."""
         self._places: set[tuple[KeyscanId, Channel, str]] = set()
         """Keyscan, channel and detector version of every place."""
+        self._spans: dict[tuple[KeyscanId, Channel], tuple[int, int]] = {}
+        """First and last keyscan behind the places at a keyscan, whichever detector described them."""
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -136,6 +138,8 @@ class SessionStore:
         if described in self._places:
             raise PacketError(f"{robot}: {place.channel} place {number} was described before")
         self._places.add(described)
+        first, last = self.span(place.id, place.channel)
+        self._spans[place.id, place.channel] = min(first, place.first), max(last, place.last)
 
     def add_tile(self, tile: MapTile, sequence: int) -> None:
         """A tile of the session's own map; ``sequence`` is the number of its packet.
@@ -195,6 +199,10 @@ class SessionStore:
             self._read_keyscan(robot, number)
         return bool(chosen)
 
+    def span(self, place: KeyscanId, channel: Channel) -> tuple[int, int]:
+        """First and last keyscan that the place was described on; without a place there, the keyscan itself."""
+        return self._spans.get((place, channel), (place.number, place.number))
+
     def stamp(self, keyscan: KeyscanId) -> float:
         """When the keyscan was taken."""
         return self._stamps[keyscan.robot][keyscan.number]
@@ -234,6 +242,7 @@ class SessionStore:
             "hellos": dict(self._hello_sequences),
             "announced": {robot: sorted(announced) for robot, announced in self._announced.items()},
             "places": sorted(self._places),
+            "spans": [(*place, *span) for place, span in self._spans.items()],
             "tiles": dict(self._tile_sequences),
             "keyscans": {
                 robot: {
@@ -256,6 +265,9 @@ class SessionStore:
         for robot, announced in state["announced"].items():
             self._announced[robot] = {(Channel(channel), version) for channel, version in announced}
         self._places = {(KeyscanId(*place), Channel(channel), version) for place, channel, version in state["places"]}
+        self._spans = {
+            (KeyscanId(*place), Channel(channel)): (first, last) for place, channel, first, last in state["spans"]
+        }
         for robot, kept in state["keyscans"].items():
             self._stamps[robot], self._holders[robot] = kept["stamps"].tolist(), kept["holders"].tolist()
             self._sequences[robot] = kept["sequences"].tolist()
