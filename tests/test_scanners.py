@@ -78,6 +78,16 @@ def test_a_scanner_whose_beams_vary_maps_as_well_as_one_whose_do_not(truth, odom
     assert errors["varying"] < 0.05
 
 
+@pytest.mark.slow
+def test_more_beams_than_the_noise_can_tell_apart_map_as_well_as_fewer(truth, odometry):
+    errors = {}
+    for beams in (400, 3200):
+        laser = LaserModel(beams, -np.pi, 2.0 * np.pi / beams, 20.0)
+        _, poses = mapped(recorded(truth, odometry, ring(), lambda _, laser=laser: laser))
+        errors[beams] = pose_errors(poses, truth)[0].mean()
+    assert errors[3200] < 1.15 * errors[400] + 0.005
+
+
 def test_the_increment_of_another_scan_spoils_the_map(truth, odometry):
     """The beams of each scan matter: here all scans are declared to have the same increment."""
     scans = recorded(truth[:150], odometry[:150], ring(), jittering)

@@ -4,7 +4,7 @@ from math import nan, pi, radians, tau
 
 import pytest
 
-from fcslam.geometry.beams import is_same_laser, misfit
+from fcslam.geometry.beams import beam_step, is_same_laser, misfit
 from fcslam.records import Beams, LaserModel
 
 DEGREE = radians(1.0)
@@ -59,3 +59,8 @@ def test_a_laser_is_known_by_its_mounting_too():
     assert is_same_laser(front, front.with_beams(Beams(180, -pi / 2 + 0.25 * DEGREE, DEGREE)))
     assert not is_same_laser(front, LaserModel(*SICK, 50.0, (-0.2, 0.0, pi)))
     assert not is_same_laser(front, LaserModel(*SICK, 30.0, (0.2, 0.0, 0.0)))
+
+
+def test_beams_that_turn_clockwise_or_not_at_all_have_a_step_too():
+    assert beam_step(Beams(3600, pi, -tau / 3600)) == 5
+    assert beam_step(Beams(3600, pi, 0.0)) == beam_step(Beams(3600, pi, nan)) == 1

@@ -14,6 +14,7 @@ from fcslam.geometry import se2
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import open_source, write_carmen
 from tests import small_fleet
+from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 from tests.robot.kidnapping import drives, kidnapping
 
@@ -46,6 +47,19 @@ def test_each_pose_is_that_of_the_tracker(robot, scans):
     assert {pose.map_index for pose in poses} <= {None, 0}
     assert all(pose.quality > 0.8 for pose in poses[1:] if not math.isnan(pose.quality))
     assert robot.pose is poses[-1]
+
+
+def test_a_dense_scanner_that_gives_its_maximum_where_nothing_is_maps_as_any_other():
+    """It has 7,200 beams, and sees 5.6 m, which is less in single precision."""
+    dense = fcslam.LaserModel(7200, -math.pi, math.tau / 7200, 5.6)
+    rng = np.random.default_rng(0)
+    truth = worlds.drive([(-2.0, -1.0), (1.5, -1.5), (1.5, 2.0), (-2.0, 1.0), (-2.0, -1.0)])
+    odometry = worlds.drifting(truth, rng)
+    measured = worlds.ranges(truth, worlds.room(), dense, 0.01, rng)
+    assert (measured == np.float32(5.6)).any()
+    with fcslam.Robot("anna", dense, executor=SameThread()) as robot:
+        poses = [robot.add_scan(measured[k], 0.1 * k, odometry[k]).T_map_base for k in range(len(truth))]
+    assert worlds.pose_errors(np.array(poses), truth)[0].max() < 0.03
 
 
 def test_the_frame_of_the_odometry_carries_the_correction(robot, scans):

@@ -14,6 +14,7 @@ from fcslam.cli.recordings import CameraTopic, LaserPose, OdomTopic, ScanTopic, 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from fcslam.records import LaserModel
     from fcslam.sources.inspection import Inspection, LaserContents
 
 GAPS_SHOWN = 3
@@ -78,6 +79,14 @@ def _laser(laser: "LaserContents") -> str:
     last_deg = first_deg + math.degrees(model.beams.span_rad)
     rate = "" if laser.rate_hz is None else f" at {laser.rate_hz:.1f} Hz"
     return (
-        f"{laser.scans} scans{rate}, {model.beam_count} beams from {first_deg:.1f} to {last_deg:.1f} degrees, "
+        f"{laser.scans} scans{rate}, {model.beam_count} beams from {first_deg:.1f} to {last_deg:.1f} degrees"
+        f"{_thinning(model)}, "
         f"range up to {model.max_range_m:g} m, mounted at x {x:g} m, y {y:g} m, {math.degrees(theta):.1f} degrees"
     )
+
+
+def _thinning(model: "LaserModel") -> str:
+    from fcslam.geometry.beams import beam_step
+
+    step = beam_step(model.beams)
+    return "" if step == 1 else f" (1 of {step} is mapped)"

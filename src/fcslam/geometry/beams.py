@@ -1,6 +1,6 @@
-"""Whether a scan can be of a laser, judged by the directions of its beams."""
+"""The beams of a laser: whether a scan can be of it, and how many of them a map needs."""
 
-from math import degrees, pi, remainder, tau
+from math import degrees, pi, radians, remainder, tau
 
 from fcslam.records import Beams, LaserModel
 
@@ -12,6 +12,11 @@ SAME_VIEW_RAD = 0.05
 SAME_VIEW_BEAMS = 1.5
 """The same in increments, if that is more: interleaved scans, one beam more or less, rounded headers."""
 
+FINEST_RAD, COARSEST_RAD = radians(0.25), radians(0.5)
+"""Of beams closer together than the first, every k-th one is mapped, so that those are at most the second apart. The
+normals of returns are fitted to few neighbours, which must be farther apart than the noise of a range."""
+ROUNDING = 0.01
+"""Share by which headers round an increment."""
 
 FULL_TURN_RAD = 2.0 * pi
 LARGEST_SPAN_RAD = 1.01 * FULL_TURN_RAD
@@ -56,6 +61,14 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     if not (abs(first_rad) <= tolerance_rad and abs(last_rad) <= tolerance_rad):
         return f"it looks over {_view(beams)}, the laser over {_view(declared)}"
     return None
+
+
+def beam_step(beams: Beams) -> int:
+    """The k of the every k-th beam that is mapped, 1 or more; the first beam and another one remain."""
+    increment_rad = abs(beams.angle_increment_rad)
+    if not 0.0 < increment_rad < (1.0 - ROUNDING) * FINEST_RAD:  # true for NaN
+        return 1
+    return max(1, min(int((1.0 + ROUNDING) * COARSEST_RAD / increment_rad), beams.beam_count - 1))
 
 
 def is_same_laser(a: LaserModel, b: LaserModel) -> bool:

@@ -34,10 +34,10 @@ from fcslam.robot.backend import (
 )
 from fcslam.robot.beside import BackendRunner, Inline
 from fcslam.robot.map_localizer import MapLocalizationConfig
+from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
-from fcslam.wire.quantisation import dequantise, quantise
 
 
 class RobotConfig(SessionConfig):
@@ -95,6 +95,7 @@ class RobotFrontend:
         self.odometry = OdometryGate(config.odometry)
         """Jumps of the odometry so far."""
         self._config = config
+        self._mapped = MappedScans()
         self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
@@ -144,9 +145,7 @@ class RobotFrontend:
         """Process the next record of the recording; returns the packets that are ready."""
         match record:
             case LaserScan():
-                # The robot maps with the quantised ranges, so robot and cloud see the same numbers.
-                scan = self.odometry.scan(record)
-                self._process_scan(replace(scan, ranges_m=dequantise(quantise(scan.ranges_m))))
+                self._process_scan(self._mapped.of(self.odometry.scan(record)))
             case CameraImage() if Channel.CAMERA in self._config.channels:
                 image = self.odometry.image(record)
                 if self._deferred:

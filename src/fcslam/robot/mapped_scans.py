@@ -1,0 +1,54 @@
+"""The scans of a robot as it maps them: one rule for recordings, bags, live robots and programs."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from fcslam.geometry.beams import beam_step
+from fcslam.lidar.lasers import Lasers
+from fcslam.records import Beams, LaserModel, LaserScan, Ranges
+from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
+from fcslam.wire.quantisation import dequantise, quantise
+
+
+class MappedScans:
+    """Prepares the scans of one robot for its map.
+
+    Of a dense scan, every k-th beam is mapped. The first scan of a laser decides k, so that a scanner whose beams vary
+    remains one laser.
+    """
+
+    def __init__(self) -> None:
+        self._lasers = Lasers()
+
+    def of(self, scan: LaserScan) -> LaserScan:
+        """The scan as it is mapped.
+
+        Its ranges, shape (mapped beams,), metres, are those of the wire, so that robot and cloud see the same numbers.
+        A missing return and an invalid range are 0.
+        """
+        index = self._lasers.index(scan.laser)
+        step = beam_step(self._lasers.known[index].beams)
+        laser = _mapped_laser(scan.laser, step)
+        returns = _returns(scan.ranges_m[::step], laser.max_range_m)
+        return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser)
+
+
+@lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
+def _mapped_laser(laser: LaserModel, step: int) -> LaserModel:
+    """The laser with every ``step``-th beam from its first on, and a maximum range that a packet can state."""
+    count, first_rad, increment_rad = laser.beams
+    every = laser.with_beams(Beams(-(-count // step), first_rad, step * increment_rad))
+    if every.max_range_m <= MAXIMUM_LASER_RANGE_M:
+        return every
+    return replace(every, max_range_m=MAXIMUM_LASER_RANGE_M)
+
+
+def _returns(ranges_m: Ranges, max_range_m: float) -> Ranges:
+    """The ranges below the maximum, and 0 for the others, shape (N,), metres.
+
+    The maximum is rounded as the ranges are: 5.6 m in single precision is below 5.6 m, and it is no return. It is
+    compared before the ranges are rounded to the steps of the wire, which may take it below the maximum as well.
+    """
+    return np.where(ranges_m < np.float32(max_range_m), ranges_m, np.float32(0.0))
