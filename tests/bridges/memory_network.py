@@ -7,10 +7,9 @@ from fcslam.sources.bags.codec import MessageCodec
 
 
 class MemoryNetwork:
-    ros1 = False
-
-    def __init__(self, others=()):
+    def __init__(self, others=(), ros1=False):
         """``others``: publishers and subscriptions of somebody else."""
+        self.ros1 = ros1
         self.others = list(others)
         self.sent = defaultdict(list)
         self.subscribed = {}

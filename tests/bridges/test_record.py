@@ -1,8 +1,11 @@
 """A recording of a network in memory is read as a bag; what is missing on a computer is said in one line."""
 
+import resource
 import sys
 import threading
+from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 from fcslam.bridges.node import await_sensors
@@ -12,9 +15,11 @@ from fcslam.bridges.ros1 import Ros1Network
 from fcslam.bridges.ros2 import INSTALL as INSTALL_ROS2
 from fcslam.bridges.ros2 import Ros2Network
 from fcslam.cli import main
-from fcslam.errors import NetworkError
+from fcslam.errors import NetworkError, OutputError
 from fcslam.sources import BagOptions, open_source
-from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.codec import ODOMETRY, OLD_TRANSFORMS, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.container import BagFile
+from fcslam.sources.bags.transforms import in_space
 from tests.bridges.memory_network import MemoryNetwork, offered
 from tests.bridges.ros_messages import odometry, scan, transform
 
@@ -40,6 +45,67 @@ def test_a_recording_is_a_bag(tmp_path):
     survey = open_source(output).survey()
     assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
     assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
+
+
+def recorded(network, output, messages):
+    """Record these messages; returns what is said, and the error if there is one."""
+    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
+    stop, said = threading.Event(), []
+
+    def write():
+        try:
+            record(network, topics, output, stop, said.append)
+        except OutputError as error:
+            said.append(str(error))
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    while "/clock" not in network.subscribed:
+        stop.wait(0.01)
+    for topic, kind, message in messages:
+        network.say(topic, kind, message)
+    stop.set()
+    thread.join(20.0)
+    return said
+
+
+@contextmanager
+def largest_file(size_bytes):
+    """Writing fails beyond this size, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):
+    network = MemoryNetwork([offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)])
+    messages = [("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser"))]
+    for stamp in range(1, 400):
+        messages.append(("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))))
+        messages.append(("/scan", SCAN, scan(stamp, [5.0] * 3000, increment=0.001)))
+    part = tmp_path / "day.part.mcap"
+    with largest_file(3_500_000):
+        (error,) = recorded(network, tmp_path / "day.mcap", messages)
+    assert f"what was recorded before is in {part}; free some space" in error
+    assert list(tmp_path.iterdir()) == [part]
+    assert 200 < open_source(part).survey().scan_count < 399
+
+
+def test_a_bag_of_early_ros_1_on_a_full_disk_is_kept_with_its_index(tmp_path):
+    network = MemoryNetwork([offered("/scan", SCAN), offered("/tf", OLD_TRANSFORMS)], ros1=True)
+    codec = MessageCodec(ros1=True)
+    message = codec.transforms(codec.header(10**9, "odom"), "base_link", in_space(np.zeros(3)))
+    part = tmp_path / "day.part.bag"
+    part.write_bytes(b"of yesterday")
+    with largest_file(1_800_000):
+        (error,) = recorded(network, tmp_path / "day.bag", 15_000 * [("/tf", OLD_TRANSFORMS, message)])
+    assert f"is in {tmp_path / 'day.part-2.bag'}; " in error
+    ((topic, kind, count),) = BagFile(tmp_path / "day.part-2.bag").topics
+    assert (topic, kind) == ("/tf", TRANSFORMS)
+    assert 5000 < count < 15_000
 
 
 def test_messages_that_the_disk_cannot_take_are_counted(monkeypatch):

@@ -1,10 +1,13 @@
 """Records what a robot publishes into a file that `fcslam map` reads: the messages as they come, undecoded."""
 
+import os
 import queue
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import count, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,6 +18,7 @@ from fcslam.bridges.sensors import Notify
 from fcslam.bridges.topics import TF_STATIC, SensorTopics
 from fcslam.errors import OutputError
 from fcslam.sources.bags.codec import full_name, typestore
+from fcslam.sources.bags.mcap_records import end_mcap
 
 _POLL_S = 0.2
 _DEPTH = 1000
@@ -32,10 +36,10 @@ def record(
 ) -> Counter[str]:
     """Write all messages of the sensors, and /clock, until ``stop``; returns their number by topic.
 
-    The file is complete or absent: it moves to ``output`` at the end.
+    The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written; the message names the file that is kept.
     """
     inbox = _Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
@@ -50,9 +54,12 @@ def record(
         publishers = [point for point in offered if point.topic == topic]
         subscribe(topic, kind, bool(publishers) and all(point.quality.reliable for point in publishers))
     counts: Counter[str] = Counter()
+    kept = ""
     try:
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
-            with _Recording(Path(staging, output.stem), network.ros1) as recording:
+            recording = _Recording(Path(staging, output.stem), network.ros1)
+            try:
+                recording.open()
                 while not stop.is_set() or not inbox.is_empty:
                     try:
                         topic, received_ns, payload = inbox.get(_POLL_S)
@@ -61,15 +68,31 @@ def record(
                     recording.write(topic, kinds[topic], received_ns, payload)
                     counts[topic] += 1
                     watch(counts)
+                recording.close()
+            except BaseException as error:
+                if recording.rescue(error):
+                    kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}; "
+                    if not isinstance(error, OSError):
+                        notify(kept)
+                raise
             recording.file.replace(output)
     except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error}); free some space, or choose another path") from error
+        raise OutputError(
+            f"{output}: cannot be written ({error}); {kept}free some space, or choose another path"
+        ) from error
     for topic in (*topics.scans, *filter(None, (topics.odometry,))):
         if not counts[topic]:
             notify(f"{topic}: no message arrived")
     if inbox.lost:
         notify(f"the disk is slower than the messages: {inbox.lost} were lost; record fewer topics, or on another disk")
     return counts
+
+
+def _part_of(output: Path) -> Path:
+    """The first name that is free for a part of ``output``, as in ``day.part.mcap``."""
+    parts = (f"part-{number}" if number > 1 else "part" for number in count(1))
+    places = (output.with_name(f"{output.stem}.{part}{output.suffix}") for part in parts)
+    return next(place for place in places if not place.exists())
 
 
 class _Inbox:
@@ -114,7 +137,7 @@ class _Recording:
     def __init__(self, place: Path, ros1: bool) -> None:
         from rosbags import rosbag1, rosbag2
 
-        self._store = typestore(ros1)
+        self._ros1, self._store = ros1, typestore(ros1)
         self._connections: dict[str, Any] = {}
         self._latest_ns = 0
         self._writer: Any
@@ -125,12 +148,29 @@ class _Recording:
             self._writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
             self.file = place / f"{place.name}.mcap"
 
-    def __enter__(self) -> "_Recording":
+    def open(self) -> None:
+        """Make the file."""
         self._writer.open()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Complete the file."""
         self._writer.close()
+
+    def rescue(self, error: BaseException) -> bool:
+        """End the file after an error, and return whether it holds messages.
+
+        After an error of the disk, the last megabyte is lost.
+        """
+        if not isinstance(error, OSError):
+            with suppress(Exception):
+                self.close()
+                return bool(self._connections)
+        with suppress(Exception):
+            self._writer.abort()
+        try:
+            return _end_bag(self._writer) if self._ros1 else end_mcap(self.file)
+        except OSError:
+            return self.file.exists()
 
     def write(self, topic: str, kind: str, received_ns: int, payload: bytes) -> None:
         """Write a message; the time of recording only ever grows."""
@@ -138,3 +178,21 @@ class _Recording:
             self._connections[topic] = self._writer.add_connection(topic, full_name(kind), typestore=self._store)
         self._latest_ns = max(self._latest_ns, received_ns)
         self._writer.write(self._connections[topic], self._latest_ns, payload)
+
+
+def _end_bag(writer: Any) -> bool:
+    """Cut a ROS 1 bag that was not closed after its last whole chunk and write its index; whether it has messages.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    size = writer.path.stat().st_size
+    whole = [(chunk, after.pos) for chunk, after in pairwise(writer.chunks) if -1 < after.pos <= size]
+    if not whole:
+        return False
+    os.truncate(writer.path, whole[-1][1])
+    writer.chunks = [chunk for chunk, _ in whole]
+    writer.bio = writer.path.open("r+b")
+    writer.bio.seek(0, os.SEEK_END)
+    writer.close()
+    return True

@@ -40,7 +40,7 @@ class MessageCodec:
         Raises:
             ValueError: the bytes are not a message of this kind.
         """
-        name = full_name(TRANSFORMS if kind == OLD_TRANSFORMS else kind)
+        name = full_name(kind)
         try:
             if self.ros1:
                 return self.store.deserialize_ros1(payload, name)
@@ -92,8 +92,8 @@ class MessageCodec:
 
 
 def full_name(kind: str) -> str:
-    """The name of a kind of messages in ROS 2, and in rosbags."""
-    return kind.replace("/", "/msg/")
+    """The name of a kind of messages in ROS 2, and in rosbags; that of OLD_TRANSFORMS is that of TRANSFORMS."""
+    return (TRANSFORMS if kind == OLD_TRANSFORMS else kind).replace("/", "/msg/")
 
 
 @cache
