@@ -137,6 +137,13 @@ def test_a_mounting_on_the_command_line_needs_no_tf():
     assert len(robot.records) == SCANS_FOR_RIG
 
 
+def test_odometry_without_a_frame_is_odometry(robot):
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0), frame="")).hears("/scan", scan(stamp, RANGES))
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    assert robot.sensors.odom_frame == "odom"
+
+
 def test_silence_of_the_odometry_is_told():
     robot = Robot(laser_poses=((0.1, 0.0, 0.0),))
     robot.hears("/scan", scan(1.0, RANGES))

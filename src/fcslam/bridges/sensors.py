@@ -47,6 +47,8 @@ from fcslam.sources.bags.transforms import Mounting, NoTransformError, Transform
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
 
+USUAL_ODOM = "odom"
+"""Frame of an odometry that names none."""
 SCANS_FOR_RIG = 5
 """Number of first scans of each laser that decide which beams it has."""
 PATIENCE_S = 5.0
@@ -78,8 +80,8 @@ class LiveSensors:
         """``namespace`` is "" or begins with a slash."""
         self.audit = Audit("message")
         """Faults so far."""
-        self.odom_frame = self.base_frame = ""
-        """Frames of the odometry, once it is there."""
+        self.odom_frame, self.base_frame = USUAL_ODOM, ""
+        """Frames of the odometry, once it is there; a driver may leave them out."""
         self.restarts = 0
         """Number of times that the clock stepped back."""
         self.newest_stamp: float | None = None
@@ -88,6 +90,7 @@ class LiveSensors:
         self._prefix = namespace.strip("/")
         self._codec = MessageCodec(ros1)
         self._tree = TransformTree()
+        self._has_odometry = False
         self._edge: tuple[str, str] | None = None
         """Frames of the odometry in tf."""
         self._calibration: Calibration | None = None
@@ -211,7 +214,8 @@ class LiveSensors:
             return [scan]
         if kind == ODOMETRY:
             reading = odometry_of(content, received_ns)
-            self.odom_frame, self.base_frame = reading.odom_frame, reading.base_frame
+            self.odom_frame, self.base_frame = reading.odom_frame or USUAL_ODOM, reading.base_frame
+            self._has_odometry = True
             return [reading]
         if kind in (COMPRESSED_IMAGE, IMAGE):
             return [image_of(content, kind, received_ns)]
@@ -230,6 +234,7 @@ class LiveSensors:
             frames = transform.parent, transform.child
             if self._edge is None and is_odometry(transform) and self._is_own(transform.parent):
                 self._edge, (self.odom_frame, self.base_frame) = frames, frames
+                self._has_odometry = True
             if frames == self._edge:
                 readings.append(odometry_in(transform))
         return readings
@@ -275,13 +280,13 @@ class LiveSensors:
         for topic, scans in zip(self._topics.scans, self._first, strict=True):
             if not scans and is_late:
                 self._notify(f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s")
-        if is_late and not self.odom_frame:
+        if is_late and not self._has_odometry:
             self._notify(
                 f"waits for odometry: {self._topics.odometry or 'tf from odom to base'} is silent; the driver of the "
                 "base publishes it; start it, or choose another topic by --odom-topic"
             )
         enough = all(len(scans) >= (1 if is_late else SCANS_FOR_RIG) for scans in self._first)
-        return enough and bool(self.odom_frame)
+        return enough and self._has_odometry
 
     def _tell_rig(self, mountings: list[Mounting], camera_note: str) -> None:
         if camera_note:
