@@ -127,6 +127,22 @@ def test_a_damaged_line_of_ticks_costs_only_itself(tmp_path, damaged):
     assert source.faults[Fault.BROKEN_LINE].count == bool(damaged)
 
 
+def test_encoders_that_are_reset_cost_one_line(tmp_path):
+    lines = drive(np.outer(0.03 * np.arange(60) + 8.0, (1.0, 1.1)))
+    again = [coreslam(11_000_000 + 100_000 * k, 190 * k, 210 * k) for k in range(40)]
+    source = open_source(save(tmp_path / "exp.dat", [*lines, *again]))
+    assert len(scans_of(source)) == 99
+    assert source.faults[Fault.BROKEN_LINE].count == 1
+
+
+def test_one_damaged_count_of_ticks_costs_one_line(tmp_path):
+    lines = drive(np.outer(0.03 * np.arange(60), (1.0, 1.1)))
+    lines[30] = coreslam(8_000_000, 10**9, 2)
+    source = open_source(save(tmp_path / "exp.dat", lines))
+    assert len(scans_of(source)) == 59
+    assert source.faults[Fault.BROKEN_LINE].count == 1
+
+
 def test_another_number_of_columns_is_refused(tmp_path):
     path = save(tmp_path / "exp.dat", [line + " 7" for line in drive(np.zeros((20, 2)))])
     with pytest.raises(SourceError, match="known format"):

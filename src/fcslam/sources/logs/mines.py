@@ -59,6 +59,8 @@ class _MinesParser:
 
     def __init__(self) -> None:
         self._ticks: tuple[float, float] | None = None
+        self._refused: tuple[float, float] | None = None
+        """Counts of the line before, if they were no sane ones."""
         self._newest: Pose = (0.0, 0.0, 0.0)
         self._recent: deque[tuple[float, Pose]] = deque(maxlen=_POSES_KEPT)
 
@@ -79,12 +81,18 @@ class _MinesParser:
         return ScanLine(stamp, T_odom_base, T_odom_laser, _BEAM_COUNT - 2 * _HIDDEN_BEAMS, range_text, _LASER)
 
     def _drive(self, left: float, right: float) -> None:
-        """Go on to these counts along an arc, taken as its chord."""
-        before = self._ticks or (left, right)
-        left_m, right_m = (left - before[0]) * _METRES_PER_TICK, (right - before[1]) * _METRES_PER_TICK
-        if max(abs(left_m), abs(right_m)) > _MAX_STEP_M:
+        """Go on to these counts along an arc, taken as its chord.
+
+        A count that no wheel can reach is damage, unless the next one is near it: then the encoders were reset.
+        """
+        counts = left, right
+        known = (before for before in (self._ticks or counts, self._refused) if before is not None)
+        before = next((before for before in known if _step_m(before, counts) <= _MAX_STEP_M), None)
+        if before is None:
+            self._refused = counts
             raise ValueError("no sane count of ticks")
-        self._ticks = left, right
+        self._ticks, self._refused = counts, None
+        left_m, right_m = (left - before[0]) * _METRES_PER_TICK, (right - before[1]) * _METRES_PER_TICK
         x, y, theta = self._newest
         turn = (right_m - left_m) / _TRACK_M
         ahead_m, heading = 0.5 * (left_m + right_m), theta + 0.5 * turn
@@ -100,6 +108,11 @@ class _MinesParser:
                 return x, y, theta
             after = before
         return after[1]
+
+
+def _step_m(before: tuple[float, float], after: tuple[float, float]) -> float:
+    """The longer way of both wheels between these counts."""
+    return max(abs(after[0] - before[0]), abs(after[1] - before[1])) * _METRES_PER_TICK
 
 
 def _count(word: bytes) -> float:
