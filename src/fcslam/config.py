@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from fcslam.errors import ConfigError
+from fcslam.errors import ConfigError, printable
 
 LONGEST_QUOTE: Final = 300
 """Longer texts from a file are cut in messages."""
@@ -143,5 +143,5 @@ def parse_yaml(text: str | bytes) -> Any:
 
 def one_line(text: str) -> str:
     """The text on one line of at most ``LONGEST_QUOTE`` characters, for a message that quotes a file."""
-    line = " ".join(text.split())
+    line = printable(" ".join(text.split()))
     return line if len(line) <= LONGEST_QUOTE else f"{line[: LONGEST_QUOTE - 3]}..."

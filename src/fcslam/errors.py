@@ -38,6 +38,11 @@ class FcslamError(Exception):
         super().__init__(_SYSTEM_ERROR.sub(lambda found: _readable(found, message), message))
 
 
+def printable(text: str) -> str:
+    """The text without the line breaks and control characters that a terminal would obey: recordings hold any names."""
+    return "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in text)
+
+
 def _readable(system_error: re.Match[str], message: str) -> str:
     text, file = system_error.groups()
     return text if file is None or message.startswith(file) else f"{text}: '{file}'"

@@ -8,7 +8,7 @@ import pytest
 from fcslam.cli import main
 from fcslam.records import LaserModel, LaserScan
 from fcslam.sources import write_carmen
-from tests.sources.bag_messages import drive, save
+from tests.sources.bag_messages import drive, save, scan
 
 
 @pytest.fixture
@@ -46,6 +46,14 @@ def test_a_dense_scanner_of_any_range_can_be_mapped_as_the_text_says(tmp_path, c
     assert "7200 beams from -180.0 to 179.9 degrees (1 of 10 is mapped), range up to 100000 m" in out
     assert out.endswith("can be mapped\n")
     assert main(["map", str(log), "--output", str(run), "--quiet"]) == 0
+
+
+def test_names_of_a_bag_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):
+    said = [scan(100.0 + k, frame="la\x1b[31mser\nx", topic="/scan\x1b[2J") for k in range(9)]
+    assert main(["info", str(save(tmp_path / "run1.bag", [*drive(9), *said]))]) == 0
+    out = capsys.readouterr().out
+    assert "\x1b" not in out
+    assert "  /scan?[2J: sensor_msgs/LaserScan, 9 messages, 1.0 Hz, frame la?[31mser x" in out.splitlines()
 
 
 def test_json_holds_the_same(bag, capsys):

@@ -36,7 +36,7 @@ from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
 from fcslam.cli.examples import examples
-from fcslam.errors import FcslamError, InputError
+from fcslam.errors import FcslamError, InputError, printable
 
 BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
 """Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells, 1 for a closed pipe as in click."""
@@ -200,7 +200,7 @@ def _drop_stdout() -> None:
 
 
 def _fail(message: str, code: int) -> int:
-    typer.echo(f"fcslam: {' '.join(message.split())}", err=True)
+    typer.echo(f"fcslam: {printable(' '.join(message.split()))}", err=True)
     return code
 
 

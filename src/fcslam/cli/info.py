@@ -10,6 +10,7 @@ import typer
 
 from fcslam.cli.output import answers, print_line
 from fcslam.cli.recordings import CameraTopic, LaserPose, OdomTopic, ScanTopic, bag_options
+from fcslam.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,7 +39,7 @@ def info(
         print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
         return
     for line in _lines(found):
-        print_line(console, line)
+        print_line(console, printable(line))
 
 
 def _lines(found: "Inspection") -> "Iterator[str]":
