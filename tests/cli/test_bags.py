@@ -214,3 +214,9 @@ def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
     log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40, start_stamp=-5.0))
     assert "ROS counts from 0 s" in refused(capsys, "convert", log, tmp_path / "a.bag")
     assert {path.name for path in tmp_path.iterdir()} == {"a.log"}
+
+
+def test_a_name_that_is_too_long_is_one_line(logs, tmp_path, capsys):
+    long = "a" * 300
+    assert "name too long" in refused(capsys, "convert", f"robot={long}.bag", tmp_path / "out.clf")
+    assert "name too long" in refused(capsys, "convert", logs[0], tmp_path / f"{long}.bag")

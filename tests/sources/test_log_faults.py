@@ -1,5 +1,7 @@
+import errno
 import gzip
 import lzma
+import os
 import tracemalloc
 from contextlib import suppress
 from pathlib import Path
@@ -52,6 +54,27 @@ def test_what_is_no_file_is_refused(tmp_path):
     assert "no such file" in refusal(tmp_path / "missing.clf")
     assert "folder" in refusal(tmp_path)
     assert "cannot be read" in refusal(save(tmp_path / "run.log", drive(2)) / "inside.log")
+
+
+def test_a_pipe_is_refused_because_it_can_be_read_only_once(tmp_path):
+    pipe = tmp_path / "run.clf"
+    os.mkfifo(pipe)
+    assert "is a pipe or device" in refusal(pipe)
+    assert "empty" in refusal(Path(os.devnull))
+
+
+@pytest.mark.parametrize("reason", ["name too long", "denied"])
+def test_what_the_system_does_not_show_is_refused(tmp_path, reason, monkeypatch):
+    path = tmp_path / ("a" * 400 + ".clf")
+    if reason == "denied":
+        path = tmp_path / "private"
+        path.mkdir()
+        monkeypatch.setattr(Path, "is_file", denied)
+    assert reason in refusal(path)
+
+
+def denied(path, **_):
+    raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
 
 @pytest.mark.slow

@@ -76,15 +76,15 @@ def _prepare(output: Path, force: bool) -> None:
         raise OutputError(
             f"{output}: unknown format; give .clf (.gz, .xz, .bz2), .bag, .mcap, .db3, .fcslam, or no suffix"
         )
+    mark = _FOLDER_MARKS.get(output.suffix)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
+        if output.exists() and not force:
+            raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
+        if output.is_dir() and (mark is None or not (output / mark).is_file()):
+            raise OutputError(f"{output}: is a folder and no recording; choose another name")
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
-    if output.exists() and not force:
-        raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
-    mark = _FOLDER_MARKS.get(output.suffix)
-    if output.is_dir() and (mark is None or not (output / mark).is_file()):
-        raise OutputError(f"{output}: is a folder and no recording; choose another name")
 
 
 def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") -> None:

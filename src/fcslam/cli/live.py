@@ -222,10 +222,13 @@ def _prepare(output: Path, network: str, force: bool) -> None:
     suffix = ".bag" if network == "ros1" else ".mcap"
     if output.suffix != suffix:
         raise OutputError(f"{output}: a recording of {network} is a {suffix} file; choose such a name")
-    if output.exists() and not force:
-        raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
-    if not output.parent.is_dir():
-        raise OutputError(f"{output}: there is no folder {output.parent}; make it first")
+    try:
+        if output.exists() and not force:
+            raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
+        if not output.parent.is_dir():
+            raise OutputError(f"{output}: there is no folder {output.parent}; make it first")
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
 
 
 def _listed(counts: Counter[str]) -> str:

@@ -1,6 +1,7 @@
 """Commands that read recordings: the options of ROS bags, opening, and notices about a recording."""
 
 import math
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -102,7 +103,8 @@ def open_recordings(arguments: Iterable[str], options: "BagOptions | None") -> "
 
 def _named(argument: str) -> tuple[Path, str | None]:
     name, equals, path = argument.partition("=")
-    if not equals or not name or Path(argument).exists():
+    # Path.exists raises for a name that is too long, and in a folder that cannot be searched.
+    if not equals or not name or os.path.exists(argument):
         return Path(argument), None
     return Path(path), name
 

@@ -8,7 +8,7 @@ from fcslam.errors import SourceError
 from fcslam.sources.bags.container import is_bag
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag, as_fleet
-from fcslam.sources.logs.archive import head, robot_name
+from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
 from fcslam.sources.logs.carmen import CARMEN
 from fcslam.sources.logs.cmu import CMU
 from fcslam.sources.logs.dialect import Dialect
@@ -91,12 +91,13 @@ def format_of(path: Path) -> Format:
     Raises:
         SourceError: as ``open_source``.
     """
-    content = b"" if path.is_dir() else head(path)
-    for kind in FORMATS:
-        if kind.recognises(path, content):
-            return kind
+    content = b"" if is_folder(path) else head(path)
+    with translate_errors(path):
+        for kind in FORMATS:
+            if kind.recognises(path, content):
+                return kind
     *others, last = (kind.name for kind in FORMATS)
     known = f"{', '.join(others)} or {last}"
-    if path.is_dir():
+    if is_folder(path):
         raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")
     raise SourceError(f"{path}: no recording of a known format (it starts with {content[:16]!r}); give a {known}")

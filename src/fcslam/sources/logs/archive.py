@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import lzma
+import os
 import re
 import zlib
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 from typing import BinaryIO, cast
 
 from fcslam.errors import SourceError
@@ -31,13 +33,26 @@ def robot_name(path: Path) -> str:
     return _UNSAFE.sub("_", stem).strip("._-") or "robot"
 
 
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder, and no file.
+
+    Raises:
+        SourceError: there is nothing that can be read, or something that can be read only once.
+    """
+    with translate_errors(path):
+        mode = path.stat().st_mode
+        if not (S_ISDIR(mode) or S_ISREG(mode) or path.samefile(os.devnull)):
+            raise SourceError(f"{path}: is a pipe or device, and a recording is read twice; write it to a file first")
+    return S_ISDIR(mode)
+
+
 def head(path: Path) -> bytes:
     """The first 64 KiB, decompressed.
 
     Raises:
         SourceError: the path is missing or not a file, or the file is empty or damaged.
     """
-    with _translate_errors(path), _open(path) as stream:
+    with translate_errors(path), _open(path) as stream:
         content = stream.read(_HEAD_BYTES)
     if not content:
         raise SourceError(f"{path}: the file is empty; give a recording with laser scans")
@@ -50,7 +65,7 @@ def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
     Raises:
         SourceError: the file cannot be read to its end.
     """
-    with _translate_errors(path), _open(path) as stream:
+    with translate_errors(path), _open(path) as stream:
         yield from enumerate(iter(partial(stream.readline, MAX_LINE_BYTES), b""), start=1)
 
 
@@ -73,7 +88,7 @@ def _buffered(stream: gzip.GzipFile | lzma.LZMAFile | bz2.BZ2File) -> BinaryIO:
 
 
 @contextmanager
-def _translate_errors(path: Path) -> Iterator[None]:
+def translate_errors(path: Path) -> Iterator[None]:
     """Translate errors of the system and the archive modules to SourceError with a one-line message."""
     try:
         yield
