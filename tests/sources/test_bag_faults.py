@@ -373,3 +373,58 @@ def test_a_flipped_bag_never_breaks_the_reader(tmp_path, name, data):
         with suppress(SourceError):
             source = open_source(bag)
             assert len(scans_of(source)) <= source.survey().scan_count
+
+
+# Files of MCAP that other programs write
+
+
+def mcap_file(path, records):
+    """A file of these records, opcode and content each."""
+    body = b"".join(struct.pack("<BQ", opcode, len(content)) + content for opcode, content in records)
+    path.write_bytes(b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n")
+    return path
+
+
+def mcap_records_of(path):
+    content, at = path.read_bytes(), 8
+    while at < len(content) - 8:
+        opcode, size = struct.unpack_from("<BQ", content, at)
+        yield opcode, content[at + 9 : at + 9 + size]
+        at += 9 + size
+
+
+def counted(size, text):
+    return struct.pack(size, len(text)) + text
+
+
+HEADER = (0x01, counted("<I", b"ros2") + counted("<I", b"test"))
+END = [(0x0F, bytes(4)), (0x02, bytes(20))]
+
+
+def test_a_chunk_that_would_fill_the_memory_is_refused_before_it_is_read(tmp_path):
+    chunk = struct.pack("<QQQI", 0, 1, 2**31, 0) + counted("<I", b"zstd") + counted("<Q", b"never looked at")
+    path = mcap_file(tmp_path / "run.mcap", [HEADER, (0x06, chunk), *END])
+    assert "has a chunk of 2147 MB, which would fill the memory; write it again" in refusal(path)
+
+
+def test_another_profile_is_named(tmp_path):
+    path = mcap_file(tmp_path / "run.mcap", [(0x01, counted("<I", b"") + counted("<I", b"test")), *END])
+    assert "has the profile '', and the bags of ROS 2 have 'ros2'; write it again" in refusal(path)
+
+
+@pytest.mark.parametrize("with_counts", [True, False])
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path, with_counts):
+    """As the option noMessageIndex of rosbag2 writes them."""
+    records = list(mcap_records_of(save(tmp_path / "whole.mcap", drive(40))))
+    data = [HEADER, *(record for record in records if record[0] == 0x06), (0x0F, bytes(4))]
+    places, at = [], 8
+    for opcode, content in data:
+        places.append((opcode, at, len(content) + 9))
+        at += len(content) + 9
+    ((start, size),) = ((place, length) for opcode, place, length in places if opcode == 0x06)
+    index = struct.pack("<QQQQIQ", 100 * 10**9, 10**12, start, size, 0, 0) + counted("<I", b"")
+    index += struct.pack("<QQ", size - 49, size - 49)
+    kept = (0x03, 0x04, *(0x0B,) * with_counts)
+    summary = [record for record in records if record[0] in kept] + [(0x08, index)]
+    path = mcap_file(tmp_path / "run.mcap", [*data, *summary, (0x02, struct.pack("<QQI", at, 0, 0))])
+    assert len(scans_of(open_source(path))) == 40

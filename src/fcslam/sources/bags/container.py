@@ -10,19 +10,24 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 from urllib.parse import quote
 
+from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import OLD_TRANSFORMS, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.mcap_records import MCAP_MAGIC, largest_chunk_bytes, profile_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-_ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
+_ROS1, _MCAP, _SQLITE = b"#ROSBAG V", MCAP_MAGIC, b"SQLite format 3\x00"
 _METADATA = "metadata.yaml"
+_PROFILE = "ros2"
 _LONGEST_REASON = 200
 _SQLITE_HEADER_BYTES = 100
+_LARGEST_CHUNK_BYTES = 256_000_000
+"""Of a chunk of MCAP without compression, which is read as one; recorders write some megabytes."""
 _LONGEST_TOPIC = 255
 """Characters in a topic's name, as in ROS 2."""
 
@@ -138,9 +143,10 @@ class BagFile:
     def _opened(self) -> Iterator[_Reader]:
         """Open a reader and translate all errors to SourceError; rosbags raises many types on damaged files."""
         try:
-            reader = _reader(self.path, self._magic)
+            reader = _reader(self._checked_path, self._magic)
             reader.open()
             try:
+                _read_without_index(reader)
                 yield reader
             finally:
                 reader.close()
@@ -149,6 +155,19 @@ class BagFile:
         except Exception as error:
             reason = " ".join(str(error).split())[:_LONGEST_REASON].rstrip(".") or type(error).__name__
             raise SourceError(f"{self.path}: the bag cannot be read ({reason}); {self._remedy()}") from error
+
+    @cached_property
+    def _checked_path(self) -> Path:
+        """The path; files of MCAP are looked through once before, as they could fill the memory.
+
+        Raises:
+            SourceError: one would fill the memory, or is none of ROS 2.
+        """
+        for path in self.path.glob("*.mcap") if self.path.is_dir() else [self.path]:
+            with path.open("rb") as file:
+                if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
+                    _check_mcap(path, file)
+        return self.path
 
     def _remedy(self) -> str:
         if self._is_ros1:
@@ -183,6 +202,35 @@ def _reader(path: Path, magic: bytes) -> _Reader:
     if magic.startswith(_MCAP):
         return rosbag2.Reader.STORAGE_PLUGINS[".mcap"](path)
     raise SourceError(f"{path}: the whole bag is compressed; unpack it first")
+
+
+def _check_mcap(path: Path, file: BinaryIO) -> None:
+    profile, chunk_bytes = profile_of(file), largest_chunk_bytes(file)
+    if profile is not None and profile != _PROFILE:
+        raise SourceError(
+            f"{path}: has the profile {one_line(repr(profile))}, and the bags of ROS 2 have {_PROFILE!r}; "
+            "write it again with this profile, as `ros2 bag convert` does"
+        )
+    if chunk_bytes > _LARGEST_CHUNK_BYTES:
+        raise SourceError(
+            f"{path}: has a chunk of {chunk_bytes / 1e6:.0f} MB, which would fill the memory; "
+            "write it again with smaller chunks, as `mcap compress` does"
+        )
+
+
+def _read_without_index(reader: Any) -> None:
+    """Let rosbags read a file whose chunks have no index of their messages from its beginning; it would find none."""
+    from rosbags import rosbag2
+
+    for storage in getattr(reader, "storages", [reader]):
+        is_mcap = isinstance(storage, rosbag2.Reader.STORAGE_PLUGINS[".mcap"])
+        if not is_mcap or any(chunk.message_index_offsets for chunk in storage.chunks):
+            continue
+        storage.chunks.clear()
+        if not any(connection.msgcount for connection in storage.connections):
+            storage.meta_scan()
+            counts = storage.statistics.channel_message_counts
+            storage.connections = [each._replace(msgcount=counts.get(each.id, 0)) for each in storage.connections]
 
 
 def _check_database(database: Path) -> None:

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-CHUNK, DATA_END = 0x06, 0x0F
+HEADER, CHUNK, DATA_END = 0x01, 0x06, 0x0F
 _FOOTER = 0x02
 _HEADER_BYTES = 9
 """Opcode and length of a record."""
+_SIZE_AT = 16
+"""Where a chunk has its size without compression, after two stamps."""
 
 
 class McapRecord(NamedTuple):
@@ -32,6 +34,26 @@ def mcap_records(file: BinaryIO) -> Iterator[McapRecord]:
         if at > size:
             return
         yield McapRecord(header[0], start, at)
+
+
+def profile_of(file: BinaryIO) -> str | None:
+    """The profile that the file names, as in ``ros2``; None without a whole header."""
+    header = next(mcap_records(file), None)
+    if header is None or header.opcode != HEADER:
+        return None
+    file.seek(header.start)
+    content = file.read(header.end - header.start)
+    return content[4 : 4 + int.from_bytes(content[:4], "little")].decode(errors="replace")
+
+
+def largest_chunk_bytes(file: BinaryIO) -> int:
+    """The size of the largest chunk without compression, as the file states it; 0 without chunks."""
+    largest = 0
+    for record in mcap_records(file):
+        if record.opcode == CHUNK:
+            file.seek(record.start + _SIZE_AT)
+            largest = max(largest, int.from_bytes(file.read(8), "little"))
+    return largest
 
 
 def end_mcap(path: Path) -> bool:
