@@ -137,6 +137,21 @@ def test_a_mounting_on_the_command_line_needs_no_tf():
     assert len(robot.records) == SCANS_FOR_RIG
 
 
+def test_a_camera_whose_clock_is_ahead_delays_no_scan_and_is_said_once():
+    kinds = {**KINDS, "/camera/image_raw": IMAGE, "/camera/camera_info": CAMERA_INFO}
+    robot = Robot(kinds=kinds, camera="/camera/image_raw", info="/camera/camera_info")
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "camera")).hears("/camera/camera_info", camera_info(0.0))
+    for stamp in np.arange(1.0, 20.0):
+        robot.now_s = stamp
+        robot.drives([stamp])
+        assert robot.records == [] or robot.stamps[-1] == stamp
+        robot.hears("/camera/image_raw", image(stamp + 3.0))
+    assert sum(isinstance(record, CameraImage) for record in robot.records) > 10
+    (line,) = [line for line in robot.said if "clock" in line]
+    assert "the clock of /camera/image_raw is about 2.0 s ahead" in line
+
+
 def test_odometry_without_a_frame_is_odometry(robot):
     for stamp in np.arange(1.0, 9.0):
         robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0), frame="")).hears("/scan", scan(stamp, RANGES))

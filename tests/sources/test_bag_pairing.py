@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import Beams, OdometryReading, ScanMessage
-from fcslam.sources.bags.pairing import MAX_GAP_S, PosedScan, pair_with_odometry
+from fcslam.sources.bags.pairing import MAX_GAP_S, OdometryPairing, PosedImage, PosedScan, pair_with_odometry
 from fcslam.sources.faults import Fault
 
 
@@ -115,6 +116,25 @@ def test_one_scan_far_ahead_does_not_stop_the_others():
     assert first.fault is Fault.NO_ODOMETRY
     assert {entry.fault for entry in others} == {None}
     assert all(a.scan.stamp < b.scan.stamp for a, b in pairwise(others))
+
+
+def test_an_image_of_a_clock_that_is_ahead_holds_no_scan():
+    pairing = OdometryPairing()
+    for k in range(100):
+        stamp = 0.1 * k
+        fed = [reading(stamp), ImageMessage(stamp + (3.0 if k < 50 else 0.3), b""), scan(stamp)]
+        out = [entry for item in fed for _, entry in pairing.add(k, item)]
+        assert [type(entry) for entry in out] == [OdometryReading, PosedImage, PosedScan]
+        assert out[1].T_odom_base == (None if k < 50 else reading(stamp).T_odom_base)
+    assert pairing.images_ahead_s == pytest.approx(0.3)
+
+
+def test_an_image_of_the_same_clock_waits_for_its_odometry():
+    pairing = OdometryPairing()
+    items = [reading(1.0), ImageMessage(1.15, b""), scan(1.0), scan(1.05), reading(1.2)]
+    out = [entry for item in items for _, entry in pairing.add(1, item)]
+    assert_on_the_line(out[1].T_odom_base, 1.15)
+    assert pairing.images_ahead_s == 0.0
 
 
 def test_what_waits_is_bounded():

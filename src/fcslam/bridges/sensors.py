@@ -90,7 +90,7 @@ class LiveSensors:
         self._prefix = namespace.strip("/")
         self._codec = MessageCodec(ros1)
         self._tree = TransformTree()
-        self._has_odometry = False
+        self._has_odometry = self._is_camera_ahead = False
         self._edge: tuple[str, str] | None = None
         """Frames of the odometry in tf."""
         self._calibration: Calibration | None = None
@@ -325,6 +325,12 @@ class LiveSensors:
         for paired, entry in self._pairing.add(number, message):
             self._waiting_since = None
             yield from self._recorded(paired, entry)
+        if self._pairing.images_ahead_s and not self._is_camera_ahead:
+            self._is_camera_ahead = True
+            self._notify(
+                f"the clock of {self._topics.camera} is about {self._pairing.images_ahead_s:.1f} s ahead of that of "
+                "the odometry, so its images get an older pose or none; set both clocks by one"
+            )
 
     def _skip_silent(self, now_s: float) -> Iterator[SensorRecord]:
         """Wait no longer for a laser that has stopped while another one goes on."""

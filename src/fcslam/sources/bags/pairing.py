@@ -4,6 +4,9 @@ Poses are interpolated between two readings; a scan with exactly the stamp of a 
 Odometry may come later than the scan, so scans wait for it in the order of the recording. The two readings are those
 nearest in the recording, not in time, so that a step back of the clock does not mix earlier and later readings.
 
+An image whose clock is ahead would hold the scans behind it. So once such a scan has its pose, the image waits no
+longer and gets the nearest pose.
+
 Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
 nearest reading within 1 s, or none.
 """
@@ -22,6 +25,8 @@ from fcslam.sources.pose import Pose, interpolated_pose
 MAX_GAP_S = 1.0
 """Largest time between a scan and a reading outside of which it has no odometry."""
 
+_AHEAD_S = 0.2
+"""An image that is farther ahead of the newest reading than this holds no scan; by one clock, odometry is not later."""
 _READINGS_KEPT = 1000
 """Number of past readings that are searched for a scan."""
 _LONGEST_QUEUE = 1000
@@ -67,6 +72,8 @@ class OdometryPairing:
     def __init__(self) -> None:
         self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
         self._queue: deque[_QueuedItem] = deque()
+        self.images_ahead_s = 0.0
+        """By how much the newest image that held a scan was ahead of the odometry; 0 without one."""
 
     @property
     def waiting(self) -> int:
@@ -82,8 +89,19 @@ class OdometryPairing:
             queue.append(_QueuedItem(number, item, _PoseMatch(item.T_odom_base, None)))
         else:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
-        while queue and (queue[0].match or len(queue) > _LONGEST_QUEUE):
+        while queue and (queue[0].match or len(queue) > _LONGEST_QUEUE or self._is_held_by_image()):
             yield _with_pose(queue.popleft(), readings)
+
+    def _is_held_by_image(self) -> bool:
+        """Whether the first item is an image of a clock that is ahead, and a scan behind it has its pose."""
+        first = self._queue[0].item
+        if not isinstance(first, ImageMessage) or not self._readings:
+            return False
+        ahead_s = first.stamp - self._readings[-1].stamp
+        if ahead_s <= _AHEAD_S or not any(each.match and isinstance(each.item, ScanMessage) for each in self._queue):
+            return False
+        self.images_ahead_s = ahead_s
+        return True
 
     def flush(self) -> Iterator[tuple[int, Entry]]:
         """Yield all that wait, as no odometry comes any more."""
