@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, ODOMETRY, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 CODEC = MessageCodec(ros1=False)
@@ -22,6 +22,17 @@ def scan(stamp, ranges, frame="laser", angle_min=-math.pi / 2, increment=math.pi
         angle_increment=increment, time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=range_max, ranges=ranges,
         intensities=np.zeros(0, np.float32),
     )  # fmt: skip
+
+
+def multi_echo(stamp, ranges):
+    """A scan whose beams have a second echo a metre behind; none at 0."""
+    single = scan(stamp, ranges)
+    beams = [
+        CODEC.make("sensor_msgs/LaserEcho", echoes=np.array([r, r + 1.0] if r else [], np.float32)) for r in ranges
+    ]
+    names = ("header", "angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min")
+    fields = {name: getattr(single, name) for name in (*names, "range_max")}
+    return CODEC.make(MULTI_ECHO_SCAN, **fields, ranges=beams, intensities=[])
 
 
 def odometry(stamp, pose, frame="odom", child="base_link"):

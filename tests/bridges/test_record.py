@@ -16,12 +16,13 @@ from fcslam.bridges.ros2 import INSTALL as INSTALL_ROS2
 from fcslam.bridges.ros2 import Ros2Network
 from fcslam.cli import main
 from fcslam.errors import NetworkError, OutputError
+from fcslam.records import LaserScan
 from fcslam.sources import BagOptions, open_source
-from fcslam.sources.bags.codec import ODOMETRY, OLD_TRANSFORMS, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import MULTI_ECHO_SCAN, ODOMETRY, OLD_TRANSFORMS, SCAN, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.container import BagFile
 from fcslam.sources.bags.transforms import in_space
 from tests.bridges.memory_network import MemoryNetwork, offered
-from tests.bridges.ros_messages import odometry, scan, transform
+from tests.bridges.ros_messages import multi_echo, odometry, scan, transform
 
 RANGES = [5.0] * 180
 
@@ -78,6 +79,18 @@ def largest_file(size_bytes):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_recording_of_several_echoes_is_read_by_the_first(tmp_path):
+    network = MemoryNetwork([offered("/echoes", MULTI_ECHO_SCAN), offered("/odom", ODOMETRY)])
+    messages = []
+    for stamp in range(1, 9):
+        messages.append(("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))))
+        messages.append(("/echoes", MULTI_ECHO_SCAN, multi_echo(stamp, RANGES)))
+    assert recorded(network, tmp_path / "day.mcap", messages) == []
+    source = open_source(tmp_path / "day.mcap", BagOptions(laser_poses=((0.0, 0.0, 0.0),)))
+    scans = [record for record in source.records() if isinstance(record, LaserScan)]
+    np.testing.assert_array_equal([scan.ranges_m for scan in scans], [RANGES] * 8)
 
 
 def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):

@@ -9,8 +9,18 @@ from fcslam.bridges.topics import SensorTopics
 from fcslam.errors import NetworkError
 from fcslam.records import CameraImage
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE
-from tests.bridges.ros_messages import KINDS, LASER_POSE, camera_info, encoded, image, odometry, scan, transform
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN
+from tests.bridges.ros_messages import (
+    KINDS,
+    LASER_POSE,
+    camera_info,
+    encoded,
+    image,
+    multi_echo,
+    odometry,
+    scan,
+    transform,
+)
 
 RANGES = np.full(180, 5.0)
 
@@ -150,6 +160,14 @@ def test_a_camera_whose_clock_is_ahead_delays_no_scan_and_is_said_once():
     assert sum(isinstance(record, CameraImage) for record in robot.records) > 10
     (line,) = [line for line in robot.said if "clock" in line]
     assert "the clock of /camera/image_raw is about 2.0 s ahead" in line
+
+
+def test_of_several_echoes_the_first_counts():
+    robot = Robot(kinds={**KINDS, "/scan": MULTI_ECHO_SCAN}, laser_poses=((0.1, 0.0, 0.0),))
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0))).hears("/scan", multi_echo(stamp, [5.0] * 179 + [0.0]))
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    np.testing.assert_array_equal(robot.records[0].ranges_m, [5.0] * 179 + [np.nan])
 
 
 def test_odometry_without_a_frame_is_odometry(robot):

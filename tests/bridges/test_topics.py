@@ -6,7 +6,7 @@ from fcslam.bridges.addresses import RosAddress, open_network, parse_address
 from fcslam.bridges.topics import choose_sensor_topics
 from fcslam.errors import NetworkError
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS
 from tests.bridges.memory_network import offered
 
 
@@ -54,7 +54,7 @@ def test_named_topics_may_be_relative_or_of_tf():
     ("options", "said"),
     [
         ({}, r"no laser scans \(sensor_msgs/LaserScan\) in /robot1; .* the topics are /robot1/odom \(nav_msgs/Odom"),
-        ({"scan_topics": ("scan",)}, r"topic /robot1/scan is not there; --scan-topic needs sensor_msgs/LaserScan; the"),
+        ({"scan_topics": ("scan",)}, r"topic /robot1/scan is not there; --scan-topic needs sensor_msgs/LaserScan or"),
         ({"scan_topics": ("odom",)}, r"topic /robot1/odom has the type nav_msgs/Odometry; --scan-topic needs"),
     ],
 )
@@ -80,3 +80,9 @@ def test_addresses():
 def test_a_domain_out_of_range(domain):
     with pytest.raises(NetworkError, match="no domain of ROS 2"):
         open_network(RosAddress("ros2", ""), domain, {})
+
+
+def test_a_topic_of_one_echo_a_beam_goes_before_one_of_several():
+    echoes = [offered("/first", SCAN), offered("/echoes", MULTI_ECHO_SCAN), offered("/odom", ODOMETRY)]
+    assert choose_sensor_topics(echoes, "", BagOptions()).scans == ("/first",)
+    assert choose_sensor_topics(echoes[1:], "", BagOptions()).scans == ("/echoes",)

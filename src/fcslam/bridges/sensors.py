@@ -18,7 +18,7 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     ODOMETRY,
     OLD_TRANSFORMS,
-    SCAN,
+    SCANS,
     TRANSFORMS,
     MessageCodec,
 )
@@ -206,7 +206,7 @@ class LiveSensors:
         """Raises ValueError if the message is invalid."""
         kind = self._topics.kinds[topic]
         content = self._codec.decode(payload, kind)
-        if kind == SCAN:
+        if kind in SCANS:
             laser = self._topics.scans.index(topic)
             scan = scan_of(content, received_ns)._replace(laser=laser)
             if self._rig is None:

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from fcslam.bridges.network import Endpoint, named_topics, published
 from fcslam.errors import NetworkError
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, OLD_TRANSFORMS, SCAN, TRANSFORMS
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    OLD_TRANSFORMS,
+    SCAN,
+    SCANS,
+    TRANSFORMS,
+)
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.topics import is_truth
 
@@ -38,7 +47,7 @@ def resolved(namespace: str, name: str) -> str:
 def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options: BagOptions) -> SensorTopics:
     """Choose the topics to read in ``namespace``, by these rules:
 
-    - laser: the name ``scan``, first by name;
+    - laser: one echo a beam, the name ``scan``, first by name;
     - odometry: the name ``odom``, first by name, else tf; ground truth only if the user names it;
     - camera: calibrated, compressed images, first by name;
     - tf: the namespace's own if there is one, else that of all robots.
@@ -51,12 +60,12 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     inside = [topic for topic in known if topic.startswith(f"{namespace}/")]
     chosen = _Choice(endpoints, known, namespace)
     notes: list[str] = []
-    scans = [chosen.named(name, "--scan-topic", SCAN) for name in options.scan_topics]
+    scans = [chosen.named(name, "--scan-topic", *SCANS) for name in options.scan_topics]
     if not scans:
-        candidates = [topic for topic in inside if known[topic] == SCAN]
+        candidates = [topic for topic in inside if known[topic] in SCANS]
         if not candidates:
             raise NetworkError(f"no laser scans ({SCAN}) in {namespace or '/'}; start the driver; {chosen.known()}")
-        scans = [min(candidates, key=lambda topic: (_basename(topic) != "scan", topic))]
+        scans = [min(candidates, key=lambda topic: (known[topic] != SCAN, _basename(topic) != "scan", topic))]
         notes += _note("laser scans", "--scan-topic", scans[0], candidates)
     odometry = None if options.odom_topic is None else resolved(namespace, options.odom_topic)
     if odometry is None:

@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
+MULTI_ECHO_SCAN = "sensor_msgs/MultiEchoLaserScan"
+SCANS = SCAN, MULTI_ECHO_SCAN
 COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 """Message types that are read, as ROS 1 writes them."""

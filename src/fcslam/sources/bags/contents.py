@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from fcslam.sources.bags.codec import SCAN
+from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.container import BagFile, RawMessage, Topic, is_transforms
 from fcslam.sources.bags.messages import header_of, transforms_of
 
@@ -50,7 +50,7 @@ def bag_contents(path: Path) -> BagContents:
         spans_ns[topic] = count + 1, min(first_ns, now_ns), max(last_ns, now_ns)
         if is_transforms(topic):
             edges |= dict.fromkeys(_edges(bag, message))
-        elif topic.type == SCAN and topic.name not in frames:
+        elif topic.type in SCANS and topic.name not in frames:
             frames |= _frame(bag, message)
     topics = (_contents(topic, spans_ns.get(topic)) for topic in bag.topics)
     return BagContents(tuple(topics), tuple(edges), frames)

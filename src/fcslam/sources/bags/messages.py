@@ -1,7 +1,7 @@
 """Converts the messages of a bag and checks them; invalid messages raise ValueError."""
 
 from collections.abc import Iterator
-from math import degrees, inf, isfinite, radians, remainder
+from math import degrees, inf, isfinite, nan, radians, remainder
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ class BeamsError(ValueError):
 
 
 class ScanMessage(NamedTuple):
-    """sensor_msgs/LaserScan."""
+    """sensor_msgs/LaserScan, or the first echoes of sensor_msgs/MultiEchoLaserScan."""
 
     stamp: float
     frame: str
@@ -58,13 +58,13 @@ class StampedTransform(NamedTuple):
 
 
 def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
-    """Convert a laser scan; clockwise beams are reversed.
+    """Convert a laser scan, or the first echoes of one with several; clockwise beams are reversed.
 
     Raises:
         BeamsError: the number of ranges is not the one that the angles say, or there is no field of view.
         ValueError: the message is invalid otherwise.
     """
-    ranges = np.asarray(content.ranges, dtype=np.float32)
+    ranges = _first_echoes(content.ranges)
     count = len(ranges)
     first_rad, increment_rad = _angle_rad(content.angle_min), _angle_rad(content.angle_increment)
     range_min_m, range_max_m = float(content.range_min), float(content.range_max)
@@ -80,6 +80,13 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
     return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges)
+
+
+def _first_echoes(ranges: Any) -> Ranges:
+    """The ranges of sensor_msgs/LaserScan as they are; of MultiEchoLaserScan the nearest, NaN without an echo."""
+    if len(ranges) and hasattr(ranges[0], "echoes"):
+        ranges = [beam.echoes[0] if len(beam.echoes) else nan for beam in ranges]
+    return np.asarray(ranges, dtype=np.float32)
 
 
 def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: float) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, SCANS
 from fcslam.sources.bags.container import BagFile, Topic, is_transforms
 from fcslam.sources.bags.options import BagOptions
 
@@ -60,7 +60,7 @@ def choose_topics(
 ) -> Topics:
     """Choose the topics to read, by these rules in order:
 
-    - laser: the widest field of view (to 0.1 rad), the name ``scan``, most messages, first by name;
+    - laser: the widest field of view (to 0.1 rad), one echo a beam, the name ``scan``, most messages, first by name;
     - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
     - camera: calibrated, most messages, compressed images, first by name.
 
@@ -138,7 +138,7 @@ def _heard(bag: BagFile) -> list[Topic]:
 
 
 def _scans(bag: BagFile) -> list[Topic]:
-    return [topic for topic in _heard(bag) if topic.type == SCAN]
+    return [topic for topic in _heard(bag) if topic.type in SCANS]
 
 
 def _measured(bag: BagFile) -> list[Topic]:
@@ -163,7 +163,9 @@ def _best_scan(scans: Sequence[Topic], views_rad: Sequence[Mapping[str, float]])
     """``views_rad``: of each bag."""
     view_rad = {topic: min(views[topic.name] for views in views_rad) for topic in scans}
     wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - _SAME_VIEW_RAD]
-    return min(wide, key=lambda topic: (_basename(topic) != "scan", -topic.message_count, topic.name))
+    return min(
+        wide, key=lambda topic: (topic.type != SCAN, _basename(topic) != "scan", -topic.message_count, topic.name)
+    )
 
 
 def _best_odometry(measured: Sequence[Topic]) -> Topic:
