@@ -40,4 +40,4 @@ def test_the_pose_graph_of_two_robots_comes_back_with_its_odometry_and_closures(
     count = len(POSES)
     assert back.ids == (*range(count), *range(count + 1, 2 * count + 1)), "one id between two robots is unused"
     written = {robot.robot: robot.T_map_base for robot in result.robots}
-    assert np.array_equal(back.graph.poses(), np.concatenate([written[name] for name in tracks]))
+    assert np.array_equal(back.graph.poses(), np.concatenate([written[name] for name in sorted(tracks)]))

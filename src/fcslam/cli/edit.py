@@ -266,12 +266,17 @@ def place(
         _append(run, Placement(session, _number(stamp), read_pose("--pose", pose)), author)
         return
     opened, mission = _opened(run)
-    T_new_map = _matched(match) if match else _turned(opened, map_index, to_walls, rotate, _point("--shift", shift))
+    if not match:
+        T_new_map = _turned(opened, map_index, to_walls, rotate, _point("--shift", shift))
+        _append(run, moved_map(opened, mission, map_index, T_new_map), author)
+        return
+    T_new_map, off_m = _matched(match)
     _append(run, moved_map(opened, mission, map_index, T_new_map), author)
+    typer.echo(f"the points fit to {off_m:.3f} m", err=True)
 
 
-def _matched(pairs: list[str]) -> "FloatArray":
-    """The motion that moves points to where they shall be; says how well they fit."""
+def _matched(pairs: list[str]) -> tuple["FloatArray", float]:
+    """The motion that moves points to where they shall be, and the largest distance that remains, in metres."""
     import numpy as np
 
     from fcslam.geometry import se2
@@ -281,8 +286,7 @@ def _matched(pairs: list[str]) -> "FloatArray":
     points, targets = ([_point("--match", end[k]) for end in ends] for k in (0, 1))
     T_new_map = motion_to_points(points, targets)
     off_m = np.hypot(*(se2.transform(T_new_map, np.array(points)) - targets).T)
-    typer.echo(f"the points fit to {off_m.max():.3f} m", err=True)
-    return T_new_map
+    return T_new_map, float(off_m.max())
 
 
 def _turned(run: "Run", map_index: int, to_walls: bool, degrees: float, shift: tuple[float, float]) -> "FloatArray":

@@ -73,7 +73,7 @@ def run_of(
         closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
-        pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in tracks])),
+        pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
         map_files=_map_files(result, trajectories, grid),
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
     )
