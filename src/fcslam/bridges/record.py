@@ -71,15 +71,14 @@ def record(
                 recording.close()
             except BaseException as error:
                 if recording.rescue(error):
-                    kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}; "
+                    kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}"
                     if not isinstance(error, OSError):
                         notify(kept)
                 raise
             recording.file.replace(output)
     except OSError as error:
-        raise OutputError(
-            f"{output}: cannot be written ({error}); {kept}free some space, or choose another path"
-        ) from error
+        advice = "; ".join(filter(None, (kept, "free some space, or choose another path")))
+        raise OutputError(f"{output}: cannot be written ({error}); {advice}") from error
     for topic in (*topics.scans, *filter(None, (topics.odometry,))):
         if not counts[topic]:
             notify(f"{topic}: no message arrived")

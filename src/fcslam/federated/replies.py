@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.errors import printable
 from fcslam.federated.codec import GlobalModel, record_bytes, record_to_weights
 from fcslam.federated.flower import Message
 from fcslam.federated.messages import ARRAYS_KEY, reply_metrics, reply_sender
@@ -42,7 +43,7 @@ class RoundReplies:
 
 def printable_line(text: str) -> str:
     """The text as one printable line of at most ``MAX_REASON_LENGTH`` characters."""
-    words = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+    words = " ".join(printable(text).split())
     return words if len(words) <= MAX_REASON_LENGTH else f"{words[: MAX_REASON_LENGTH - 3]}..."
 
 
