@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,6 +92,53 @@ class Odometry:
     """Shape (3,)."""
 
 
+class Sweep(NamedTuple):
+    """When the beams of a scan were measured, and how the robot moved meanwhile.
+
+    The time from one beam to the next is constant. At ``t`` seconds after the stamp, the pose of ``base`` in ``base``
+    at the stamp is ``velocity * t + acceleration * t**2 / 2``, for x, y and theta each.
+    """
+
+    first_s: float
+    """Time of the first beam after the stamp."""
+    last_s: float
+    """Time of the last beam after the stamp; before ``first_s`` if the scanner turns against the order of its beams."""
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """x and y in m/s, heading in rad/s."""
+    acceleration: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """x and y in m/s^2, heading in rad/s^2."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time between the first and the last beam."""
+        return abs(self.last_s - self.first_s)
+
+    def displacement(self, t_s: float) -> FloatArray:
+        """Pose of ``base`` at ``t_s`` after the stamp in ``base`` at the stamp, shape (3,), metres and radians."""
+        return t_s * (np.array(self.velocity) + 0.5 * t_s * np.array(self.acceleration))
+
+    def steps(self) -> tuple[int, ...]:
+        """The eight numbers in the steps in which packets carry them (``SWEEP_STEPS``)."""
+        numbers = self.first_s, self.last_s, *self.velocity, *self.acceleration
+        return tuple(round(number / step) for number, step in zip(numbers, SWEEP_STEPS, strict=True))
+
+    @classmethod
+    def of_steps(cls, steps: Sequence[int]) -> Self:
+        """The sweep with these eight numbers of steps."""
+        first_s, last_s, *motion = (count * step for count, step in zip(steps, SWEEP_STEPS, strict=True))
+        vx, vy, vtheta, ax, ay, atheta = motion
+        return cls(first_s, last_s, (vx, vy, vtheta), (ax, ay, atheta))
+
+    def rounded(self) -> Self:
+        """The sweep as a packet carries it."""
+        return self.of_steps(self.steps())
+
+
+SWEEP_STEPS = (*2 * (1e-6,), *3 * (1e-3,), *3 * (1e-2,))
+"""Steps of the numbers of a sweep: times in seconds, velocities in m/s and rad/s, accelerations in m/s^2 and rad/s^2.
+In a sweep of 0.2 s, rounding moves a point by at most 0.2 mm and 0.2 mrad."""
+
+
 @dataclass(frozen=True, slots=True)
 class LaserScan:
     """One revolution of a 2D LiDAR with the odometry at its stamp."""
@@ -102,7 +149,9 @@ class LaserScan:
     laser: LaserModel
     """Its laser, with the beams of this scan."""
     T_odom_base: FloatArray
-    """Shape (3,)."""
+    """Shape (3,); NaN: unknown."""
+    sweep: Sweep | None = None
+    """None: all beams were measured at the stamp. The motion is that of the odometry; zeros without odometry."""
 
 
 class Transform(NamedTuple):
@@ -178,6 +227,8 @@ class Keyscan:
     """Index of its laser among those that the robot announced."""
     beams: Beams | None = None
     """Its beams; None: those that the laser was announced with."""
+    sweep: Sweep | None = None
+    """Times of the beams and the robot's motion, as the scan was matched; None: all were measured at the stamp."""
 
     def laser_model(self, lasers: Sequence[LaserModel]) -> LaserModel:
         """Its laser, with the beams of this scan; ``lasers`` are those that the robot announced."""

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from fcslam.geometry import se2
-from fcslam.lidar.occupancy import OccupancyConfig, cast, cast_periods, classify
+from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, cast_periods, classify
 from fcslam.records import LaserModel
 from fcslam.runs.map_files import Occupancy
 
@@ -30,11 +30,11 @@ def room_ranges(T_map_base, laser=ALL_ROUND, half=HALF_ROOM_M):
 
 def room_scans(laser=ALL_ROUND, count=12, seed=3):
     poses = np.random.default_rng(seed).uniform((-1.5, -1.5, -3.0), (1.5, 1.5, 3.0), (count, 3))
-    return [(room_ranges(pose, laser), laser, pose) for pose in poses]
+    return [Casting(room_ranges(pose, laser), laser, pose) for pose in poses]
 
 
 def one_beam(x, y, heading, length):
-    return cast([(np.array([length], np.float32), ONE_BEAM, np.array((x, y, heading)))], CONFIG)
+    return cast([Casting(np.array([length], np.float32), ONE_BEAM, np.array((x, y, heading)))], CONFIG)
 
 
 def chords(grid, start, end, grow_m):
@@ -105,7 +105,8 @@ def test_the_origin_is_the_lower_left_corner():
 def test_moving_every_pose_by_whole_cells_moves_the_grid(columns, rows):
     scans = room_scans(count=3)
     shift = np.array((columns, rows, 0.0)) * CELL_M
-    grid, moved = cast(scans, CONFIG), cast([(ranges, laser, pose + shift) for ranges, laser, pose in scans], CONFIG)
+    shifted = [scan._replace(T_map_base=scan.T_map_base + shift) for scan in scans]
+    grid, moved = cast(scans, CONFIG), cast(shifted, CONFIG)
     np.testing.assert_allclose(np.subtract(moved.origin_xy, grid.origin_xy), shift[:2], atol=1e-12)
     assert moved.hits.shape == grid.hits.shape
     # The sums round differently once in a blue moon: a beam end on an edge may change its cell.
@@ -151,11 +152,11 @@ def test_a_square_room_is_closed_and_free_inside():
 def test_a_beam_beyond_the_usable_range_clears_inside_the_grid_and_hits_nothing():
     near = CONFIG.model_copy(update={"usable_range_m": 3.0})
     pose = np.array((0.03, 0.03, 0.0))
-    long_beam = (np.array([100.0], np.float32), ONE_BEAM, pose)
+    long_beam = Casting(np.array([100.0], np.float32), ONE_BEAM, pose)
     alone = cast([long_beam], near)
     assert alone.hits.sum() == 0
     assert alone.passes.shape[1] <= 4
-    frame = [(np.array([2.5], np.float32), ONE_BEAM, np.array((x, 1.0, 0.0))) for x in (0.03, 3.0)]
+    frame = [Casting(np.array([2.5], np.float32), ONE_BEAM, np.array((x, 1.0, 0.0))) for x in (0.03, 3.0)]
     grid = cast([long_beam, *frame], near)
     row = round((0.0 - grid.origin_xy[1]) / CELL_M)
     cleared = np.flatnonzero(grid.passes[row]) * CELL_M + grid.origin_xy[0]
@@ -169,7 +170,7 @@ def test_what_is_no_return_adds_nothing(nothing):
     scans = room_scans(count=2)
     silent = np.full(ALL_ROUND.beam_count, nothing, np.float32)
     grid = cast(scans, CONFIG)
-    more = cast([*scans, (silent, ALL_ROUND, np.zeros(3))], CONFIG)
+    more = cast([*scans, Casting(silent, ALL_ROUND, np.zeros(3))], CONFIG)
     np.testing.assert_array_equal(more.hits, grid.hits)
     np.testing.assert_array_equal(more.passes, grid.passes)
 
@@ -177,7 +178,7 @@ def test_what_is_no_return_adds_nothing(nothing):
 def test_a_grid_too_large_gets_coarser_instead():
     small = CONFIG.model_copy(update={"maximum_cells": 10_000})
     scans = room_scans(count=2)
-    far = [(ranges, laser, pose + np.array((9000.0, 5000.0, 0.0))) for ranges, laser, pose in scans]
+    far = [Casting(ranges, laser, pose + np.array((9000.0, 5000.0, 0.0))) for ranges, laser, pose, _ in scans]
     grid = cast(scans + far, small)
     assert grid.hits.size <= 10_000
     assert np.log2(grid.resolution_m / CELL_M) % 1 == 0
@@ -195,19 +196,19 @@ def test_no_keyscans_make_one_unknown_cell():
 @pytest.mark.parametrize("pose", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0, np.nan), (0, 0, np.inf), (1e12, 0, 0)])
 def test_a_pose_out_of_all_bounds_is_refused(pose):
     with pytest.raises(ValueError, match="poses must be finite"):
-        cast([(np.ones(1, np.float32), ONE_BEAM, np.array(pose, np.float64))], CONFIG)
+        cast([Casting(np.ones(1, np.float32), ONE_BEAM, np.array(pose, np.float64))], CONFIG)
 
 
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="ranges of shape"):
-        cast([(np.ones(2, np.float32), ONE_BEAM, np.zeros(3))], CONFIG)
+        cast([Casting(np.ones(2, np.float32), ONE_BEAM, np.zeros(3))], CONFIG)
     with pytest.raises(ValueError, match="a pose of shape"):
-        cast([(np.ones(1, np.float32), ONE_BEAM, np.zeros(2))], CONFIG)
+        cast([Casting(np.ones(1, np.float32), ONE_BEAM, np.zeros(2))], CONFIG)
 
 
 def test_a_cell_is_known_after_two_passes_and_occupied_by_the_share_of_hits():
     lengths = [0.5] * 8 + [0.3]  # the last ends in a cell that the others pass
-    scans = [(np.array([r], np.float32), ONE_BEAM, np.array((0.01, 0.01, 0.0))) for r in lengths]
+    scans = [Casting(np.array([r], np.float32), ONE_BEAM, np.array((0.01, 0.01, 0.0))) for r in lengths]
     grid = cast(scans, CONFIG)
     row, first = (round(-grid.origin_xy[k] / CELL_M) for k in (1, 0))
     near, far = first + int(0.31 / CELL_M), first + int(0.51 / CELL_M)
@@ -225,7 +226,8 @@ def test_a_cell_is_known_after_two_passes_and_occupied_by_the_share_of_hits():
 def room_cells(*halves, scans=12, config=CONFIG):
     """The state after periods in which the room had these half sizes."""
     periods = [
-        [(room_ranges(pose, ALL_ROUND, half), ALL_ROUND, pose) for pose in POSES_INSIDE[:scans]] for half in halves
+        [Casting(room_ranges(pose, ALL_ROUND, half), ALL_ROUND, pose) for pose in POSES_INSIDE[:scans]]
+        for half in halves
     ]
     *_, grid = cast_periods(periods, config)
     return grid, classify(grid, config)
@@ -261,8 +263,8 @@ def test_the_newest_state_counts_however_long_another_one_lasted():
 
 def test_two_scans_alone_drop_nothing():
     before, _ = room_cells(1.03)
-    earlier = [(room_ranges(pose, ALL_ROUND, 1.03), ALL_ROUND, pose) for pose in POSES_INSIDE]
-    later = [(room_ranges(pose), ALL_ROUND, pose) for pose in POSES_INSIDE[:2]]
+    earlier = [Casting(room_ranges(pose, ALL_ROUND, 1.03), ALL_ROUND, pose) for pose in POSES_INSIDE]
+    later = [Casting(room_ranges(pose), ALL_ROUND, pose) for pose in POSES_INSIDE[:2]]
     *_, grid = cast_periods([earlier, later], CONFIG)
     assert grid.hits.sum() == before.hits.sum() + 2 * ALL_ROUND.beam_count
 

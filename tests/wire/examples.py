@@ -18,6 +18,7 @@ from fcslam.records import (
     LaserModel,
     MapTile,
     Place,
+    Sweep,
     WordPlace,
     frozen,
 )
@@ -45,6 +46,7 @@ KEYSCAN = Keyscan(
 )
 BARE_KEYSCAN = replace(KEYSCAN, ranges_m=frozen([], np.float32))
 VARIED_KEYSCAN = replace(KEYSCAN, laser=1, beams=Beams(14, -1.25, 0.0078125))
+SWEPT_KEYSCAN = replace(KEYSCAN, sweep=Sweep(0.0, 0.14, (0.512, -0.003, 1.25), (0.25, 0.0, -3.5)).rounded())
 ODOMETRY = Constraint(
     "alice",
     11,
@@ -113,6 +115,7 @@ EXAMPLES = {
     "keyscan": packet(KEYSCAN),
     "bare_keyscan": packet(BARE_KEYSCAN),
     "varied_keyscan": packet(VARIED_KEYSCAN),
+    "swept_keyscan": packet(SWEPT_KEYSCAN),
     "odometry": packet(ODOMETRY),
     "closure": packet(CLOSURE),
     "lidar_place": packet(LIDAR_PLACE),

@@ -15,6 +15,7 @@ from fcslam.records import (
     LaserModel,
     MapTile,
     Place,
+    Sweep,
     WordPlace,
     frozen,
 )
@@ -124,7 +125,18 @@ def keyscans(draw, identities, stamps):
     ranges = draw(codes().map(dequantise) | st.just(np.zeros(0, np.float32)))
     laser = draw(lasers())
     beams = draw(st.none() | st.just(laser.beams._replace(beam_count=len(ranges)))) if len(ranges) else None
-    return Keyscan(draw(identities), draw(stamps), ranges, draw(st.integers(0, 7)), beams)
+    sweep = draw(st.none() | sweeps()) if len(ranges) else None
+    return Keyscan(draw(identities), draw(stamps), ranges, draw(st.integers(0, 7)), beams, sweep)
+
+
+def sweeps():
+    number = st.integers(-2000, 2000)
+    return st.builds(
+        lambda first, last, motion: Sweep.of_steps((first, last, *motion)),
+        st.integers(-2_000_000, -1),
+        st.integers(0, 2_000_000),
+        st.tuples(*6 * (number,)),
+    )
 
 
 @st.composite

@@ -50,11 +50,13 @@ LONGEST = {
     "Hello.detectors": 2,
     "Hello.floor": 16,
     "Constraint.information": 6,
+    "Keyscan.sweep": 8,
 }
 """Every field that holds more than one number, and how much of it, in bytes, characters or elements."""
 
 
 ELEMENTS = {
+    "Keyscan.sweep": [1],
     "Hello.detectors": [pb.Detector(channel=1, version="a")],
     "Hello.lasers": list(pb.Packet.FromString(encode(EXAMPLES["hello"])).hello.lasers[:1]),
 }

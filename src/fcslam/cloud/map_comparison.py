@@ -11,7 +11,7 @@ from fcslam.graph.cluster import relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
-from fcslam.lidar.scan import point_scan
+from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import FloatArray, KeyscanId, frozen
@@ -183,9 +183,7 @@ class MapComparison:
             keyscans = [keyscans[row] for row in rows]
         anchor = min((keyscan.id for keyscan in keyscans), key=lambda id_: distance_m[id_.number])
         lasers, T_anchor = self._sessions.lasers(session), poses[anchor.number]
-        scans = [
-            (point_scan(k.ranges_m, k.laser_model(lasers)), se2.between(T_anchor, poses[k.id.number])) for k in keyscans
-        ]
+        scans = [(keyscan_points(k, lasers), se2.between(T_anchor, poses[k.id.number])) for k in keyscans]
         return _Near(build_submap(scans), anchor, len(keyscans), is_complete)
 
 

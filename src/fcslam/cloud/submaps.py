@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
-from fcslam.lidar.scan import PointScan, point_scan
+from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import PackedSubmap, Submap, build_submap, self_violation
 from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
@@ -110,10 +110,7 @@ class SubmapCache:
         lasers, anchor = self._sessions.lasers(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
         poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
         keyscans = self._sessions.keyscans(robot, place.first, place.last)
-        return [
-            (point_scan(keyscan.ranges_m, keyscan.laser_model(lasers)), pose)
-            for keyscan, pose in zip(keyscans, poses, strict=True)
-        ]
+        return [(keyscan_points(keyscan, lasers), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
 
 
 def _packed(submap: Submap | PackedSubmap) -> PackedSubmap:

@@ -187,12 +187,15 @@ class LidarFrontend:
 
     def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan, laser: int) -> MappedKeyscan:
         """Add the scan to the running buffer, with a constraint to the keyscan before it."""
-        points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
+        sweep = None if tracked.sweep is None else tracked.sweep.rounded()
+        points = tracked.scan
+        if points is None or sweep is not None:
+            points = point_scan(scan.ranges_m, scan.laser, sweep)
         self._tracker.insert(points, tracked.T_local_base, len(self.lasers))
         self._T_local_newest[laser] = tracked.T_local_base
         ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]
         beams = None if scan.laser == announced else scan.laser.beams
-        record = Keyscan(KeyscanId(self.robot, self._count), scan.stamp, ranges_m, laser, beams)
+        record = Keyscan(KeyscanId(self.robot, self._count), scan.stamp, ranges_m, laser, beams, sweep)
         odometry, travel_m = self._odometry(tracked)
         T_odom_base = np.array(scan.T_odom_base)
         newest = MappedKeyscan(record, odometry, points, T_odom_base, tracked.T_local_base, travel_m)

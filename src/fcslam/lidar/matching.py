@@ -33,6 +33,8 @@ INLIER_RATIO: Final = 20.0
 """Density of points on their surface relative to that of outliers."""
 INDEPENDENT: Final = 0.2
 """Share of the points' log-likelihood that counts: errors of neighbouring points are correlated, five count as one."""
+FIXED: Final = np.full(3, 1e12)
+"""Information of a velocity that is known."""
 SHRINK: Final = 0.6
 FAST_SHRINK: Final = 0.35
 """Factor of the loss scale after each step; the fast one after a small step."""
@@ -69,6 +71,8 @@ class ScanMatch:
 
     Each point lies on its nearest surface, with a normally distributed distance, or is an outlier.
     """
+    velocity: FloatArray
+    """Correction of the velocity in the sweep, in ``base``, shape (3,), m/s and rad/s; zeros for a scan at once."""
 
 
 def match_scan(
@@ -77,8 +81,13 @@ def match_scan(
     T_field_guess: FloatArray,
     prior_information: FloatArray,
     config: MatchingConfig,
+    velocity_information: FloatArray = FIXED,
 ) -> ScanMatch:
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
+
+    The points of a sweep were measured at different times. Their positions assume a motion, whose velocity is corrected
+    together with the pose: a point of time t moves by t times the correction (continuous-time matching as in Dellenbach
+    et al., "CT-ICP", ICRA 2022, with one velocity for a scan).
 
     Args:
         scan: points in ``base``.
@@ -86,16 +95,18 @@ def match_scan(
         T_field_guess: start, and mean of the prior, shape (3,), metres and radians.
         prior_information: over (x, y, theta) in the field's coordinates, shape (3, 3); zeros for no prior.
         config: loss and iterations.
+        velocity_information: of the assumed velocity (x, y, theta), shape (3,), in (m/s)^-2 and (rad/s)^-2.
 
     Returns:
         The pose, the information of the points, and how well they fit.
     """
-    pose, information, explained, known, log_likelihood = _match(
-        _Points(scan.points, scan.normals, scan.solitary, scan.origin),
-        np.array(T_field_guess), prior_information, field.arrays,  # a writable copy: code is compiled once
+    pose, velocity, information, explained, known, log_likelihood = _match(
+        _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
+        np.array(T_field_guess),  # a writable copy: code is compiled once
+        prior_information, velocity_information, field.arrays,
         config.iterations, config.wide_scale_m, config.narrow_scale_m, config.point_sigma_m, config.explained_m,
     )  # fmt: skip
-    return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihood)
+    return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihood, velocity)
 
 
 class _Points(NamedTuple):
@@ -105,32 +116,45 @@ class _Points(NamedTuple):
     normals: FloatArray
     solitary: NDArray[np.bool_]
     origin: FloatArray
+    times: FloatArray
 
 
 @njit
-def _match(scan, guess, prior, field, iterations, wide, narrow, sigma, explained_m):  # type: ignore[no-untyped-def]
-    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``narrow``."""
-    pose = guess.copy()
+def _match(scan, guess, prior, velocity_prior, field, iterations, wide, narrow, sigma, explained_m):  # type: ignore[no-untyped-def]
+    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``narrow``.
+
+    It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + v^T diag(velocity_prior) v. The
+    Jacobian of e_i is (J_i, t_i J_i) over pose and velocity v, so the normal equations are made of the sums of J^T J,
+    t J^T J and t^2 J^T J; v is eliminated by the Schur complement.
+    """
+    pose, velocity = guess.copy(), np.zeros(3)
     scale = wide
     for _ in range(iterations):
-        H, g = _normal_equations(scan, pose, field, scale)
-        x, y = pose[0] - guess[0], pose[1] - guess[1]
-        theta = (pose[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi
+        H, g, reduced = _normal_equations(scan, pose, velocity, field, scale, sigma, velocity_prior)
+        difference = pose - guess
+        difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
         for r in range(3):
-            g[r] = g[r] / (sigma * sigma) + prior[r, 0] * x + prior[r, 1] * y + prior[r, 2] * theta
             for c in range(3):
-                H[r, c] = H[r, c] / (sigma * sigma) + prior[r, c]
+                g[r] += prior[r, c] * difference[c]
+                H[r, c] += prior[r, c]
             H[r, r] += DAMPING
         step = _solve(H, g)
+        small = abs(step[0]) + abs(step[1]) < SMALL_STEP_M and abs(step[2]) < SMALL_STEP_RAD
         for r in range(3):
             pose[r] -= step[r]
-        small = abs(step[0]) + abs(step[1]) < SMALL_STEP_M and abs(step[2]) < SMALL_STEP_RAD
+        if len(scan.times) > 0:
+            change = reduced[3] - reduced[0] * step[0] - reduced[1] * step[1] - reduced[2] * step[2]
+            velocity -= change
         if small and scale <= narrow:
             break
         scale = max(narrow, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    H, g = _normal_equations(scan, pose, field, narrow)
-    return (pose, H / (sigma * sigma), *_fit(scan, pose, field, explained_m))
+    H, g, _ = _normal_equations(scan, pose, velocity, field, narrow, sigma, velocity_prior)
+    explained, known, log_likelihood = _fit(scan, pose, velocity, field, explained_m)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = velocity[0], velocity[1]
+    velocity[0], velocity[1] = cos * x + sin * y, cos * y - sin * x
+    return pose, velocity, H, explained, known, log_likelihood
 
 
 @njit(allocates=False)
@@ -147,78 +171,126 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
-    hxx, hxy, hxt, hyy, hyt, htt, gx, gy, gt = _sums(scan, pose, field, scale)
-    return np.array(((hxx, hxy, hxt), (hxy, hyy, hyt), (hxt, hyt, htt))), np.array((gx, gy, gt))
+def _normal_equations(scan, pose, velocity, field, scale, sigma, velocity_prior):  # type: ignore[no-untyped-def]
+    """Normal equations over the pose, without the velocity, in units of sigma.
+
+    Returns:
+        H (3, 3) and g (3,) of the pose; and (4, 3): the velocity that minimises the cost is moved by row 3 less the
+        step of the pose times rows 0 to 2.
+    """
+    own_pose, mixed_sums, own_velocity, g, f = _sums(scan, pose, velocity, field, scale)
+    s2 = 1.0 / (sigma * sigma)
+    H, gradient = s2 * _symmetric(own_pose), s2 * np.array(g)
+    reduced = np.zeros((4, 3))
+    if len(scan.times) > 0:
+        mixed, own = s2 * _symmetric(mixed_sums), s2 * _symmetric(own_velocity)
+        for r in range(3):
+            own[r, r] += velocity_prior[r] + DAMPING
+        moment = s2 * np.array(f) + velocity_prior * velocity
+        reduced[3] = np.array(_solve(own, moment))
+        for r in range(3):
+            reduced[r] = np.array(_solve(own, mixed[r]))
+        for r in range(3):
+            gradient[r] -= mixed[r, 0] * reduced[3, 0] + mixed[r, 1] * reduced[3, 1] + mixed[r, 2] * reduced[3, 2]
+            for c in range(3):
+                H[r, c] -= mixed[r, 0] * reduced[c, 0] + mixed[r, 1] * reduced[c, 1] + mixed[r, 2] * reduced[c, 2]
+    return H, gradient, reduced
+
+
+@njit
+def _symmetric(upper):  # type: ignore[no-untyped-def]
+    xx, xy, xt, yy, yt, tt = upper
+    return np.array(((xx, xy, xt), (xy, yy, yt), (xt, yt, tt)))
 
 
 @njit(allocates=False)
-def _sums(scan, pose, field, scale):  # type: ignore[no-untyped-def]
-    """Point-to-line where a normal is known, point-to-point for solitary returns; Geman-McClure weights."""
+def _sums(scan, pose, velocity, field, scale):  # type: ignore[no-untyped-def]
+    """Sums over the points of w J^T J, t w J^T J, t^2 w J^T J (upper triangles), w J^T e and t w J^T e."""
     hxx = hxy = hxt = hyy = hyt = htt = gx = gy = gt = 0.0  # scalars, which stay in registers
-    points, normals, surfels = scan.points, scan.normals, field.surfels
+    kxx = kxy = kxt = kyy = kyt = ktt = fx = fy = ft = 0.0
+    lxx = lxy = lxt = lyy = lyt = ltt = 0.0
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    c2 = scale * scale
-    for i in range(len(points)):
-        rx = cos * points[i, 0] - sin * points[i, 1]
-        ry = sin * points[i, 0] + cos * points[i, 1]
-        x, y = pose[0] + rx, pose[1] + ry
-        label = label_at(x, y, field)
-        if label == EMPTY:
-            continue
-        s = surfels[label]
-        dx, dy = x - s[0], y - s[1]
-        nx, ny = s[2], s[3]
-        mx = cos * normals[i, 0] - sin * normals[i, 1]
-        my = sin * normals[i, 0] + cos * normals[i, 1]
-        if nx * mx + ny * my < OPPOSED:  # the two sides of a thin wall do not attract each other
-            continue
-        d2 = dx * dx + dy * dy
-        if nx == 0.0 and ny == 0.0:
-            nx, ny = mx, my
-        if nx == 0.0 and ny == 0.0:
-            w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
-            if scan.solitary[i]:  # two lines through the surfel: along x here, along y below
-                hyy += w
-                hyt += w * rx
-                htt += w * rx * rx
-                gy += w * dy
-                gt += w * rx * dy
-                nx = 1.0
-            else:
-                # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot
-                # to its previous position with false certainty. Only their bearing counts.
-                bx, by = points[i, 0] - scan.origin[0], points[i, 1] - scan.origin[1]
-                length = max(np.hypot(bx, by), 1e-9)
-                nx, ny = -(sin * bx + cos * by) / length, (cos * bx - sin * by) / length
-            e = nx * dx + ny * dy
-        else:
-            e = nx * dx + ny * dy
-            along2 = max(0.0, d2 - e * e)
-            w = (c2 / (c2 + e * e + ALONG * along2)) ** 2
-        t = ny * rx - nx * ry
-        hxx += w * nx * nx
-        hxy += w * nx * ny
-        hxt += w * nx * t
-        hyy += w * ny * ny
-        hyt += w * ny * t
-        htt += w * t * t
-        gx += w * nx * e
-        gy += w * ny * e
-        gt += w * t * e
-    return hxx, hxy, hxt, hyy, hyt, htt, gx, gy, gt
+    swept = len(scan.times) > 0
+    for i in range(len(scan.points)):
+        t = scan.times[i] if swept else 0.0
+        axx, axy, axt, ayy, ayt, att, bx, by, bt = _terms(scan, i, pose, cos, sin, t, velocity, field, scale * scale)
+        hxx, hxy, hxt, hyy, hyt, htt = hxx + axx, hxy + axy, hxt + axt, hyy + ayy, hyt + ayt, htt + att
+        gx, gy, gt = gx + bx, gy + by, gt + bt
+        if swept:
+            kxx, kxy, kxt, kyy = kxx + t * axx, kxy + t * axy, kxt + t * axt, kyy + t * ayy
+            kyt, ktt, fx, fy, ft = kyt + t * ayt, ktt + t * att, fx + t * bx, fy + t * by, ft + t * bt
+            lxx, lxy, lxt = lxx + t * t * axx, lxy + t * t * axy, lxt + t * t * axt
+            lyy, lyt, ltt = lyy + t * t * ayy, lyt + t * t * ayt, ltt + t * t * att
+    return (
+        (hxx, hxy, hxt, hyy, hyt, htt), (kxx, kxy, kxt, kyy, kyt, ktt), (lxx, lxy, lxt, lyy, lyt, ltt),
+        (gx, gy, gt), (fx, fy, ft),
+    )  # fmt: skip
 
 
 @njit(allocates=False)
-def _fit(scan, pose, field, limit):  # type: ignore[no-untyped-def]
+def _terms(scan, i, pose, cos, sin, t, velocity, field, c2):  # type: ignore[no-untyped-def]
+    """w J^T J (upper triangle) and w J^T e of point i, measured at t.
+
+    e is the distance from the point to the line of its surfel, and J = (n_x, n_y, n x r) its Jacobian over the pose,
+    with the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
+    and along y. The weight w is that of Geman and McClure.
+    """
+    none = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    rx, ry = _swept_point(scan.points, i, cos, sin, t, velocity)
+    x, y = pose[0] + rx, pose[1] + ry
+    label = label_at(x, y, field)
+    if label == EMPTY:
+        return none
+    s = field.surfels[label]
+    dx, dy = x - s[0], y - s[1]
+    nx, ny = s[2], s[3]
+    mx = cos * scan.normals[i, 0] - sin * scan.normals[i, 1]
+    my = sin * scan.normals[i, 0] + cos * scan.normals[i, 1]
+    if nx * mx + ny * my < OPPOSED:  # the two sides of a thin wall do not attract each other
+        return none
+    d2 = dx * dx + dy * dy
+    if nx == 0.0 and ny == 0.0:
+        nx, ny = mx, my
+    if nx == 0.0 and ny == 0.0:
+        w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
+        if scan.solitary[i]:
+            return w, 0.0, -w * ry, w, w * rx, w * (rx * rx + ry * ry), w * dx, w * dy, w * (rx * dy - ry * dx)
+        # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot to its
+        # previous position with false certainty. Only their bearing counts.
+        bearing_x, bearing_y = scan.points[i, 0] - scan.origin[0], scan.points[i, 1] - scan.origin[1]
+        length = max(np.hypot(bearing_x, bearing_y), 1e-9)
+        nx = -(sin * bearing_x + cos * bearing_y) / length
+        ny = (cos * bearing_x - sin * bearing_y) / length
+        e = nx * dx + ny * dy
+    else:
+        e = nx * dx + ny * dy
+        w = (c2 / (c2 + e * e + ALONG * max(0.0, d2 - e * e))) ** 2
+    lever = ny * rx - nx * ry
+    return (
+        w * nx * nx, w * nx * ny, w * nx * lever, w * ny * ny, w * ny * lever, w * lever * lever,
+        w * nx * e, w * ny * e, w * lever * e,
+    )  # fmt: skip
+
+
+@njit(allocates=False)
+def _swept_point(points, i, cos, sin, t, velocity):  # type: ignore[no-untyped-def]
+    """Point i relative to the robot, turned into the field and moved by the velocity during t."""
+    rx = cos * points[i, 0] - sin * points[i, 1]
+    ry = sin * points[i, 0] + cos * points[i, 1]
+    return rx + t * (velocity[0] - velocity[2] * ry), ry + t * (velocity[1] + velocity[2] * rx)
+
+
+@njit(allocates=False)
+def _fit(scan, pose, velocity, field, limit):  # type: ignore[no-untyped-def]
     """Share of the points on a surface, share near any, and the log-likelihood of the points."""
     points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     explained = known = 0
     total = 0.0
+    swept = len(scan.times) > 0
     for i in range(len(points)):
-        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
-        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
+        rx, ry = _swept_point(points, i, cos, sin, scan.times[i] if swept else 0.0, velocity)
+        x, y = pose[0] + rx, pose[1] + ry
         label = label_at(x, y, field)
         if label == EMPTY:
             continue

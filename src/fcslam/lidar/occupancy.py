@@ -15,8 +15,8 @@ from pydantic import Field
 
 from fcslam.compiled import njit
 from fcslam.config import Settings
-from fcslam.geometry import se2
-from fcslam.records import FloatArray, LaserModel, Ranges
+from fcslam.lidar.scan import beam_times, ray_at, rays_of
+from fcslam.records import FloatArray, LaserModel, Ranges, Sweep
 from fcslam.runs.map_files import Cells
 
 Counts = NDArray[np.uint32]
@@ -68,17 +68,32 @@ class OccupancyGrid:
     """Lower left corner of cell (0, 0) in ``map``."""
 
 
-Casting = tuple[Ranges, LaserModel, FloatArray]
-"""Ranges (beam_count,), their laser, ``T_map_base`` (3,)."""
+class Casting(NamedTuple):
+    """A scan and its pose."""
+
+    ranges_m: Ranges
+    """Shape (beam_count,), metres."""
+    laser: LaserModel
+    T_map_base: FloatArray
+    """At the stamp, shape (3,), metres and radians."""
+    sweep: Sweep | None = None
 
 
 class _Beams(NamedTuple):
-    """Scans of one laser with the same beams, stacked."""
+    """Scans of one laser with the same beams at the same times, stacked."""
 
     ranges_m: Ranges  # (N, beam_count)
-    angles_rad: FloatArray  # (beam_count,)
-    T_map_laser: FloatArray  # (N, 3)
+    origins: FloatArray  # (beam_count, 2) in base, as if all were measured at the stamp
+    directions: FloatArray  # (beam_count, 2)
+    times_s: FloatArray  # (beam_count,)
+    T_map_base: FloatArray  # (N, 3)
+    velocity: FloatArray  # (N, 3)
+    acceleration: FloatArray  # (N, 3)
     max_range_m: float
+
+
+_AT_ONCE = Sweep(0.0, 0.0)
+"""A scan whose beams were all measured at the stamp."""
 
 
 class _Layout(NamedTuple):
@@ -108,7 +123,7 @@ def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
     The grid spans all hits and all lasers; beams without a hit in usable range clear cells inside of it only.
 
     Args:
-        keyscans: ranges (beam_count,) in metres, their laser, and ``T_map_base`` (3,).
+        keyscans: the scans.
         config: resolution, usable range and size.
 
     Returns:
@@ -160,10 +175,11 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
 
 
 def _by_laser(keyscans: Sequence[Casting]) -> list[_Beams]:
-    by_laser: dict[LaserModel, list[Casting]] = {}
+    by_beams: dict[tuple[LaserModel, Sweep], list[Casting]] = {}
     for scan in keyscans:
-        by_laser.setdefault(scan[1], []).append(scan)
-    return [_stacked(scans, laser) for laser, scans in by_laser.items()]
+        times = _AT_ONCE if scan.sweep is None else Sweep(scan.sweep.first_s, scan.sweep.last_s)
+        by_beams.setdefault((scan.laser, times), []).append(scan)
+    return [_stacked(scans, laser, times) for (laser, times), scans in by_beams.items()]
 
 
 def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
@@ -180,17 +196,21 @@ def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
     return cells
 
 
-def _stacked(keyscans: list[Casting], laser: LaserModel) -> _Beams:
-    for ranges_m, _, T_map_base in keyscans:
+def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams:
+    for ranges_m, _, T_map_base, _ in keyscans:
         if np.shape(ranges_m) != (laser.beam_count,):
             raise ValueError(f"ranges of shape {np.shape(ranges_m)} from a laser of {laser.beam_count} beams")
         if np.shape(T_map_base) != (3,):
             raise ValueError(f"a pose of shape {np.shape(T_map_base)}, expected (3,)")
-    ranges_m = np.array([ranges_m for ranges_m, _, _ in keyscans], np.float32)
-    poses = np.array([T_map_base for _, _, T_map_base in keyscans])
+    ranges_m = np.array([scan.ranges_m for scan in keyscans], np.float32)
+    poses = np.array([scan.T_map_base for scan in keyscans])
     if not (np.abs(poses) < FARTHEST_M).all():  # false for NaN
         raise ValueError(f"poses must be finite and within {FARTHEST_M:g} m of the origin")
-    return _Beams(ranges_m, laser.angles_rad(), se2.compose(poses, laser.T_base_laser), laser.max_range_m)
+    sweeps = [scan.sweep or _AT_ONCE for scan in keyscans]
+    return _Beams(
+        ranges_m, *rays_of(laser), beam_times(laser, times), poses, np.array([sweep.velocity for sweep in sweeps]),
+        np.array([sweep.acceleration for sweep in sweeps]), laser.max_range_m,
+    )  # fmt: skip
 
 
 def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
@@ -215,33 +235,37 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
     reach = min(usable, beams.max_range_m)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in range(len(beams.ranges_m)):
-        pose = beams.T_map_laser[k]
-        low, high = np.minimum(low, pose[:2]), np.maximum(high, pose[:2])
-        for i in range(len(beams.angles_rad)):
+        for i in range(len(beams.times_s)):
+            x, y, dx, dy = _ray(beams, k, i)
             r = beams.ranges_m[k, i]
-            if not (r > 0.0 and r < reach):  # true for NaN
-                continue
-            heading = pose[2] + beams.angles_rad[i]
-            for axis, way in ((0, np.cos(heading)), (1, np.sin(heading))):
-                value = pose[axis] + r * way
-                low[axis] = min(low[axis], value)
-                high[axis] = max(high[axis], value)
+            reached = r if r > 0.0 and r < reach else 0.0  # 0 for NaN
+            low[0], high[0] = min(low[0], x, x + reached * dx), max(high[0], x, x + reached * dx)
+            low[1], high[1] = min(low[1], y, y + reached * dy), max(high[1], y, y + reached * dy)
     return low, high
+
+
+@njit(allocates=False)
+def _ray(beams, k, i):  # type: ignore[no-untyped-def]
+    """Origin and direction of beam i of scan k in ``map``, as four numbers."""
+    ox, oy, dx, dy = ray_at(
+        beams.origins[i], beams.directions[i], beams.times_s[i], beams.velocity[k], beams.acceleration[k]
+    )
+    pose = beams.T_map_base[k]
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return pose[0] + cos * ox - sin * oy, pose[1] + sin * ox + cos * oy, cos * dx - sin * dy, sin * dx + cos * dy
 
 
 @njit(allocates=False)
 def _cast(beams, layout, usable, counts, first):  # type: ignore[no-untyped-def]
     for k in range(len(beams.ranges_m)):
-        pose = beams.T_map_laser[k]
-        x0 = pose[0] / layout.resolution_m - layout.column
-        y0 = pose[1] / layout.resolution_m - layout.row
-        for i in range(len(beams.angles_rad)):
+        for i in range(len(beams.times_s)):
             r = beams.ranges_m[k, i]
             if not (r > 0.0 and r < beams.max_range_m):  # true for NaN
                 continue
+            x, y, dx, dy = _ray(beams, k, i)
+            x0, y0 = x / layout.resolution_m - layout.column, y / layout.resolution_m - layout.row
             length = min(r, usable) / layout.resolution_m
-            heading = pose[2] + beams.angles_rad[i]
-            x1, y1 = x0 + length * np.cos(heading), y0 + length * np.sin(heading)
+            x1, y1 = x0 + length * dx, y0 + length * dy
             if _traverse(x0, y0, x1, y1, counts, np.uint32(first + k)) and r < usable:
                 counts.hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
 

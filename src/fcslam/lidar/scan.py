@@ -1,14 +1,15 @@
 """One scan as points with normals in the robot's base."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.records import FloatArray, LaserModel, Ranges
+from fcslam.records import FloatArray, Keyscan, LaserModel, Ranges, Sweep
 
 NORMAL_REACH = 3
 """Neighbours on each side that a normal is fitted to."""
@@ -21,10 +22,13 @@ LINE_TOLERANCE_M = 0.05
 ROUNDEST = 0.1
 """Largest ratio of the neighbours' variance across the fitted line to that along it."""
 
+AT_ONCE: Final = np.empty(0)
+"""Times of returns that were all measured at the stamp."""
+
 
 @dataclass(frozen=True, slots=True)
 class PointScan:
-    """Valid returns of one scan in ``base``."""
+    """Valid returns of one scan in ``base`` at its stamp."""
 
     points: FloatArray
     """Shape (N, 2), metres."""
@@ -33,7 +37,9 @@ class PointScan:
     solitary: NDArray[np.bool_]
     """Shape (N,): returns on no line and in no row, as from a post or a trunk."""
     origin: FloatArray
-    """Position of the laser, shape (2,), metres."""
+    """Position of the laser, shape (2,), metres; in the middle of a sweep."""
+    times_s: FloatArray = field(default_factory=lambda: AT_ONCE)
+    """Shape (N,): time of each return after the stamp; shape (0,): all were measured at the stamp."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -44,46 +50,103 @@ class PointScan:
         Returns farther than ``radius_m`` from the origin of ``base`` are left out.
         """
         most = len(self) if limit is None else limit
-        points, normals, solitary = _thin(self.points, self.normals, self.solitary, spacing_m, most, radius_m)
-        return PointScan(points, normals, solitary, self.origin)
+        return self.only(_thin(self.points, spacing_m, most, radius_m))
 
     def only(self, kept: NDArray[Any]) -> "PointScan":
         """The returns with the indices ``kept``, shape (K,), or where the mask ``kept``, shape (N,), is true."""
-        return PointScan(self.points[kept], self.normals[kept], self.solitary[kept], self.origin)
+        times_s = self.times_s[kept] if len(self.times_s) else AT_ONCE
+        return PointScan(self.points[kept], self.normals[kept], self.solitary[kept], self.origin, times_s)
 
 
-def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
+def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) -> PointScan:
     """Convert the valid ranges of a scan (finite, over 0, below the maximum) to points with normals.
 
     Args:
         ranges_m: shape (beam_count,), metres.
         laser: geometry and mounting of the laser.
+        sweep: when the beams were measured, and the motion meanwhile; each return is placed where the robot was then.
 
     Returns:
-        Points and normals in ``base``, shape (N, 2).
+        Points and normals in ``base`` at the stamp, shape (N, 2).
 
     Raises:
         ValueError: the number of ranges is not the number of beams.
     """
     if np.shape(ranges_m) != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {np.shape(ranges_m)}")
-    T_base_laser = np.array(laser.T_base_laser)
-    beams = _beams(laser)
-    points, normals, solitary = _project(
-        ranges_m, beams, abs(laser.angle_increment_rad), laser.max_range_m, T_base_laser
+    rays = rays_of(laser, sweep)
+    points, normals, solitary, kept = _project(
+        ranges_m, rays.origins, rays.directions, abs(laser.angle_increment_rad), laser.max_range_m
     )
-    return PointScan(points, normals, solitary, T_base_laser[:2])
+    if sweep is None:
+        return PointScan(points, normals, solitary, rays.origins[0])
+    return PointScan(points, normals, solitary, rays.origins[laser.beam_count // 2], beam_times(laser, sweep)[kept])
+
+
+def keyscan_points(keyscan: Keyscan, lasers: Sequence[LaserModel]) -> PointScan:
+    """The points of a keyscan; ``lasers`` are those that its robot announced."""
+    return point_scan(keyscan.ranges_m, keyscan.laser_model(lasers), keyscan.sweep)
+
+
+class Rays(NamedTuple):
+    """The beams of a scan in ``base`` at its stamp: a return lies at ``origin + range * direction``."""
+
+    origins: FloatArray
+    """Where the laser was at each beam, shape (beam_count, 2), metres."""
+    directions: FloatArray
+    """Unit vectors, shape (beam_count, 2)."""
+
+
+def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> Rays:
+    """The beams of a scan of ``laser``. This is the only place where beams get positions and directions."""
+    if sweep is None:
+        return _rays(laser)
+    return Rays(
+        *_swept(*_rays(laser), beam_times(laser, sweep), np.array(sweep.velocity), np.array(sweep.acceleration))
+    )
+
+
+def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
+    """Time of each beam after the stamp, seconds, shape (beam_count,)."""
+    return np.linspace(sweep.first_s, sweep.last_s, laser.beam_count)
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
-def _beams(laser: LaserModel) -> FloatArray:
-    """Direction of each beam in ``base`` as cosine and sine, shape (N, 2)."""
+def _rays(laser: LaserModel) -> Rays:
+    """The beams if all are measured at the stamp."""
     angles = laser.angles_rad() + laser.T_base_laser[2]
-    return np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    origins = np.tile(laser.T_base_laser[:2], (laser.beam_count, 1))
+    return Rays(origins, np.stack((np.cos(angles), np.sin(angles)), axis=1))
 
 
 @njit
-def _project(ranges, beams, spacing, max_range, T_base_laser):  # type: ignore[no-untyped-def]
+def _swept(origins, directions, times, velocity, acceleration):  # type: ignore[no-untyped-def]
+    """Each beam where the robot was at its time."""
+    moved, turned = np.empty_like(origins), np.empty_like(directions)
+    for i in range(len(times)):
+        moved[i, 0], moved[i, 1], turned[i, 0], turned[i, 1] = ray_at(
+            origins[i], directions[i], times[i], velocity, acceleration
+        )
+    return moved, turned
+
+
+@njit(allocates=False)
+def ray_at(origin, direction, t, velocity, acceleration):  # type: ignore[no-untyped-def]
+    """Origin and direction of a beam at ``t`` s, in ``base`` at the stamp (see ``Sweep``), as four numbers."""
+    x = t * (velocity[0] + 0.5 * t * acceleration[0])
+    y = t * (velocity[1] + 0.5 * t * acceleration[1])
+    theta = t * (velocity[2] + 0.5 * t * acceleration[2])
+    cos, sin = np.cos(theta), np.sin(theta)
+    return (
+        x + cos * origin[0] - sin * origin[1],
+        y + sin * origin[0] + cos * origin[1],
+        cos * direction[0] - sin * direction[1],
+        sin * direction[0] + cos * direction[1],
+    )
+
+
+@njit
+def _project(ranges, origins, directions, spacing, max_range):  # type: ignore[no-untyped-def]
     count = len(ranges)
     kept = np.empty(count, np.int64)
     xy = np.empty((count, 2))
@@ -91,18 +154,18 @@ def _project(ranges, beams, spacing, max_range, T_base_laser):  # type: ignore[n
     for i in range(count):
         r = ranges[i]
         if r > 0.0 and r < max_range:  # false for NaN
-            xy[n, 0] = T_base_laser[0] + r * beams[i, 0]
-            xy[n, 1] = T_base_laser[1] + r * beams[i, 1]
+            xy[n, 0] = origins[i, 0] + r * directions[i, 0]
+            xy[n, 1] = origins[i, 1] + r * directions[i, 1]
             kept[n] = i
             n += 1
-    points = xy[:n].copy()
+    points, kept = xy[:n].copy(), kept[:n].copy()
     normals = np.zeros((n, 2))
     solitary = np.zeros(n, np.bool_)
     for k in range(n):
-        _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals)
+        _fit_normal(points, kept, ranges, spacing, k, origins[kept[k]], normals)
         if normals[k, 0] == 0.0 and normals[k, 1] == 0.0:
             solitary[k] = not _in_row(points, k)
-    return points, normals, solitary
+    return points, normals, solitary, kept
 
 
 @njit(allocates=False)
@@ -119,7 +182,7 @@ def _in_row(points, k):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # type: ignore[no-untyped-def]
+def _fit_normal(points, kept, ranges, spacing, k, origin, normals):  # type: ignore[no-untyped-def]
     """Total least squares through the neighbours of return k on the same surface; facing the laser."""
     first = last = k
     while first > 0 and k - first < NORMAL_REACH and _connected(points, kept, ranges, spacing, first - 1):
@@ -146,7 +209,7 @@ def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # typ
     along = (sxx + syy) / m - across
     if across > LINE_TOLERANCE_M**2 or across > ROUNDEST * along:
         return
-    if nx * (T_base_laser[0] - points[k, 0]) + ny * (T_base_laser[1] - points[k, 1]) < 0.0:
+    if nx * (origin[0] - points[k, 0]) + ny * (origin[1] - points[k, 1]) < 0.0:
         nx, ny = -nx, -ny
     normals[k, 0] = nx
     normals[k, 1] = ny
@@ -179,7 +242,8 @@ def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def
 
 
 @njit
-def _thin(points, normals, solitary, spacing, limit, radius):  # type: ignore[no-untyped-def]
+def _thin(points, spacing, limit, radius):  # type: ignore[no-untyped-def]
+    """Numbers of the points that ``PointScan.thinned`` keeps."""
     keep = np.empty(len(points), np.int64)
     n = 0
     for i in range(len(points)):
@@ -193,10 +257,7 @@ def _thin(points, normals, solitary, spacing, limit, radius):  # type: ignore[no
         keep[n] = i
         n += 1
     count = min(n, limit)
-    kept_points, kept_normals, kept_solitary = np.empty((count, 2)), np.empty((count, 2)), np.empty(count, np.bool_)
+    spread = np.empty(count, np.int64)
     for k in range(count):  # evenly spread over those that are far enough apart
-        i = keep[k * (n - 1) // max(1, count - 1)]
-        kept_points[k] = points[i]
-        kept_normals[k] = normals[i]
-        kept_solitary[k] = solitary[i]
-    return kept_points, kept_normals, kept_solitary
+        spread[k] = keep[k * (n - 1) // max(1, count - 1)]
+    return spread

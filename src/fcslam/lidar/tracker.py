@@ -10,10 +10,10 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import MatchingConfig, ScanMatch, match_scan
+from fcslam.lidar.matching import FIXED, MatchingConfig, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryConfig, OdometryError, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
-from fcslam.records import FloatArray, LaserScan
+from fcslam.records import FloatArray, LaserScan, Sweep
 
 GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA_M = 0.8, 0.5, 0.01
 """Limits of a good match, by which odometry is judged: the share of the points in known area that it explains, and the
@@ -99,6 +99,8 @@ class TrackedScan:
     gives the pose."""
     scan: PointScan | None
     """The scan's points in ``base``; None if the robot stands still and the points were not computed."""
+    sweep: Sweep | None = None
+    """Times of the beams, and the motion as the scan was matched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,25 +158,26 @@ class ScanTracker:
         is_still = moved_m < config.still_m and turned_rad < config.still_rad
         matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
         if self._fields and is_still and matched_here == self._matched_here:
-            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None)
+            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 2. Scan to points.
-        points = point_scan(scan.ranges_m, scan.laser)
+        points = point_scan(scan.ranges_m, scan.laser, scan.sweep)
         if not self._fields:
-            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
+            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 3. Scan matching; a doubtful match starts a correlative search.
         error = odometry_error(moved_m, turned_rad, config.odometry)
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
-        match, innovation = self._match(points, thinned, T_local_guess, error)
+        velocity = self._velocity_information(scan.sweep)
+        match, innovation = self._match(points, thinned, T_local_guess, error, velocity)
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
-            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
+            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
-        tracked = TrackedScan(match.T_field_base, match.information, points)
+        tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
         trust = self._trust.learn(innovation, error) if _is_good(match) else self._trust
         usual = _learn_usual(self._usual, match.log_likelihood / max(1, len(thinned)))
@@ -214,8 +217,22 @@ class ScanTracker:
         moved_m = self._moved_m + math.hypot(motion[0], motion[1])
         return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
 
+    def _velocity_information(self, sweep: Sweep | None) -> FloatArray:
+        """Information of the velocity in a sweep, shape (3,), by odometry's error in the motion during the sweep."""
+        if sweep is None:
+            return FIXED
+        x, y, theta = sweep.displacement(sweep.duration_s).tolist()
+        error = self._trust.scale(odometry_error(math.hypot(x, y), abs(theta), self._config.odometry))
+        position, heading = (sweep.duration_s / sigma for sigma in error)
+        return np.array((position**2, position**2, heading**2))
+
     def _match(
-        self, points: PointScan, thinned: PointScan, T_local_guess: FloatArray, error: OdometryError
+        self,
+        points: PointScan,
+        thinned: PointScan,
+        T_local_guess: FloatArray,
+        error: OdometryError,
+        velocity: FloatArray,
     ) -> tuple[ScanMatch, FloatArray]:
         """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match.
 
@@ -224,7 +241,7 @@ class ScanTracker:
         """
         config, field = self._config, self._fields[0][0]
         learned = self._trust.scale(error)
-        match = match_scan(thinned, field, T_local_guess, error.information, config.matching)
+        match = match_scan(thinned, field, T_local_guess, error.information, config.matching, velocity)
         innovation = se2.between(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
         is_doubtful = (
@@ -239,12 +256,20 @@ class ScanTracker:
         )
         if np.array_equal(found.T_field_base, match.T_field_base):
             return match, innovation
-        other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching)
+        other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching, velocity)
         other_innovation = se2.between(T_local_guess, other.T_field_base)
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
             return other, other_innovation
         return match, innovation
+
+
+def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
+    """The sweep with its velocity moved by a correction, shape (3,)."""
+    if sweep is None:
+        return None
+    x, y, theta = (np.array(sweep.velocity) + velocity).tolist()
+    return sweep._replace(velocity=(x, y, theta))
 
 
 def _learn_usual(usual: float, likelihood: float) -> float:

@@ -77,7 +77,7 @@ def fuse_periods(
     number = {session: k for k, period in enumerate(periods) for session in period.sessions}
     castings: list[list[Casting]] = [[] for _ in periods] or [[]]
     for keyscan, pose in zip(keyscans, np.asarray(T_map_base), strict=True):
-        casting = keyscan.ranges_m, keyscan.laser_model(lasers[keyscan.id.robot]), pose
+        casting = Casting(keyscan.ranges_m, keyscan.laser_model(lasers[keyscan.id.robot]), pose, keyscan.sweep)
         castings[number[keyscan.id.robot]].append(casting)
     for grid in cast_periods(castings, config):
         yield OccupancyMap(classify(grid, config), grid.resolution_m, grid.origin_xy)

@@ -7,7 +7,7 @@ import numpy as np
 
 from fcslam.geometry.beams import beam_step
 from fcslam.lidar.lasers import Lasers
-from fcslam.records import Beams, LaserModel, LaserScan, Ranges
+from fcslam.records import Beams, LaserModel, LaserScan, Ranges, Sweep
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
 from fcslam.wire.quantisation import dequantise, quantise
 
@@ -32,7 +32,8 @@ class MappedScans:
         step = beam_step(self._lasers.known[index].beams)
         laser = _mapped_laser(scan.laser, step)
         returns = _returns(scan.ranges_m[::step], laser.max_range_m)
-        return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser)
+        sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
+        return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser, sweep=sweep)
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
@@ -43,6 +44,12 @@ def _mapped_laser(laser: LaserModel, step: int) -> LaserModel:
     if every.max_range_m <= MAXIMUM_LASER_RANGE_M:
         return every
     return replace(every, max_range_m=MAXIMUM_LASER_RANGE_M)
+
+
+def _mapped_sweep(sweep: Sweep, beam_count: int, step: int) -> Sweep:
+    """The sweep of every ``step``-th beam from the first on."""
+    share = (beam_count - 1) // step * step / (beam_count - 1)
+    return sweep._replace(last_s=sweep.first_s + share * (sweep.last_s - sweep.first_s))
 
 
 def _returns(ranges_m: Ranges, max_range_m: float) -> Ranges:

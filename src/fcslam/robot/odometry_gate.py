@@ -60,7 +60,7 @@ class OdometryGate:
         self._last = scan.stamp, read
         if self._bridge is None and read is scan.T_odom_base:
             return scan
-        return LaserScan(scan.stamp, scan.ranges_m, scan.laser, frozen(self.bridged(read)))
+        return replace(scan, T_odom_base=frozen(self.bridged(read)))
 
     def image(self, image: CameraImage) -> CameraImage:
         """An image taken since the last scan, with its odometry in the same frame."""

@@ -168,7 +168,7 @@ class ViewExtractor:
 
 def _lidar_view(scan: LaserScan, T_odom_image: FloatArray) -> LidarView:
     """A scan as seen from the robot's pose at an image, shape (3,), by odometry."""
-    returns = point_scan(scan.ranges_m, scan.laser)
+    returns = point_scan(scan.ranges_m, scan.laser, scan.sweep)
     T_image_scan = se2.inverse(se2.between(scan.T_odom_base, T_odom_image))
     ends = se2.transform(T_image_scan, np.vstack((returns.origin, returns.points)))
     return LidarView(ends[1:], ends[0], abs(scan.laser.angle_increment_rad))

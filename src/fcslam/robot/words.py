@@ -158,7 +158,7 @@ class WordSender:
 
 def without_ranges(keyscan: Keyscan) -> Keyscan:
     """The keyscan as a robot sends it whose ranges stay on it."""
-    return replace(keyscan, ranges_m=_NO_RANGES, beams=None)
+    return replace(keyscan, ranges_m=_NO_RANGES, beams=None, sweep=None)
 
 
 def tiles_of(own: OccupancyMap, robot: str) -> Iterator[MapTile]:

@@ -5,7 +5,7 @@ import numpy as np
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
-from fcslam.lidar.scan import point_scan
+from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import SPACING_M
 from fcslam.maps.closure_picture import closure_png
 from fcslam.records import FloatArray, Keyscan
@@ -45,7 +45,7 @@ def _submap(store: MissionStore, run: Run, session: str, stamp: float) -> FloatA
         assert isinstance(keyscan, Keyscan)
         nearest = int(np.argmin(np.abs(trajectory.stamps - keyscan.stamp)))
         if abs(trajectory.stamps[nearest] - keyscan.stamp) < SAME_S:
-            points = point_scan(keyscan.ranges_m, keyscan.laser_model(announced.lasers)).thinned(SPACING_M).points
+            points = keyscan_points(keyscan, announced.lasers).thinned(SPACING_M).points
             scans.append((keyscan.stamp, trajectory.T_map_base[nearest], points))
     if not scans or min(abs(at - stamp) for at, _, _ in scans) > SAME_S:
         raise EvaluationError(f"the mission holds no keyscan of {session} at {stamp:.3f} s")

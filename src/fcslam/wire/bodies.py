@@ -25,11 +25,19 @@ from fcslam.records import (
     LaserModel,
     MapTile,
     Place,
+    Sweep,
     WordPlace,
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import BYTES_PER_ROW, KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS, MAXIMUM_LASERS
+from fcslam.wire.limits import (
+    BYTES_PER_ROW,
+    KEYPOINT_AXES,
+    MAXIMUM_BEAMS,
+    MAXIMUM_KEYPOINTS,
+    MAXIMUM_LASERS,
+    SWEEP_NUMBERS,
+)
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind, TaughtPlace
 from fcslam.wire.quantisation import (
     dequantise,
@@ -120,6 +128,7 @@ def _write_keyscan(keyscan: Keyscan) -> pb.Keyscan:
         ranges=pack_ranges(codes),
         laser=keyscan.laser,
         beams=beams and pb.Beams(angle_min_rad=beams.angle_min_rad, angle_increment_rad=beams.angle_increment_rad),
+        sweep=None if keyscan.sweep is None else keyscan.sweep.steps(),
     )
 
 
@@ -129,7 +138,10 @@ def _read_keyscan(message: pb.Keyscan, envelope: pb.Packet) -> Keyscan:
     beams = None
     if message.HasField("beams"):
         beams = Beams(message.count, message.beams.angle_min_rad, message.beams.angle_increment_rad)
-    return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges, message.laser, beams)
+    if len(message.sweep) not in (0, SWEEP_NUMBERS):
+        raise PacketError(f"keyscan: sweep has {len(message.sweep)} numbers, not {SWEEP_NUMBERS}")
+    sweep = Sweep.of_steps(message.sweep) if message.sweep else None
+    return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges, message.laser, beams, sweep)
 
 
 def _write_constraint(constraint: Constraint) -> pb.Constraint:

@@ -21,12 +21,15 @@ from fcslam.records import (
     LaserModel,
     MapTile,
     Place,
+    Sweep,
     WordPlace,
 )
 from fcslam.runs.map_files import Occupancy
 from fcslam.wire.limits import (
     DIGEST_BYTES,
     KEYPOINT_AXES,
+    MAXIMUM_ACCELERATION,
+    MAXIMUM_BEAM_TIME_S,
     MAXIMUM_BEAMS,
     MAXIMUM_COORDINATE_M,
     MAXIMUM_EPOCH,
@@ -38,6 +41,7 @@ from fcslam.wire.limits import (
     MAXIMUM_NUMBER,
     MAXIMUM_RESOLUTION_M,
     MAXIMUM_SEQUENCE,
+    MAXIMUM_SPEED,
     MAXIMUM_TILE,
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
@@ -131,6 +135,19 @@ def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
         _check_beams(keyscan.beams, "keyscan")
         count = keyscan.beams.beam_count
         _require(count == len(ranges), f"keyscan: {len(ranges)} ranges of {count} beams")
+    if keyscan.sweep is not None:
+        _check_sweep(keyscan.sweep)
+
+
+def _check_sweep(sweep: Sweep) -> None:
+    times = sweep.first_s, sweep.last_s
+    within = all(abs(t) <= MAXIMUM_BEAM_TIME_S for t in times) and sweep.first_s != sweep.last_s
+    _require(within, f"keyscan: beams at {times} s, not two times within {MAXIMUM_BEAM_TIME_S:g} s of the stamp")
+    slow = all(abs(number) <= MAXIMUM_SPEED for number in sweep.velocity)
+    _require(slow, f"keyscan: the velocity in the sweep exceeds {MAXIMUM_SPEED:g} m/s or rad/s")
+    steady = all(abs(number) <= MAXIMUM_ACCELERATION for number in sweep.acceleration)
+    _require(steady, f"keyscan: the acceleration in the sweep exceeds {MAXIMUM_ACCELERATION:g} m/s^2 or rad/s^2")
+    _require(sweep == sweep.rounded(), "keyscan: the sweep is not in steps of the wire; work with Sweep.rounded()")
 
 
 def _check_constraint(constraint: Constraint, _: Packet) -> None:

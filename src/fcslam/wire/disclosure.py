@@ -34,6 +34,7 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "Keyscan.ranges": "the floor plan at the height of the LiDAR: walls, doors, furniture, legs of people",
         "Keyscan.laser": "which of its LiDARs measured this",
         "Keyscan.beams": "whether the beams of its LiDAR vary",
+        "Keyscan.sweep": "how fast its LiDAR turns, and how fast it drove",
         "Beams.angle_min_rad": "which LiDAR it has",
         "Beams.angle_increment_rad": "which LiDAR it has",
         "Constraint.i": "nothing by itself",

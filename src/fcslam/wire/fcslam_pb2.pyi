@@ -104,20 +104,22 @@ class Detector(_message.Message):
     def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ..., vocabulary: _Optional[bytes] = ...) -> None: ...
 
 class Keyscan(_message.Message):
-    __slots__ = ("number", "stamp", "count", "ranges", "laser", "beams")
+    __slots__ = ("number", "stamp", "count", "ranges", "laser", "beams", "sweep")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     STAMP_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     RANGES_FIELD_NUMBER: _ClassVar[int]
     LASER_FIELD_NUMBER: _ClassVar[int]
     BEAMS_FIELD_NUMBER: _ClassVar[int]
+    SWEEP_FIELD_NUMBER: _ClassVar[int]
     number: int
     stamp: float
     count: int
     ranges: bytes
     laser: int
     beams: Beams
-    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., count: _Optional[int] = ..., ranges: _Optional[bytes] = ..., laser: _Optional[int] = ..., beams: _Optional[_Union[Beams, _Mapping]] = ...) -> None: ...
+    sweep: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., count: _Optional[int] = ..., ranges: _Optional[bytes] = ..., laser: _Optional[int] = ..., beams: _Optional[_Union[Beams, _Mapping]] = ..., sweep: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Beams(_message.Message):
     __slots__ = ("angle_min_rad", "angle_increment_rad")

@@ -1,4 +1,4 @@
-"""All limits of the format, versions 2 to 5. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 to 6. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
@@ -9,6 +9,8 @@ WORDS_VERSION = 4
 """Of what only a robot sends that sends words in place of descriptors."""
 TAUGHT_VERSION = 5
 """Of codes that the cloud gives to a robot that learns."""
+SWEEP_VERSION = 6
+"""Of a keyscan whose beams were measured at different times."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -24,6 +26,12 @@ MAXIMUM_LASERS = 8
 """Lasers of one robot."""
 MAXIMUM_BEAMS = 4096
 BYTES_PER_RANGE = 2
+SWEEP_NUMBERS = 8
+MAXIMUM_BEAM_TIME_S = 2.0
+MAXIMUM_SPEED = 50.0
+"""Of a robot during a scan, m/s and rad/s."""
+MAXIMUM_ACCELERATION = 500.0
+"""The same, m/s^2 and rad/s^2."""
 
 MAXIMUM_KEYPOINTS = 2048
 KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}

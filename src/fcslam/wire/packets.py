@@ -23,12 +23,13 @@ from fcslam.wire.limits import (
     MAXIMUM_PACKET_BYTES,
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
+    SWEEP_VERSION,
     TAUGHT_VERSION,
     WORDS_VERSION,
 )
 from fcslam.wire.messages import Body, Hello, Packet, PacketKind, TaughtPlace
 
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, TAUGHT_VERSION)
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, TAUGHT_VERSION, SWEEP_VERSION)
 
 
 class Label(NamedTuple):
@@ -170,8 +171,8 @@ def _version(body: Body) -> int:
             return TAUGHT_VERSION
         case WordPlace() | MapTile():
             return WORDS_VERSION
-        case Keyscan(ranges_m=ranges_m) if not len(ranges_m):
-            return WORDS_VERSION
+        case Keyscan(ranges_m=ranges_m, sweep=sweep):
+            return WORDS_VERSION if not len(ranges_m) else PROTOCOL_VERSION if sweep is None else SWEEP_VERSION
         case Hello(vocabularies=vocabularies) if vocabularies:
             return WORDS_VERSION
         case Hello(floor=floor) if floor:

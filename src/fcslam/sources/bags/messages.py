@@ -7,11 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fcslam.geometry.beams import FULL_TURN_RAD, SAME_VIEW_BEAMS, is_field_of_view
-from fcslam.records import Beams, Ranges, Transform
+from fcslam.records import Beams, Ranges, Sweep, Transform
 from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.sources.pose import Pose
 
 _LONGEST_RANGE_M = 1000.0
+SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 1e-4, 1.0
+"""A scan that takes less is one at once; one that takes more is of no 2D LiDAR, so its time increment is wrong."""
+_OVER_SCAN_TIME = 1.2
+"""Largest ratio of the time of all beams to the time between scans; some drivers state a wrong time increment."""
 _COUNT_TOLERANCE = 0.01
 """Share of the ranges by which drivers that round the increment are wrong."""
 _MAX_COORDINATE_M = 1e7
@@ -37,6 +41,13 @@ class ScanMessage(NamedTuple):
     """Ranges as sent, metres, shape (beam_count,)."""
     laser: int = 0
     """Index of its topic among those of laser scans."""
+    sweep: Sweep | None = None
+    """Times of the beams, without a motion; None: all were measured at the stamp, or nothing is known."""
+
+    @property
+    def end(self) -> float:
+        """Stamp of its last measurement."""
+        return self.stamp if self.sweep is None else self.stamp + max(self.sweep.first_s, self.sweep.last_s)
 
 
 class OdometryReading(NamedTuple):
@@ -73,13 +84,30 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     range_min_m = range_min_m if range_min_m > 0.0 else 0.0
     if not range_max_m > range_min_m:
         raise ValueError("no sane range")
+    sweep = _sweep(count, float(content.time_increment), float(content.scan_time))
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
+        sweep = reversed_sweep(sweep)
     if abs(first_rad) > FULL_TURN_RAD:
         first_rad = remainder(first_rad, FULL_TURN_RAD)
     stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
-    return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges)
+    return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges, sweep=sweep)
+
+
+def _sweep(count: int, increment_s: float, scan_time_s: float) -> Sweep | None:
+    """Times of the beams of a message: the stamp is the time of the first, as ``LaserScan.msg`` says."""
+    last_s = (count - 1) * increment_s
+    if not SHORTEST_SWEEP_S <= last_s <= _LONGEST_SWEEP_S:  # false for NaN
+        return None
+    if scan_time_s > 0.0 and count * increment_s > _OVER_SCAN_TIME * scan_time_s:
+        last_s = scan_time_s * (count - 1) / count
+    return Sweep(0.0, last_s)
+
+
+def reversed_sweep(sweep: Sweep | None) -> Sweep | None:
+    """The times of the beams in the opposite order."""
+    return None if sweep is None else sweep._replace(first_s=sweep.last_s, last_s=sweep.first_s)
 
 
 def _first_echoes(ranges: Any) -> Ranges:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
+from fcslam.sources.motion import moving_sweep
 from fcslam.sources.pose import Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
@@ -37,6 +38,7 @@ class PosedScan(NamedTuple):
     """A scan with the odometry at its stamp."""
 
     scan: ScanMessage
+    """Its sweep has the motion by odometry."""
     T_odom_base: Pose
     fault: Fault | None
     """Fault of the pose; with NO_ODOMETRY the pose is the identity."""
@@ -89,8 +91,19 @@ class OdometryPairing:
             queue.append(_QueuedItem(number, item, _PoseMatch(item.T_odom_base, None)))
         else:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
-        while queue and (queue[0].match or len(queue) > _LONGEST_QUEUE or self._is_held_by_image()):
+        while queue and (self._is_complete(queue[0]) or len(queue) > _LONGEST_QUEUE or self._is_held_by_image()):
             yield _with_pose(queue.popleft(), readings)
+
+    def _is_complete(self, waiting: _QueuedItem) -> bool:
+        """Whether the odometry at the stamp and, for a scan, during its sweep is known.
+
+        Odometry that is late or has stopped does not hold a scan for longer than the next scan takes.
+        """
+        if waiting.match is None or not isinstance(waiting.item, ScanMessage) or waiting.item.sweep is None:
+            return waiting.match is not None
+        end_s = waiting.item.end
+        is_covered = self._readings[-1].stamp >= end_s or self._readings[-1].stamp < waiting.item.stamp
+        return is_covered or any(isinstance(each.item, ScanMessage) and each.item.end > end_s for each in self._queue)
 
     def _is_held_by_image(self) -> bool:
         """Whether the first item is an image of a clock that is ahead, and a scan behind it has its pose."""
@@ -126,7 +139,10 @@ def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[
     if isinstance(waiting.item, ImageMessage):
         unknown = match.fault is Fault.NO_ODOMETRY
         return waiting.number, PosedImage(waiting.item, None if unknown else match.T_odom_base)
-    return waiting.number, PosedScan(waiting.item, *match)
+    scan = waiting.item
+    if scan.sweep is not None and match.fault is not Fault.NO_ODOMETRY:
+        scan = scan._replace(sweep=moving_sweep(scan.sweep, scan.stamp, readings))
+    return waiting.number, PosedScan(scan, *match)
 
 
 def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, newest: OdometryReading) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.errors import FcslamError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
 from fcslam.sources.bags.camera import Calibration
-from fcslam.sources.bags.messages import ScanMessage, measured_ranges
+from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.images import check_image
@@ -38,7 +38,8 @@ class Rig(NamedTuple):
         scan, upside_down = posed.scan, self.upside_down[posed.scan.laser]
         ranges_m = _turned(measured_ranges(scan), upside_down)
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
-        return LaserScan(scan.stamp, ranges_m, laser, pose_array(posed.T_odom_base))
+        sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
+        return LaserScan(scan.stamp, ranges_m, laser, pose_array(posed.T_odom_base), sweep)
 
     def image(self, posed: PosedImage) -> CameraImage:
         """The record of an image; raises ValueError if it is damaged, or of another camera, or there is none."""
