@@ -84,14 +84,17 @@ def test_no_scans(tmp_path, name):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_no_odometry(tmp_path, name):
-    message = refusal(save(tmp_path / name, [*without(without(drive(20), "/odom"), "/tf_static"), text(100.0)]))
-    assert "no odometry (nav_msgs/Odometry, or tf from odom to base)" in message
-    assert "/chatter (std_msgs/String, 1), /scan (sensor_msgs/LaserScan, 20)" in message
+    source = open_source(save(tmp_path / name, without(drive(20), "/odom")))
+    (note,) = source.survey().notes
+    assert "no odometry, so scan matching alone gives the motion" in note
+    scans = list(source.records())
+    assert len(scans) == 20
+    assert all(np.isnan(scan.T_odom_base).all() for scan in scans)
 
 
-def test_no_odometry_in_tf(tmp_path):
-    message = refusal(save(tmp_path / "run.bag", without(drive(20), "/odom")))
-    assert "in tf no transform from odom to base, but base_link -> laser" in message
+def test_odometry_may_be_left_out(tmp_path):
+    source = open_source(save(tmp_path / "run.bag", drive(20)), BagOptions(odom_topic="none"))
+    assert all(np.isnan(scan.T_odom_base).all() for scan in source.records())
 
 
 @pytest.mark.parametrize(

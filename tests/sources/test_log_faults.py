@@ -90,11 +90,27 @@ def test_a_log_without_laser_scans_is_refused(tmp_path):
     assert "no laser scan" in refusal(save(tmp_path / "run.log", [odom(k, pose_at(k)) for k in range(30)]))
 
 
-def test_a_log_without_odometry_is_refused(tmp_path):
-    standing = [flaser(k, (1, 2, 0)) for k in range(30)]
-    assert "no odometry" in refusal(save(tmp_path / "run.log", standing))
-    assert "no odometry" in refusal(save(tmp_path / "both.log", [*standing, *(odom(k, (0, 0, 0)) for k in range(9))]))
-    assert open_source(save(tmp_path / "short.log", standing[:9])).survey().scan_count == 9
+@pytest.mark.parametrize(
+    ("poses", "words"),
+    [
+        ([(1, 2, 0)] * 30, "never changes in 30 poses"),
+        ([(0.1 * k, 0.1 * k, 0) for k in range(30)], "its heading is never set"),
+    ],
+)
+def test_odometry_that_says_nothing_is_not_used(tmp_path, poses, words):
+    source = open_source(save(tmp_path / "run.log", [flaser(k, pose) for k, pose in enumerate(poses)]))
+    assert words in source.survey().notes[0]
+    assert "no odometry" in source.survey().notes[1]
+    assert all(np.isnan(record.T_odom_base).all() for record in source.records())
+
+
+@pytest.mark.parametrize(
+    "poses", [[(0.1 * k, 0, 0) for k in range(30)], [(1, 2, 0)] * 9, [(0, 0, 0.1 * k) for k in range(30)]]
+)
+def test_odometry_of_a_straight_drive_a_turn_or_a_few_scans_is_used(tmp_path, poses):
+    source = open_source(save(tmp_path / "run.log", [flaser(k, pose) for k, pose in enumerate(poses)]))
+    assert source.survey().notes == ()
+    assert all(np.isfinite(record.T_odom_base).all() for record in source.records())
 
 
 def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):

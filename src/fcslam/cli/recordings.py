@@ -29,7 +29,10 @@ ScanTopic = Annotated[
 OdomTopic = Annotated[
     str | None,
     typer.Option(
-        "--odom-topic", metavar="TOPIC", help="Topic of the odometry; /tf reads it from tf.", rich_help_panel=_BAGS
+        "--odom-topic",
+        metavar="TOPIC",
+        help="Topic of the odometry; /tf reads it from tf, none maps without it.",
+        rich_help_panel=_BAGS,
     ),
 ]
 CameraTopic = Annotated[

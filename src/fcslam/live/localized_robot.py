@@ -196,8 +196,9 @@ class LocalizedRobot(LiveTracker):
         estimate = known or _NOWHERE
         return RobotPose(
             newest.pose.stamp, frozen(se2.compose(estimate.T_map_odom, T_smooth_base)),
-            T_odom_base if self._prediction is None else None, estimate.quality, known is not None, 0,
-            newest.pose.T_keyscan_base, newest.tracked, self._config.robot.lidar.tracker.odometry, estimate.covariance,
+            None if self._is_without_odometry else T_odom_base, estimate.quality, known is not None, 0,
+            newest.pose.T_keyscan_base, newest.tracked, self._frontend.lidar_config.tracker.odometry,
+            estimate.covariance,
         )  # fmt: skip
 
     def _tell(self) -> None:

@@ -214,9 +214,7 @@ class Robot(LiveTracker):
             raise InputError(f"{self.name}: the robot has no camera; give camera=fcslam.CameraModel(...)")
         with self._lock:
             stamp = checked_stamp(stamp, self._newest_s)
-            T_odom_base = (
-                None if odometry is None or self._prediction is not None else checked_pose("odometry", odometry)
-            )
+            T_odom_base = None if odometry is None or self._is_without_odometry else checked_pose("odometry", odometry)
             self.add(checked_image(image, stamp, T_odom_base, self._camera))
 
     def change_floor(self, floor: str) -> None:
@@ -520,9 +518,9 @@ class Robot(LiveTracker):
         is_found = self._part in self._floors or localizer.quality > 0.0
         return RobotPose(
             newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
-            T_odom_base if self._prediction is None else None, newest.quality,
+            None if self._is_without_odometry else T_odom_base, newest.quality,
             is_found and not newest.is_deferred, localizer.map_index, newest.pose.T_keyscan_base, newest.tracked,
-            self._config.robot.lidar.tracker.odometry, np.zeros((3, 3)),
+            self._frontend.lidar_config.tracker.odometry, np.zeros((3, 3)),
         )  # fmt: skip
 
     def _tell(self) -> None:

@@ -9,15 +9,15 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.errors import InputError
 from fcslam.live.inputs import Lasers, checked_lasers, checked_pose, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
 from fcslam.mission import MissionConfig
-from fcslam.records import FloatArray, LaserScan, SensorRecord
+from fcslam.records import FloatArray, LaserScan, SensorRecord, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
-from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.wire.messages import Packet
 
 UNDETERMINED_S = 1.0
@@ -51,8 +51,6 @@ class LiveTracker(ABC):
         self._newest_s = -math.inf
         self._scans = 0
         self._pose: RobotPose | None = None
-        self._prediction: MotionPrediction | None = None
-        """Stands in for the odometry; None if there is odometry."""
         self._determined_s = -math.inf
         """Stamp of the newest scan that fixed the position; infinity after the event that none does."""
         self._is_finished = False
@@ -104,7 +102,7 @@ class LiveTracker(ABC):
             raise InputError(f"laser {laser!r} is not known; known: {', '.join(map(repr, self._lasers)) or 'none'}")
         with self._lock:
             stamp = checked_stamp(stamp, self._newest_s)
-            T_odom_base = self._odometry(stamp, odometry)
+            T_odom_base = self._odometry(odometry)
             return self._process(checked_scan(ranges_m, stamp, T_odom_base, self._lasers[laser]))
 
     def add(self, record: SensorRecord) -> RobotPose | None:
@@ -148,19 +146,17 @@ class LiveTracker(ABC):
             raise InputError(f"{self.name}: the robot is finished; make a new Robot to go on")
         return self._frontend.process(record)
 
-    def _odometry(self, stamp: float, given: ArrayLike | None) -> FloatArray:
-        """The given odometry, or its prediction; the first scan decides whether there is any."""
-        if not self._scans and given is None and self._prediction is None:
-            self._prediction = MotionPrediction()
-            self._config = self._config.model_copy(update={"robot": without_odometry(self._config.robot)})
-            self._frontend.replace_settings(self._config.robot)
-        if given is None and self._prediction is not None:
-            return self._prediction.predict(stamp)
-        if given is None or self._prediction is not None:
+    def _odometry(self, given: ArrayLike | None) -> FloatArray:
+        """The given odometry, or NaN without; the first scan decides whether there is any."""
+        if self._scans and (given is None) is not self._is_without_odometry:
             raise InputError(
                 f"{self.name}: some scans have odometry and some have not; give it with every scan or with none"
             )
-        return checked_pose("odometry", given)
+        return frozen(np.full(3, np.nan)) if given is None else checked_pose("odometry", given)
+
+    @property
+    def _is_without_odometry(self) -> bool:
+        return self._frontend.prediction is not None
 
     def _process(self, scan: LaserScan) -> RobotPose:
         """Localize a scan, and tell what happened."""
@@ -169,11 +165,8 @@ class LiveTracker(ABC):
         self._scans += 1
         newest = self._newest()
         T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
-        if self._prediction is not None:
-            is_matched = newest.tracked.information.any() and not newest.is_deferred
-            self._prediction.observe(scan.stamp, T_smooth_base if is_matched else None)
         pose = self._pose = self._pose_of(newest, T_smooth_base, scan.T_odom_base)
-        if self._prediction is not None:
+        if self._is_without_odometry:
             self._tell_undetermined(pose)
         self._tell()
         return pose

@@ -14,6 +14,7 @@ from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import Field
 
 from fcslam.errors import FeatureError
@@ -35,6 +36,7 @@ from fcslam.robot.backend import (
 from fcslam.robot.beside import BackendRunner, Inline
 from fcslam.robot.map_localizer import MapLocalizationConfig
 from fcslam.robot.mapped_scans import MappedScans
+from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
@@ -94,6 +96,10 @@ class RobotFrontend:
         """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
         self.odometry = OdometryGate(config.odometry)
         """Jumps of the odometry so far."""
+        self.prediction: MotionPrediction | None = None
+        """Stands in for the odometry; None if there is odometry."""
+        self.lidar_config = config.lidar
+        """Settings of the LiDAR front end; those for a robot without odometry once that is known."""
         self._config = config
         self._mapped = MappedScans()
         self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
@@ -115,11 +121,6 @@ class RobotFrontend:
         self._T_local_deferred: FloatArray | None = None
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
         self._begin()
-
-    def replace_settings(self, config: RobotConfig) -> None:
-        """Localize with other settings, before the first scan; those of the back end stay."""
-        self._config = config
-        self._lidar = LidarFrontend(self.robot, config.lidar)
 
     @property
     def scan_poses(self) -> ScanTrack:
@@ -145,7 +146,7 @@ class RobotFrontend:
         """Process the next record of the recording; returns the packets that are ready."""
         match record:
             case LaserScan():
-                self._process_scan(self._mapped.of(self.odometry.scan(record)))
+                self._process_scan(self._mapped.of(self._with_motion(record)))
             case CameraImage() if Channel.CAMERA in self._config.channels:
                 image = self.odometry.image(record)
                 if self._deferred:
@@ -196,7 +197,29 @@ class RobotFrontend:
         self._submit(SessionEnd())
         return self.ready(wait=True)
 
+    def _with_motion(self, scan: LaserScan) -> LaserScan:
+        """The scan with its odometry free of jumps, or with a prediction; the first scan decides if there is any."""
+        if self.newest is None and np.isnan(scan.T_odom_base).any():
+            self.prediction = MotionPrediction()
+            self.lidar_config = without_odometry(self.lidar_config)
+            self._lidar = LidarFrontend(self.robot, self.lidar_config)
+        return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
+
+    def _observe(self, scan: LaserScan) -> None:
+        """Predict the next scan from where this one was found."""
+        newest = self.newest
+        if self.prediction is None or newest is None:
+            return
+        is_matched = newest.tracked.information.any() and not newest.is_deferred
+        T_smooth_base = self.scan_poses.in_odom(newest.pose) if is_matched else None
+        self.prediction.observe(scan.stamp, T_smooth_base, newest.tracked.sweep)
+
     def _process_scan(self, scan: LaserScan) -> None:
+        """Process a scan and learn the robot's motion from it."""
+        self._localize(scan)
+        self._observe(scan)
+
+    def _localize(self, scan: LaserScan) -> None:
         config = self._config.lost
         before, self._previous = self._previous, scan
         if before is not None and has_moved_unseen(before, scan, config):
@@ -230,7 +253,7 @@ class RobotFrontend:
 
     def _begin(self) -> None:
         """Begin a session."""
-        self._lidar = LidarFrontend(self.robot, self._config.lidar)
+        self._lidar = LidarFrontend(self.robot, self.lidar_config)
         self._newest, self._scans = None, {}
         self.tracks.append(ScanTrack())
 

@@ -1,11 +1,13 @@
 """Motion of a robot without wheel odometry: the one of the last scans goes on, and scan matching corrects it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.odometry import OdometryConfig
-from fcslam.records import FloatArray, frozen
-from fcslam.robot.frontend import RobotConfig
+from fcslam.records import FloatArray, LaserScan, Sweep, frozen
 
 LONGEST_S = 1.0
 """After a longer gap between two scans the robot is assumed to stand still: nothing is known of its motion."""
@@ -22,14 +24,17 @@ ERRORS = OdometryConfig(
 """Errors of the prediction: within a tenth of a second, a robot may brake or turn by so much."""
 
 
-def without_odometry(config: RobotConfig) -> RobotConfig:
+def without_odometry(config: LidarConfig) -> LidarConfig:
     """The settings of a robot without odometry: every scan is matched, and the prediction is trusted little."""
-    tracker = config.lidar.tracker.model_copy(update={"still_m": 0.0, "still_rad": 0.0, "odometry": ERRORS})
-    return config.model_copy(update={"lidar": config.lidar.model_copy(update={"tracker": tracker})})
+    tracker = config.tracker.model_copy(update={"still_m": 0.0, "still_rad": 0.0, "odometry": ERRORS})
+    return config.model_copy(update={"tracker": tracker})
 
 
 class MotionPrediction:
-    """Stands in for the odometry of a robot, with constant velocity."""
+    """Stands in for the odometry of a robot, with constant velocity.
+
+    It is the velocity in the sweep of the last scan, or that between the last two scans if they were measured at once.
+    """
 
     def __init__(self) -> None:
         self._T_odom_base = np.zeros(3)
@@ -39,25 +44,42 @@ class MotionPrediction:
         """Time between them."""
         self._last: tuple[float, FloatArray] | None = None
         """Stamp and pose of the last scan, if it was matched."""
+        self._sweep: Sweep | None = None
+        """The sweep of the last scan, as it was matched."""
 
-    def predict(self, stamp: float) -> FloatArray:
-        """Pose at the next scan, in a frame of its own, shape (3,), metres and radians."""
-        elapsed_s = 0.0 if self._last is None else stamp - self._last[0]
-        if elapsed_s <= LONGEST_S and self._elapsed_s > 0.0:
+    def predict(self, scan: LaserScan) -> LaserScan:
+        """The next scan with its pose in a frame of the prediction's own, and with the motion during its sweep."""
+        elapsed_s = 0.0 if self._last is None else scan.stamp - self._last[0]
+        if self._last is None or not elapsed_s <= LONGEST_S:
+            return replace(scan, T_odom_base=frozen(self._T_odom_base))
+        sweep = scan.sweep
+        if self._sweep is not None and 0.0 < elapsed_s <= LARGEST_SHARE * self._sweep.duration_s:
+            motion = self._sweep.displacement(elapsed_s)
+            if sweep is not None:
+                sweep = sweep._replace(velocity=self._sweep.velocity)
+        elif self._elapsed_s > 0.0:
             share = min(max(elapsed_s / self._elapsed_s, LEAST_SHARE), LARGEST_SHARE)
-            self._T_odom_base = se2.compose(self._T_odom_base, se2.exp(share * self._motion))
-        return frozen(self._T_odom_base)
+            motion = se2.exp(share * self._motion)
+            if sweep is not None:
+                x, y, theta = (self._motion / self._elapsed_s).tolist()
+                sweep = sweep._replace(velocity=(x, y, theta))
+        else:
+            motion = np.zeros(3)
+        self._T_odom_base = se2.compose(self._T_odom_base, motion)
+        return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
 
-    def observe(self, stamp: float, T_smooth_base: FloatArray | None) -> None:
+    def observe(self, stamp: float, T_smooth_base: FloatArray | None, sweep: Sweep | None) -> None:
         """Where the tracker found the scan.
 
         Args:
             stamp: of the scan, seconds.
             T_smooth_base: its pose in a frame without jumps, shape (3,), metres and radians. None: it was not matched;
                 then the robot is assumed to stand still, as a wrong velocity would take it ever further.
+            sweep: the sweep as it was matched.
         """
-        self._elapsed_s = 0.0
+        self._elapsed_s, self._sweep = 0.0, None
         if self._last is not None and T_smooth_base is not None and 0.0 < stamp - self._last[0] <= LONGEST_S:
             self._motion = se2.log(se2.between(self._last[1], T_smooth_base))
             self._elapsed_s = stamp - self._last[0]
+            self._sweep = sweep
         self._last = None if T_smooth_base is None else (stamp, T_smooth_base)

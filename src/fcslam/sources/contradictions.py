@@ -8,12 +8,12 @@ The scans are kept, as one sensor alone does not say which of both is wrong.
 """
 
 from dataclasses import dataclass
-from math import hypot, remainder, tau
+from math import hypot, inf, isnan, remainder, tau
 from typing import NamedTuple
 
 import numpy as np
 
-from fcslam.records import LaserScan
+from fcslam.records import LaserScan, Ranges
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.pose import Pose
 
@@ -57,6 +57,8 @@ class OdometryWatch:
     def add(self, number: int, scan: LaserScan) -> None:
         """Count what is wrong with the next scan, which is on line (or in message) ``number``."""
         x, y, theta = scan.T_odom_base.tolist()
+        if isnan(theta):
+            return
         seen = _Seen(scan, (x, y, theta))
         known = self._lasers.get(scan.laser.T_base_laser)
         if known is None:
@@ -101,9 +103,22 @@ def _changed_share(before: LaserScan, after: LaserScan) -> float:
     laser, was = after.laser, before.laser
     beams = np.rint((laser.angles_rad() - was.angle_min_rad) / was.angle_increment_rad).astype(np.intp)
     inside = (beams >= 0) & (beams < was.beam_count)
-    a, b = before.ranges_m[beams[inside]], after.ranges_m[inside]
+    return changed_share(
+        before.ranges_m[beams[inside]], after.ranges_m[inside], min(was.max_range_m, laser.max_range_m)
+    )
+
+
+def changed_share(before_m: Ranges, after_m: Ranges, max_range_m: float = inf) -> float:
+    """Share of the common returns of two scans that measure something else; NaN if there are too few.
+
+    Args:
+        before_m, after_m: ranges of the same beams, metres; beams that only one of them has are left out.
+        max_range_m: a range at or above it is no return.
+    """
+    count = min(len(before_m), len(after_m))
+    a, b = before_m[:count], after_m[:count]
     with np.errstate(invalid="ignore"):  # NaN is no return
-        both = (a > 0.0) & (a < was.max_range_m) & (b > 0.0) & (b < laser.max_range_m)
+        both = (a > 0.0) & (a < max_range_m) & (b > 0.0) & (b < max_range_m)
         changed = np.abs(a - b) > np.maximum(CHANGE_M, CHANGE * np.minimum(a, b))
-    count = np.count_nonzero(both)
-    return np.count_nonzero(changed & both) / count if count >= FEWEST_RETURNS else float("nan")
+    returns = np.count_nonzero(both)
+    return np.count_nonzero(changed & both) / returns if returns >= FEWEST_RETURNS else float("nan")

@@ -1,9 +1,21 @@
 """Length, duration and motion of a path, pose by pose: what every format's survey needs."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from math import hypot, inf
+from math import hypot, inf, remainder, tau
+from typing import Final
 
-from fcslam.sources.pose import Pose
+from fcslam.sources.pose import Pose, relative_pose
+
+RESOLUTION_M: Final = 1e-3
+RESOLUTION_RAD: Final = 1e-4
+"""Odometry that changes by less over a whole recording never changes."""
+FEWEST_POSES: Final = 10
+"""Fewer poses are not judged."""
+LEAST_TRAVEL_M: Final = 1.0
+"""A robot that drove less far may not have turned at all."""
+SIDEWAYS: Final = 0.1
+"""Odometry without turns that moves sideways by a larger share of its travel has no heading."""
 
 
 @dataclass(slots=True)
@@ -17,19 +29,66 @@ class PathSummary:
     """Whether any two successive poses differ."""
     earliest: float = inf
     latest: float = -inf
+    _first: Pose | None = None
     _pose: Pose | None = None
+    _sideways_m: float = 0.0
+    _leaves: bool = False
+    _turns: bool = False
 
     def add(self, stamp: float, pose: Pose) -> None:
         """Append the next pose; ``stamp`` in seconds, ``pose`` in metres and radians."""
-        if self._pose is not None and pose != self._pose:
+        if self._pose is None or self._first is None:
+            self._first = pose
+        elif pose != self._pose:
             self.moves = True
             self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
+            self._judge(self._first, relative_pose(self._pose, pose), pose)
         self._pose = pose
         self.count += 1
         self.earliest = min(self.earliest, stamp)
         self.latest = max(self.latest, stamp)
 
+    def _judge(self, first: Pose, step: Pose, pose: Pose) -> None:
+        if self.says_something:
+            return
+        self._sideways_m += abs(step[1])
+        self._leaves = self._leaves or hypot(pose[0] - first[0], pose[1] - first[1]) > RESOLUTION_M
+        self._turns = self._turns or abs(remainder(pose[2] - first[2], tau)) > RESOLUTION_RAD
+
     @property
     def duration_s(self) -> float:
         """Between the earliest and the latest stamp; 0 without poses."""
         return max(0.0, self.latest - self.earliest)
+
+    @property
+    def says_something(self) -> bool:
+        """Whether the position and the heading change."""
+        return self._leaves and self._turns
+
+    @property
+    def fault(self) -> str | None:
+        """Why these poses are no odometry, as the end of a sentence; None if they can be."""
+        if self.count < FEWEST_POSES or self.says_something:
+            return None
+        if not self._leaves and not self._turns:
+            return f"never changes in {self.count} poses"
+        if self._leaves and self.length_m > LEAST_TRAVEL_M and self._sideways_m > SIDEWAYS * self.length_m:
+            return f"moves sideways for {self._sideways_m:.1f} of {self.length_m:.1f} m: its heading is never set"
+        return None
+
+
+def fault_of_odometry(poses: Iterable[Pose]) -> str | None:
+    """``PathSummary.fault`` of poses in their order; reads as many as it needs."""
+    summary = PathSummary()
+    for pose in poses:
+        summary.add(0.0, pose)
+        if summary.says_something:
+            return None
+    return summary.fault if summary.count else "has no message that can be read"
+
+
+WITHOUT_ODOMETRY: Final = (
+    "no odometry, so scan matching alone gives the motion; where the scans do not fix the position, as along a bare "
+    "corridor, the distance is unknown"
+)
+"""A note about such a recording."""

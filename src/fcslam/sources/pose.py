@@ -1,12 +1,14 @@
 """Poses as tuples (x, y, theta), metres and radians. For single poses they are twenty times faster than arrays."""
 
-from math import cos, remainder, sin, tau
+from math import cos, nan, remainder, sin, tau
 
 import numpy as np
 
 from fcslam.records import FloatArray
 
 Pose = tuple[float, float, float]
+UNKNOWN_POSE: Pose = (nan, nan, nan)
+"""Odometry of a robot that has none."""
 
 
 def relative_pose(T_a_b: Pose, T_a_c: Pose) -> Pose:

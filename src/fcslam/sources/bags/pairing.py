@@ -21,7 +21,7 @@ from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
 from fcslam.sources.motion import moving_sweep
-from fcslam.sources.pose import Pose, interpolated_pose
+from fcslam.sources.pose import UNKNOWN_POSE, Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
 """Largest time between a scan and a reading outside of which it has no odometry."""
@@ -130,6 +130,15 @@ def pair_with_odometry(
     for number, item in items:
         yield from pairing.add(number, item)
     yield from pairing.flush()
+
+
+def without_odometry(items: Iterable[tuple[int, Message]]) -> Iterator[tuple[int, Entry]]:
+    """Yield the scans and images in their order, without poses."""
+    for number, item in items:
+        if isinstance(item, ScanMessage):
+            yield number, PosedScan(item, UNKNOWN_POSE, None)
+        elif isinstance(item, ImageMessage):
+            yield number, PosedImage(item, None)
 
 
 def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[int, Entry]:

@@ -114,7 +114,13 @@ class RosBag:
         tilts = (
             self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
-        notes = (*self._notes, *self.stream.topics.notes, *filter(None, tilts), *camera_notes)
+        notes = (
+            *self._notes,
+            *self.stream.topics.notes,
+            *self.stream.odometry_notes,
+            *filter(None, tilts),
+            *camera_notes,
+        )
         rig = rig_of([laser.first for laser in self.stream.lasers], mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
         return _Reading(survey, rig)

@@ -1,6 +1,7 @@
 """The scans of a bag with their odometry, in the order of recording."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -18,6 +19,7 @@ from fcslam.sources.bags.container import BagFile, RawMessage, Topic
 from fcslam.sources.bags.merging import merge_scans
 from fcslam.sources.bags.messages import (
     BeamsError,
+    OdometryReading,
     ScanMessage,
     StampedTransform,
     is_odometry,
@@ -26,15 +28,18 @@ from fcslam.sources.bags.messages import (
     scan_of,
     transforms_of,
 )
-from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry
+from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
+from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry, without_odometry
 from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import TransformTree
+from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 
-_EDGES_NAMED = 10
 _IMAGES_TRIED = 5
+_STRIDE = 5
+"""Of the scans that show whether a robot moves, every such one is compared."""
 
 
 class RecordedLaser(NamedTuple):
@@ -45,6 +50,24 @@ class RecordedLaser(NamedTuple):
     """The first scan with its usual beams."""
 
 
+class OdometryInput(NamedTuple):
+    """Where the odometry of a bag comes from."""
+
+    topics: tuple[Topic, ...]
+    edge: tuple[str, str] | None
+    """Parent and child frame in tf; None: the topic holds messages of odometry."""
+
+    @property
+    def name(self) -> str:
+        """The name of the topic, or the frames in tf."""
+        return self.topics[0].name if self.edge is None else f"tf from {self.edge[0]} to {self.edge[1]}"
+
+    def readings_in(self, topic: Topic, transforms: Sequence[StampedTransform]) -> Iterator[OdometryReading]:
+        """The readings among the transforms of a message of ``topic``."""
+        if self.edge is not None and topic in self.topics:
+            yield from (odometry_in(each) for each in transforms if (each.parent, each.child) == self.edge)
+
+
 class BagStream:
     """Decodes and combines the chosen topics of a bag."""
 
@@ -52,6 +75,8 @@ class BagStream:
         self.path = path
         self._bag = BagFile(path)
         self._options = options
+        self.odometry_notes: list[str] = []
+        """Why an odometry is not used."""
 
     @cached_property
     def candidates(self) -> Candidates:
@@ -109,7 +134,8 @@ class BagStream:
         ``tree`` collects all transforms, if it is given.
         """
         gates = [ScanGate(laser.first.beams, audit) for laser in self.lasers]
-        for number, entry in pair_with_odometry(merge_scans(self._items(audit, tree, with_images), len(gates))):
+        items = merge_scans(self._items(audit, tree, with_images), len(gates))
+        for number, entry in (without_odometry if self.odometry is None else pair_with_odometry)(items):
             if not isinstance(entry, PosedScan):
                 yield number, entry
             elif gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
@@ -119,10 +145,10 @@ class BagStream:
                     yield number, entry
 
     def _items(self, audit: Audit, tree: TransformTree | None, with_images: bool) -> Iterator[tuple[int, Message]]:
-        topics = self.topics
+        topics, odometry = self.topics, () if self.odometry is None else self.odometry.topics
         heard = () if tree is None else topics.transforms
         seen = (topics.camera,) if with_images and topics.camera is not None else ()
-        for message in self._bag.messages(list(dict.fromkeys((*topics.odometry, *heard, *topics.scans, *seen)))):
+        for message in self._bag.messages(list(dict.fromkeys((*odometry, *heard, *topics.scans, *seen)))):
             try:
                 items = self._items_in(message, tree)
             except BeamsError:
@@ -147,32 +173,60 @@ class BagStream:
         if tree is not None:
             for transform in transforms:
                 tree.add(transform.parent, transform.child, transform.T_parent_child)
-        if message.topic not in self.topics.odometry:
-            return []
-        return [
-            odometry_in(transform)
-            for transform in transforms
-            if (transform.parent, transform.child) == self._odometry_edge
-        ]
+        return [] if self.odometry is None else list(self.odometry.readings_in(message.topic, transforms))
 
     @cached_property
-    def _odometry_edge(self) -> tuple[str, str]:
-        """Frames of the odometry in tf: the first transform whose parent frame contains "odom"."""
-        seen: set[str] = set()
-        for message in self._bag.messages(self.topics.odometry):
-            try:
-                transforms = self._transforms_in(message)
-            except ValueError:
-                continue
-            for transform in transforms:
-                if is_odometry(transform):
-                    return transform.parent, transform.child
-                seen.add(f"{transform.parent} -> {transform.child}")
-        known = ", ".join(sorted(seen)[:_EDGES_NAMED]) or "nothing that can be read"
-        raise SourceError(
-            f"{self.path}: no odometry: no topic of type {ODOMETRY}, and in tf no transform from odom to base, but "
-            f"{known}; record the odometry"
+    def odometry(self) -> "OdometryInput | None":
+        """The odometry that is read: the chosen topic, else tf; one that says nothing is none."""
+        if self._options.odom_topic == NO_ODOMETRY:
+            return None
+        for candidate in self._odometry_candidates():
+            fault = fault_of_odometry(reading.T_odom_base for reading in self._readings_of(candidate))
+            if fault is None or not self._scans_change:
+                return candidate
+            self.odometry_notes.append(f"{self.path}: {candidate.name} {fault}, so it is not used")
+        self.odometry_notes.append(f"{self.path}: {WITHOUT_ODOMETRY}")
+        return None
+
+    @cached_property
+    def _scans_change(self) -> bool:
+        """Whether the scans show that the robot moves: some scan measures something else than the first."""
+        scans = self._scans_of(self.topics.scans[0])
+        first = next(scans, None)
+        return first is not None and any(
+            changed_share(first.raw_ranges_m, scan.raw_ranges_m) > CHANGED
+            for scan in islice(scans, None, None, _STRIDE)
         )
+
+    def _odometry_candidates(self) -> Iterator["OdometryInput"]:
+        measured = [topic for topic in self.topics.odometry if topic.type == ODOMETRY]
+        for topic in measured:
+            yield OdometryInput((topic,), None)
+        if measured and self._options.odom_topic is not None:
+            return
+        edge = self._odometry_edge
+        if edge is not None:
+            yield OdometryInput(self.topics.transforms, edge)
+
+    @cached_property
+    def _odometry_edge(self) -> tuple[str, str] | None:
+        """Frames of the odometry in tf: the first transform whose parent frame contains "odom"; None without one."""
+        transforms = self._transforms_of(self.topics.transforms)
+        return next(((each.parent, each.child) for each in transforms if is_odometry(each)), None)
+
+    def _readings_of(self, odometry: "OdometryInput") -> Iterator[OdometryReading]:
+        if odometry.edge is not None:
+            for transform in self._transforms_of(odometry.topics):
+                yield from odometry.readings_in(odometry.topics[0], [transform])
+            return
+        for message in self._bag.messages(odometry.topics):
+            with suppress(ValueError):
+                yield odometry_of(self._bag.decode(message), message.bag_time_ns)
+
+    def _transforms_of(self, topics: Sequence[Topic]) -> Iterator[StampedTransform]:
+        for message in self._bag.messages(topics):
+            with suppress(ValueError):
+                yield from self._transforms_in(message)
 
     def _transforms_in(self, message: RawMessage) -> list[StampedTransform]:
         return list(transforms_of(self._bag.decode(message), message.bag_time_ns))

@@ -10,7 +10,7 @@ from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, SCANS
 from fcslam.sources.bags.container import BagFile, Topic, is_transforms
-from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 
 _NAMED_AT_MOST = 15
 _NEEDED = {
@@ -30,7 +30,7 @@ class Topics(NamedTuple):
     scans: tuple[Topic, ...]
     """One for each laser."""
     odometry: tuple[Topic, ...]
-    """One topic of odometry, or all tf topics."""
+    """One topic of odometry, or all tf topics; empty without either."""
     transforms: tuple[Topic, ...]
     """All tf topics."""
     camera: Topic | None
@@ -75,11 +75,8 @@ def choose_topics(
     ]
     transforms = tuple(topic for topic in heard if is_transforms(topic))
     measured = _measured(bag) if options.odom_topic is None else [topic for topic in heard if topic.type == ODOMETRY]
-    odometries = _candidates(bag, [*measured, *transforms], options.odom_topic, "--odom-topic")
-    if not odometries:
-        raise SourceError(
-            f"{bag.path}: no odometry ({ODOMETRY}, or tf from odom to base); record it; {_known(bag.topics)}"
-        )
+    wanted = options.odom_topic
+    odometries = [] if wanted == NO_ODOMETRY else _candidates(bag, [*measured, *transforms], wanted, "--odom-topic")
     camera, camera_info, camera_notes = _choose_camera(bag, options.camera_topic, has_images)
     notes = [*camera_notes]
     if not options.scan_topics:

@@ -3,17 +3,13 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from fcslam.errors import SourceError
 from fcslam.sources.faults import Faults
 from fcslam.sources.gate import TOLERATED_SHARE, check_consistency
 from fcslam.sources.logs.dialect import Line, OdometryLine, ParameterLine, ScanLine
 from fcslam.sources.logs.laser import Interleaving, laser_model, parameter
-from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
 from fcslam.sources.pose import Pose, relative_pose
 from fcslam.sources.source import Survey
-
-SCANS_THAT_MUST_MOVE = 10
-"""A log with at least this many scans must contain motion."""
 
 _MOUNTING_TOLERANCE = 0.01
 """Largest difference between the mountings of two scans, in metres or radians."""
@@ -26,6 +22,8 @@ class LogReading(NamedTuple):
     interleaving: Interleaving | None
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
+    has_odometry: bool
+    """Whether the poses are those of wheels."""
 
 
 class MountingEstimate:
@@ -84,21 +82,20 @@ class Overview:
         """Summarise the log at ``path`` after its last line.
 
         Raises:
-            SourceError: the log cannot be mapped.
+            SourceError: the log is mostly damaged, or of several lasers.
         """
         assert self._scan is not None
         check_consistency(path, faults, self._scans.count, self._odometry.count)
         pose_from_odometry = not self._scans.moves and self._odometry.moves
-        if not (self._scans.moves or pose_from_odometry) and self._scans.count >= SCANS_THAT_MUST_MOVE:
-            raise SourceError(
-                f"{path}: no odometry: the robot's pose is the same in all {self._scans.count} scans; "
-                "give a log with wheel odometry, of a robot that moves"
-            )
+        fault = (self._odometry if pose_from_odometry else self._scans).fault
+        notes = (
+            () if fault is None else (f"{path}: the odometry {fault}; it is not used", f"{path}: {WITHOUT_ODOMETRY}")
+        )
         offset_m = parameter(self._parameters, "robot_frontlaser_offset") or 0.0
         laser = laser_model(self._scan, self._parameters, self._mounting.T_base_laser(offset_m))
         length_m = self._odometry.length_m if pose_from_odometry else self._scans.length_m
-        survey = Survey(self._scans.count, self._scans.duration_s, length_m, (laser,), faults)
-        return LogReading(survey, interleaving, pose_from_odometry)
+        survey = Survey(self._scans.count, self._scans.duration_s, length_m, (laser,), faults, notes)
+        return LogReading(survey, interleaving, pose_from_odometry, fault is None)
 
 
 def _tells_more(scan: ScanLine, than: ScanLine) -> bool:

@@ -3,8 +3,8 @@
 Besides the rules of ``gate``:
 
 - Scans of a dialect without stamps get stamps 1 s apart, and are counted.
-- A log of ten or more scans in which neither the poses of scans nor the odometry messages ever change has no odometry
-  and is rejected. If only the odometry messages change, a scan takes the pose of the message before it.
+- If only the poses of odometry messages change, a scan takes the pose of the message before it.
+- Poses that say nothing (``PathSummary.fault``) are no odometry.
 """
 
 from collections.abc import Iterable, Iterator
@@ -23,7 +23,7 @@ from fcslam.sources.logs.laser import Interleaving, LogBeams, first_beams
 from fcslam.sources.logs.overview import LogReading, Overview
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.pose import Pose, pose_array
+from fcslam.sources.pose import UNKNOWN_POSE, Pose, pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 KEPT_BYTES = 1 << 25
@@ -74,7 +74,8 @@ class TextLog:
         for number, entry in self._entries(scans, parse_ahead(self._all_lines(), unit), audit):
             T_odom_base = pose_array(entry.T_odom_base)
             if isinstance(entry, OdometryLine):
-                yield Odometry(entry.stamp, T_odom_base)
+                if self._reading.has_odometry:
+                    yield Odometry(entry.stamp, T_odom_base)
                 continue
             model = laser.with_beams(entry.beams)
             ranges_m: Ranges | None
@@ -164,7 +165,8 @@ class TextLog:
                 beams = log_beams.of(line)
                 if gate.admits(number, line.stamp, beams) and beams is not None:
                     late = latest if reading.pose_from_odometry else None
-                    yield number, _Scan(line, beams, (late or line).T_odom_base)
+                    pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
+                    yield number, _Scan(line, beams, pose)
 
     def _note_clock(self, number: int, audit: Audit) -> None:
         if not self._dialect.timed:
