@@ -234,8 +234,9 @@ class RobotNode:
         if np.isnan(pose.T_map_base[0]):
             self._transforms.pause()
             return
-        if pose.T_map_odom is not None:
-            self._transforms.add(stamp_ns, self._clock.now_ns(), pose.T_map_odom)
+        moved = pose.T_map_base if self.sensors.is_without_odometry else pose.T_map_odom
+        if moved is not None:
+            self._transforms.add(stamp_ns, self._clock.now_ns(), moved)
         self._outputs.pose(stamp_ns, pose.T_map_base, pose.covariance)
 
     def _publish_transforms(self) -> None:
@@ -244,7 +245,8 @@ class RobotNode:
         while not self._stop.wait(max(0.0, due_s - time.monotonic())):
             transform = self._transforms.due(self._clock.now_ns())
             if transform is not None:
-                self._outputs.transform(transform.stamp_ns, self.sensors.odom_frame, transform.T_map_odom)
+                child = self.sensors.base_frame if self.sensors.is_without_odometry else self.sensors.odom_frame
+                self._outputs.transform(transform.stamp_ns, child, transform.T_map_odom)
             due_s = max(due_s + period_s, time.monotonic() - period_s)
 
     def _publish_maps(self) -> None:

@@ -1,7 +1,8 @@
 """Messages of a live robot in, sensor records out, as a bag would give them.
 
 The first messages wait until the mounting of every laser is known; then they are read, so none is lost. A scan waits
-for the odometry at its stamp. If that does not come, it gets the nearest pose within 1 s, or it is left out.
+for the odometry at its stamp. If that does not come, it gets the nearest pose within 1 s, or it is left out. A robot
+whose odometry is silent from the start is mapped without.
 """
 
 from collections import Counter, deque
@@ -32,8 +33,8 @@ from fcslam.sources.bags.messages import (
     scan_of,
     transforms_of,
 )
-from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
+from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
+from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan, without_odometry
 from fcslam.sources.bags.rig import (
     USUAL_BASES,
     Rig,
@@ -46,6 +47,7 @@ from fcslam.sources.bags.rig import (
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY
 
 USUAL_ODOM = "odom"
 """Frame of an odometry that names none."""
@@ -82,6 +84,8 @@ class LiveSensors:
         """Faults so far."""
         self.odom_frame, self.base_frame = USUAL_ODOM, ""
         """Frames of the odometry, once it is there; a driver may leave them out."""
+        self.is_without_odometry = options.odom_topic == NO_ODOMETRY
+        """Whether the robot is mapped without odometry."""
         self.restarts = 0
         """Number of times that the clock stepped back."""
         self.newest_stamp: float | None = None
@@ -175,8 +179,7 @@ class LiveSensors:
         if self._rig is None:
             return
         for number, item in self._merger.flush():
-            for paired, entry in self._pairing.add(number, item):
-                yield from self._recorded(paired, entry)
+            yield from self._paired(number, item)
         for number, entry in self._pairing.flush():
             yield from self._recorded(number, entry)
 
@@ -249,7 +252,8 @@ class LiveSensors:
         is_late = self._began is not None and now_s > self._began + PATIENCE_S
         if not self._is_heard(is_late):
             return None
-        base_frame = self.base_frame or next((frame for frame in USUAL_BASES if frame in self._tree), USUAL_BASES[-1])
+        known = (frame for frame in USUAL_BASES if frame in self._tree)
+        self.base_frame = base_frame = self.base_frame or next(known, USUAL_BASES[-1])
         usual = [usual_beams([scan.beams for scan in scans]) for scans in self._first]
         first = [
             next(scan for scan in scans if scan.beams == beams) for scans, beams in zip(self._first, usual, strict=True)
@@ -280,13 +284,20 @@ class LiveSensors:
         for topic, scans in zip(self._topics.scans, self._first, strict=True):
             if not scans and is_late:
                 self._notify(f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s")
-        if is_late and not self._has_odometry:
-            self._notify(
-                f"waits for odometry: {self._topics.odometry or 'tf from odom to base'} is silent; the driver of the "
-                "base publishes it; start it, or choose another topic by --odom-topic"
-            )
         enough = all(len(scans) >= (1 if is_late else SCANS_FOR_RIG) for scans in self._first)
-        return enough and self._has_odometry
+        if is_late and not (self._has_odometry or self.is_without_odometry):
+            if self._topics.odometry is not None:
+                self._notify(
+                    f"waits for odometry: {self._topics.odometry} is silent; the driver of the base publishes it; "
+                    "start it, or choose another topic by --odom-topic; --odom-topic none maps without odometry"
+                )
+            elif enough:
+                self.is_without_odometry = True
+                self._notify(
+                    f"{WITHOUT_ODOMETRY}. To use odometry, start the driver of the base before the robot, or name its "
+                    "topic by --odom-topic"
+                )
+        return enough and (self._has_odometry or self.is_without_odometry)
 
     def _tell_rig(self, mountings: list[Mounting], camera_note: str) -> None:
         if camera_note:
@@ -322,6 +333,10 @@ class LiveSensors:
 
     def _paired(self, number: int, message: Message) -> Iterator[SensorRecord]:
         """Give the next message in order its odometry."""
+        if self.is_without_odometry:
+            for paired, entry in without_odometry([(number, message)]):
+                yield from self._recorded(paired, entry)
+            return
         for paired, entry in self._pairing.add(number, message):
             self._waiting_since = None
             yield from self._recorded(paired, entry)

@@ -16,7 +16,7 @@ from fcslam.sources.bags.codec import (
     SCANS,
     TRANSFORMS,
 )
-from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.topics import is_truth
 
 TF, TF_STATIC = "tf", "tf_static"
@@ -67,8 +67,10 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
             raise NetworkError(f"no laser scans ({SCAN}) in {namespace or '/'}; start the driver; {chosen.known()}")
         scans = [min(candidates, key=lambda topic: (known[topic] != SCAN, _basename(topic) != "scan", topic))]
         notes += _note("laser scans", "--scan-topic", scans[0], candidates)
-    odometry = None if options.odom_topic is None else resolved(namespace, options.odom_topic)
-    if odometry is None:
+    odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
+    if options.odom_topic == NO_ODOMETRY:
+        notes.append("reads no odometry, as --odom-topic none says")
+    elif odometry is None:
         candidates = [topic for topic in inside if known[topic] == ODOMETRY and not is_truth(topic)]
         odometry = min(candidates, key=lambda topic: (_basename(topic) != "odom", topic), default=None)
         notes += _note("odometry", "--odom-topic", odometry, candidates)

@@ -39,7 +39,11 @@ from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
+from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.wire.messages import Body, Hello, Packet
+
+SCANS_THAT_CHANGED = 10
+"""So many scans in a row that changed while the odometry never did show that it measures nothing."""
 
 
 class RobotConfig(SessionConfig):
@@ -120,6 +124,12 @@ class RobotFrontend:
         """Records since the first doubtful scan."""
         self._T_local_deferred: FloatArray | None = None
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
+        self._at_rest: LaserScan | None = None
+        """The first scan."""
+        self._has_moved = False
+        """Whether the odometry has changed since."""
+        self._changed = 0
+        """Newest scans in a row that measure something else than the first."""
         self._begin()
 
     @property
@@ -188,7 +198,10 @@ class RobotFrontend:
     def begin_session(self) -> None:
         """End the present session and begin another: the next scan is of another place, as after a ride in a lift."""
         self._process_deferred()
-        self._end_session()
+        if self.newest is None:
+            self._lidar = LidarFrontend(self.robot, self.lidar_config)
+        else:
+            self._end_session()
         self._previous = None
 
     def finish(self) -> list[Packet]:
@@ -198,12 +211,25 @@ class RobotFrontend:
         return self.ready(wait=True)
 
     def _with_motion(self, scan: LaserScan) -> LaserScan:
-        """The scan with its odometry free of jumps, or with a prediction; the first scan decides if there is any."""
-        if self.newest is None and np.isnan(scan.T_odom_base).any():
+        """The scan with its odometry free of jumps, or with a prediction if there is none."""
+        if self.prediction is None and self._is_without_odometry(scan):
             self.prediction = MotionPrediction()
             self.lidar_config = without_odometry(self.lidar_config)
-            self._lidar = LidarFrontend(self.robot, self.lidar_config)
+            self.begin_session()
         return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
+
+    def _is_without_odometry(self, scan: LaserScan) -> bool:
+        """Whether the first scan has no odometry, or the odometry never changed while the scans did."""
+        if self._at_rest is None:
+            self._at_rest = scan
+            return bool(np.isnan(scan.T_odom_base).any())
+        if self._has_moved or not np.array_equal(scan.T_odom_base, self._at_rest.T_odom_base):
+            self._has_moved = True
+            return False
+        if scan.laser == self._at_rest.laser:
+            changed = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m) > CHANGED
+            self._changed = self._changed + 1 if changed else 0
+        return self._changed >= SCANS_THAT_CHANGED
 
     def _observe(self, scan: LaserScan) -> None:
         """Predict the next scan from where this one was found."""
