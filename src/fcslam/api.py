@@ -10,10 +10,12 @@ from fcslam import sources
 from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
+from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission import Live, MissionConfig, Watch, continued_config, run_mission
 from fcslam.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
+from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
 
@@ -82,7 +84,8 @@ def map_recordings(
         prepare_output(Path(output), force)
     earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
-    robots = split_recordings(_opened(recordings, bag_options, at_least=0 if earlier else 1), split)
+    opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=0 if earlier else 1)
+    robots = split_recordings(opened, split)
     drive = side_by_side(processes)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
@@ -190,8 +193,13 @@ def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
     return sources.split(recordings[0], parts)
 
 
-def _opened(recordings: Recordings, options: BagOptions | None, at_least: int = 1) -> list[Source]:
-    """The recordings as sources, each checked as far as can be without reading the ranges."""
+def _opened(
+    recordings: Recordings, options: BagOptions | None, config: LidarConfig | None = None, at_least: int = 1
+) -> list[Source]:
+    """The recordings as sources, each checked as far as can be without reading the ranges.
+
+    With the settings of the LiDAR, bags are calibrated.
+    """
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
     named: list[tuple[StrPath | Source, str | None]] = (
@@ -204,10 +212,11 @@ def _opened(recordings: Recordings, options: BagOptions | None, at_least: int = 
     opened = iter(
         sources.open_fleet([(Path(item), name) for item, name in named if isinstance(item, str | os.PathLike)], options)
     )
-    return [_checked(next(opened)) if isinstance(item, str | os.PathLike) else item for item, _ in named]
+    return [_checked(next(opened), config) if isinstance(item, str | os.PathLike) else item for item, _ in named]
 
 
-def _checked(source: Source) -> Source:
+def _checked(source: Source, config: LidarConfig | None) -> Source:
+    source = source if config is None else calibrated(source, config)
     survey = source.survey()
     for note in survey.notes:
         _log.info("%s: %s", source.name, note)

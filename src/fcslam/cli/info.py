@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.output import answers, print_line
+from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import CameraTopic, LaserPose, OdomTopic, ScanTopic, bag_options
 from fcslam.errors import printable
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from fcslam.records import LaserModel
+    from fcslam.sources import BagOptions
     from fcslam.sources.inspection import Inspection, LaserContents
 
 GAPS_SHOWN = 3
@@ -25,6 +26,14 @@ def info(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
     *,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    calibrate: Annotated[
+        bool,
+        typer.Option(
+            "--calibrate",
+            help="Estimate clocks, beam times, the mounting of the laser and the scale of odometry from the motion in "
+            "a bag.",
+        ),
+    ] = False,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
     camera_topic: CameraTopic = None,
@@ -33,13 +42,45 @@ def info(
     """Say what is in a recording, and whether it can be mapped; if not, why."""
     from fcslam.sources.inspection import inspect
 
-    found = inspect(recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
+    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
+    found = inspect(recording, options)
     console = answers()
     if as_json:
         print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
         return
-    for line in _lines(found):
+    calibration = _calibration(recording, options) if calibrate and found.problem is None else ()
+    for line in (*_lines(found), *calibration):
         print_line(console, printable(line))
+
+
+def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":
+    from fcslam.cli.warm_up import compiled
+    from fcslam.lidar.frontend import LidarConfig
+    from fcslam.robot.calibrating import calibrate_bag
+    from fcslam.sources import open_source
+    from fcslam.sources.bags.rosbag import RosBag
+
+    source = open_source(recording, options)
+    if not isinstance(source, RosBag):
+        yield "calibration: of ROS bags only"
+        return
+    with compiled(notices(quiet=False)):
+        found = calibrate_bag(source, LidarConfig())
+    estimated = found.calibration
+    mounting = estimated.mounting or (None, None, None)
+    yield "calibration from motion (standard deviation):"
+    for name, estimate, factor, unit in (
+        ("odometry's clock ahead of the scans'", estimated.delay, 1e3, "ms"),
+        ("turn by scans per turn by odometry", estimated.turn_scale, 1.0, ""),
+        ("distance by scans per distance by odometry", estimated.distance_scale, 1.0, ""),
+        ("duration of a scan as a share of the time assumed", estimated.sweep_share, 1.0, ""),
+        ("laser off along x", mounting[0], 1.0, "m"),
+        ("laser off along y", mounting[1], 1.0, "m"),
+        ("laser turned to the left", mounting[2], 180.0 / math.pi, "deg"),
+    ):
+        value, sigma = (None, None) if estimate is None else (factor * estimate.value, factor * estimate.sigma)
+        yield f"  {name}: " + ("unknown" if value is None else f"{value:.3f} ({sigma:.3f}) {unit}".rstrip())
+    yield from (f"  {line}" for line in found.lines)
 
 
 def _lines(found: "Inspection") -> "Iterator[str]":

@@ -112,6 +112,7 @@ def map_recordings(
         from fcslam.errors import InputError
         from fcslam.mission import continued_config
         from fcslam.mission_file import read_mission
+        from fcslam.robot.calibrating import calibrated
         from fcslam.runs import prepare_output, read_vetoes
 
         output = output or new_folder(RUNS)
@@ -122,7 +123,9 @@ def map_recordings(
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
-        sources = split_recordings(open_recordings(logs or [], options), split)
+        with compiled(notices(quiet)):
+            opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
+        sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
     with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:

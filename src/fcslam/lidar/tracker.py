@@ -28,6 +28,8 @@ direction. Along a bare wall the points hardly distinguish poses, and the patter
 """
 USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
+LARGEST_VELOCITY = 30.0
+"""Of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
 _NO_INFORMATION = np.zeros((3, 3))
 
 
@@ -268,7 +270,7 @@ def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
     """The sweep with its velocity moved by a correction, shape (3,)."""
     if sweep is None:
         return None
-    x, y, theta = (np.array(sweep.velocity) + velocity).tolist()
+    x, y, theta = np.clip(np.array(sweep.velocity) + velocity, -LARGEST_VELOCITY, LARGEST_VELOCITY).tolist()
     return sweep._replace(velocity=(x, y, theta))
 
 

@@ -41,6 +41,8 @@ class OdometryGate:
         """The present frame ``odom`` in the first one, shape (3,); None before the first jump."""
         self._motion = np.array((LEAST_BRIDGE_M, 0.0, 0.0))
         """The last motion between two scans of a robot that moved."""
+        self._velocity = (0.0, 0.0, 0.0)
+        """In the last sweep without a jump."""
 
     def scan(self, scan: LaserScan) -> LaserScan:
         """The next scan, with its odometry free of jumps."""
@@ -58,9 +60,22 @@ class OdometryGate:
             elif math.hypot(motion[0], motion[1]) > LEAST_BRIDGE_M or abs(motion[2]) > LEAST_BRIDGE_RAD:
                 self._motion = motion
         self._last = scan.stamp, read
+        scan = self._with_possible_sweep(scan)
         if self._bridge is None and read is scan.T_odom_base:
             return scan
         return replace(scan, T_odom_base=frozen(self.bridged(read)))
+
+    def _with_possible_sweep(self, scan: LaserScan) -> LaserScan:
+        """The scan; if odometry jumped during its sweep, with the velocity in the sweep before."""
+        sweep, limits = scan.sweep, self._limits
+        if sweep is None:
+            return scan
+        mean = sweep.displacement(sweep.duration_s) / sweep.duration_s
+        fastest = np.maximum(np.abs(sweep.velocity), np.abs(mean))
+        if math.hypot(fastest[0], fastest[1]) <= limits.speed_m_s and fastest[2] <= limits.turn_rad_s:
+            self._velocity = sweep.velocity
+            return scan
+        return replace(scan, sweep=sweep._replace(velocity=self._velocity, acceleration=(0.0, 0.0, 0.0)))
 
     def image(self, image: CameraImage) -> CameraImage:
         """An image taken since the last scan, with its odometry in the same frame."""

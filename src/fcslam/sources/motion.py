@@ -1,18 +1,27 @@
 """The motion of a robot during a scan, from the odometry around it."""
 
 from collections.abc import Sequence
+from math import hypot
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.records import Sweep
-from fcslam.sources.pose import Pose
+from fcslam.sources.pose import Pose, relative_pose
 
 SAMPLES: Final = 9
 """Poses by odometry that the motion during a sweep is fitted to."""
 LARGEST_ACCELERATION: Final = 50.0
 """Largest acceleration of a robot, m/s^2 and rad/s^2; odometry that jumps shows more."""
+
+
+FEWEST_REPEATS: Final = 2
+"""Repeats between two updates of odometry that is updated too rarely."""
+LONGEST_UPDATE_S: Final = 0.35
+"""A robot whose odometry does not change for longer stands still."""
+LEAST_STEP_M, LEAST_STEP_RAD = 0.005, 0.005
+"""A smaller change is that of an encoder at a low speed."""
 
 
 class Reading(Protocol):
@@ -25,6 +34,36 @@ class Reading(Protocol):
     @property
     def T_odom_base(self) -> Pose:
         """Metres and radians."""
+
+
+class OdometryUpdates:
+    """Finds readings that repeat an older pose, of odometry that is published more often than it is updated.
+
+    Such odometry stays and jumps while the robot moves. It says where the robot was when it changed; between two
+    changes, the pose is interpolated. Readings of a robot at rest repeat as well, but for longer.
+    """
+
+    def __init__(self) -> None:
+        self._period_s = 0.0
+        """Longest time between two updates of a moving robot; 0 if every reading is an update."""
+        self._update: tuple[float, Pose] | None = None
+        """Stamp and pose of the newest reading that differs from the one before."""
+        self._repeats = 0
+
+    def is_fresh(self, stamp: float, T_odom_base: Pose) -> bool:
+        """Whether the next reading says where the robot is at its stamp."""
+        if self._update is not None:
+            changed_s, pose = self._update
+            held_s = stamp - changed_s
+            if T_odom_base == pose:
+                self._repeats += 1
+                return not 0.0 <= held_s <= self._period_s
+            x, y, theta = relative_pose(pose, T_odom_base)
+            is_step = hypot(x, y) > LEAST_STEP_M or abs(theta) > LEAST_STEP_RAD
+            if self._repeats >= FEWEST_REPEATS and 0.0 < held_s <= LONGEST_UPDATE_S and is_step:
+                self._period_s = max(self._period_s, held_s)
+        self._update, self._repeats = (stamp, T_odom_base), 0
+        return True
 
 
 class _Track(NamedTuple):

@@ -24,6 +24,12 @@ def interpolated_pose(T_a_b: Pose, T_a_c: Pose, share: float) -> Pose:
     return x, y, remainder(T_a_b[2] + share * remainder(T_a_c[2] - T_a_b[2], tau), tau)
 
 
+def pose_of(array: FloatArray) -> Pose:
+    """The pose of an array of shape (3,)."""
+    x, y, theta = array.tolist()
+    return x, y, theta
+
+
 def pose_array(pose: Pose) -> FloatArray:
     """The pose as a read-only array, shape (3,)."""
     array = np.array(pose, dtype=np.float64)

@@ -1,12 +1,25 @@
 """Options for reading a bag."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from fcslam.sources.pose import Pose
 
 NO_ODOMETRY: Final = "none"
 """In place of a topic of odometry: none is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What the motion in a bag says against its messages."""
+
+    odometry_delay_s: float = 0.0
+    """Stamps of the odometry are this much later than those of scans made at the same time."""
+    sweep: tuple[float, float] | None = None
+    """Times of the first and the last beam after the stamp of a scan, beams counter-clockwise; equal: all beams are
+    measured at once. None: as the messages say."""
+    mounting: Pose = (0.0, 0.0, 0.0)
+    """``C`` of the true ``T_base_laser = C T_base_laser``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,3 +33,4 @@ class BagOptions:
     camera_topic: str | None = None
     laser_poses: tuple[Pose, ...] = ()
     """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf."""
+    correction: Correction = field(default_factory=Correction)

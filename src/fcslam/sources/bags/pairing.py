@@ -20,7 +20,7 @@ from typing import NamedTuple
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
-from fcslam.sources.motion import moving_sweep
+from fcslam.sources.motion import OdometryUpdates, moving_sweep
 from fcslam.sources.pose import UNKNOWN_POSE, Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
@@ -74,6 +74,7 @@ class OdometryPairing:
     def __init__(self) -> None:
         self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
         self._queue: deque[_QueuedItem] = deque()
+        self._updates = OdometryUpdates()
         self.images_ahead_s = 0.0
         """By how much the newest image that held a scan was ahead of the odometry; 0 without one."""
 
@@ -86,8 +87,9 @@ class OdometryPairing:
         """Add the next item; yields those that wait no longer, in their order."""
         readings, queue = self._readings, self._queue
         if isinstance(item, OdometryReading):
-            _assign_poses(queue, readings[-1] if readings else None, item)
-            readings.append(item)
+            if self._updates.is_fresh(item.stamp, item.T_odom_base):
+                _assign_poses(queue, readings[-1] if readings else None, item)
+                readings.append(item)
             queue.append(_QueuedItem(number, item, _PoseMatch(item.T_odom_base, None)))
         else:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))

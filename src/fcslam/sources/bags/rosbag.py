@@ -6,15 +6,17 @@ shows that there is odometry.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
+from fcslam.geometry import se2
 from fcslam.records import CameraModel, Odometry, SensorRecord
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import OdometryReading
-from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.options import BagOptions, Correction
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
     USUAL_BASES,
@@ -51,6 +53,7 @@ class RosBag:
         self.name = name
         self._notes = notes
         self._options = options or BagOptions()
+        """The options by which it is read."""
         self._check_options(path)
         self.stream = BagStream(path, self._options)
         self._audit = _audit()
@@ -109,7 +112,7 @@ class RosBag:
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
-        mountings = self._mountings(tree, base_frame)
+        mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
         camera, camera_notes = self._camera(tree, base_frame)
         tilts = (
             self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
@@ -162,6 +165,18 @@ class RosBag:
                 )
         return [self._mounting(laser.topic.name, laser.first.frame, tree, base_frame) for laser in lasers]
 
+    @property
+    def is_upside_down(self) -> bool:
+        """Whether the first laser is."""
+        return self._reading.rig.upside_down[0]
+
+    def corrected(self, correction: Correction, notes: tuple[str, ...]) -> "RosBag":
+        """The same bag, read with a correction that ``notes`` explain."""
+        if self._options.laser_poses:
+            correction = replace(correction, mounting=(0.0, 0.0, 0.0))
+        options = replace(self._options, correction=correction)
+        return RosBag(self.stream.path, self.name, options, (*self._notes, *notes))
+
     def _mounting(self, topic: str, laser_frame: str, tree: TransformTree, base_frame: str) -> Mounting:
         try:
             return level_mounting(tree, base_frame, laser_frame)
@@ -198,6 +213,11 @@ def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]
     """
     agreed, notes = agree_on_topics([bag.stream.candidates for bag in bags], options or BagOptions())
     return [RosBag(bag.stream.path, bag.name, agreed, () if k else notes) for k, bag in enumerate(bags)]
+
+
+def _moved(mounted: Mounting, correction: Correction) -> Mounting:
+    x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
+    return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
 
 
 def _audit() -> Audit:

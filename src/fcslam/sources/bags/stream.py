@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
+from fcslam.records import Sweep
 from fcslam.sources.bags.camera import (
     Calibration,
     ImageMessage,
@@ -164,16 +165,31 @@ class BagStream:
         """Decode one message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
             scan = scan_of(self._bag.decode(message), message.bag_time_ns)
-            return [scan._replace(laser=self.topics.scans.index(message.topic))]
+            return [self._corrected(scan)._replace(laser=self.topics.scans.index(message.topic))]
         if message.topic == self.topics.camera:
             return [self._image_in(message)]
         if message.topic.type == ODOMETRY:
-            return [odometry_of(self._bag.decode(message), message.bag_time_ns)]
+            return [self._in_time(odometry_of(self._bag.decode(message), message.bag_time_ns))]
         transforms = self._transforms_in(message)
         if tree is not None:
             for transform in transforms:
                 tree.add(transform.parent, transform.child, transform.T_parent_child)
-        return [] if self.odometry is None else list(self.odometry.readings_in(message.topic, transforms))
+        readings = () if self.odometry is None else self.odometry.readings_in(message.topic, transforms)
+        return [self._in_time(reading) for reading in readings]
+
+    def _in_time(self, reading: OdometryReading) -> OdometryReading:
+        """The reading with its stamp by the clock of the scans."""
+        return reading._replace(stamp=reading.stamp - self._options.correction.odometry_delay_s)
+
+    def _corrected(self, scan: ScanMessage) -> ScanMessage:
+        """The scan with the times of its beams as they were found."""
+        times = self._options.correction.sweep
+        return scan if times is None else scan._replace(sweep=Sweep(*times) if times[0] != times[1] else None)
+
+    @property
+    def states_sweep(self) -> bool:
+        """Whether the messages of the first laser say when the beams are measured."""
+        return self.lasers[0].first.sweep is not None
 
     @cached_property
     def odometry(self) -> "OdometryInput | None":

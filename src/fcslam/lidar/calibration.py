@@ -1,0 +1,195 @@
+"""Calibration from motion: what the scans of a drive say about stamps, odometry and the mounting of the laser.
+
+The scans are tracked without odometry. Their motion is then compared with that of odometry, by robust least squares:
+
+- heading: ``turn_scale * (turn by odometry from t_k + delay to t_l + delay) = turn by the scans from k to l``;
+- position: ``M C = C B`` with the motion M by odometry, B by the scans, and the correction C of the mounting (A. Censi
+  et al., "Simultaneous calibration of odometry and sensor parameters for mobile robots", T-RO 2013);
+- sweep: ``share * (turn by odometry in the assumed sweep) = turn in the sweep, as the scans were matched``.
+"""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.records import FloatArray
+
+LEAST_TURN_RAD: Final = 0.15
+LEAST_MOVE_M: Final = 0.15
+"""Two scans are compared once the robot has turned or moved by so much."""
+LONGEST_S: Final = 2.0
+"""Scans farther apart in time are not compared: odometry drifts."""
+FEWEST_TURNS: Final = 20
+FEWEST_MOTIONS: Final = 30
+"""Fewer turns and motions say nothing."""
+LARGEST_DELAY_S: Final = 0.4
+DELAY_STEP_S: Final = 0.01
+"""Range and step of the search for the delay, before it is refined."""
+HUBER: Final = 1.5
+"""Residuals beyond this many standard deviations count less."""
+CORRELATED: Final = 3.0
+"""Standard deviations are larger by this: residuals that follow each other are alike."""
+
+
+Pairs = NDArray[np.int64]
+
+
+class Estimate(NamedTuple):
+    """A number that was estimated."""
+
+    value: float
+    sigma: float
+    """Standard deviation."""
+
+    def differs(self, nominal: float, least: float, sigmas: float = 4.0) -> bool:
+        """Whether it is significantly not ``nominal``, and by more than ``least``."""
+        return abs(self.value - nominal) > max(least, sigmas * self.sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMotions:
+    """The scans of a drive as they were tracked without odometry, N of them."""
+
+    stamps: FloatArray
+    """Shape (N,), seconds."""
+    T_local_base: FloatArray
+    """Poses at the stamps, shape (N, 3), metres and radians; NaN starts a new track."""
+    turned_rad: FloatArray
+    """Turn in each sweep, shape (N,), as the scan was matched; NaN for a scan at once."""
+    sweep_s: FloatArray
+    """Assumed duration of each sweep, shape (N,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryTrack:
+    """Poses by wheel odometry with growing stamps."""
+
+    stamps: FloatArray
+    """Shape (M,), seconds."""
+    T_odom_base: FloatArray
+    """Shape (M, 3), headings unwrapped."""
+
+    def at(self, stamps: FloatArray) -> FloatArray:
+        """Interpolated poses, shape (K, 3)."""
+        return np.stack([np.interp(stamps, self.stamps, axis) for axis in self.T_odom_base.T], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What a drive says about the robot; None where it says nothing."""
+
+    delay: Estimate | None = None
+    """Time by the clock of the odometry at a stamp of the scans, less this stamp, seconds."""
+    turn_scale: Estimate | None = None
+    """Turn by the scans per turn by odometry."""
+    distance_scale: Estimate | None = None
+    """Distance by the scans per distance by odometry."""
+    mounting: tuple[Estimate, Estimate, Estimate] | None = None
+    """Correction of the pose of the laser, in ``base``: x and y in metres, heading in radians."""
+    sweep_share: Estimate | None = None
+    """True duration of a sweep per assumed duration."""
+
+
+def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> Calibration:
+    """Compare the motion of the scans with that of the odometry."""
+    pairs = _pairs(motions)
+    turned = np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD
+    if np.count_nonzero(turned) < FEWEST_TURNS:
+        return Calibration()
+    delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
+    share = _sweep_share(motions, odometry, delay.value)
+    calibration = Calibration(delay, turn_scale, sweep_share=share)
+    if len(pairs) < FEWEST_MOTIONS:
+        return calibration
+    distance_scale, mounting = _mounting(motions, odometry, pairs, delay.value, turn_scale.value)
+    return Calibration(delay, turn_scale, distance_scale, mounting, share)
+
+
+def _pairs(motions: ScanMotions) -> Pairs:
+    """Pairs (k, l) of scans of one track, one after the other, with enough motion between them, shape (P, 2)."""
+    pairs: list[tuple[int, int]] = []
+    first = 0
+    poses, stamps = motions.T_local_base, motions.stamps
+    for k in range(1, len(stamps)):
+        step = se2.between(poses[first], poses[k])
+        if np.isnan(step[0]) or stamps[k] - stamps[first] > LONGEST_S or stamps[k] <= stamps[first]:
+            first = k
+        elif abs(step[2]) > LEAST_TURN_RAD or np.hypot(step[0], step[1]) > LEAST_MOVE_M:
+            pairs.append((first, k))
+            first = k
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _turn(motions: ScanMotions, pairs: Pairs) -> FloatArray:
+    return np.asarray(se2.wrap_angle(motions.T_local_base[pairs[:, 1], 2] - motions.T_local_base[pairs[:, 0], 2]))
+
+
+def _delay_and_scale(motions: ScanMotions, odometry: OdometryTrack, pairs: Pairs) -> tuple[Estimate, Estimate]:
+    """Gauss-Newton over the delay and the scale of turns, from the best delay of a search."""
+    turned, begins, ends = _turn(motions, pairs), motions.stamps[pairs[:, 0]], motions.stamps[pairs[:, 1]]
+
+    def turned_by_odometry(delay_s: float) -> FloatArray:
+        return np.asarray(odometry.at(ends + delay_s)[:, 2] - odometry.at(begins + delay_s)[:, 2])
+
+    delays = np.arange(-LARGEST_DELAY_S, LARGEST_DELAY_S + DELAY_STEP_S / 2, DELAY_STEP_S)
+    delay_s = float(min(delays, key=lambda delay: float(np.abs(turned - turned_by_odometry(delay)).sum())))
+    scale = 1.0
+    covariance = np.eye(2)
+    for _ in range(8):
+        by_odometry = turned_by_odometry(delay_s)
+        later, earlier = turned_by_odometry(delay_s + DELAY_STEP_S), turned_by_odometry(delay_s - DELAY_STEP_S)
+        rate = scale * (later - earlier) / (2.0 * DELAY_STEP_S)
+        step, covariance = _robust(np.stack((rate, by_odometry), axis=1), turned - scale * by_odometry)
+        delay_s, scale = delay_s + float(step[0]), scale + float(step[1])
+    sigmas = np.sqrt(np.diag(covariance))
+    return Estimate(delay_s, float(sigmas[0])), Estimate(scale, float(sigmas[1]))
+
+
+def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) -> Estimate | None:
+    """Share of the assumed duration in which the beams were measured, by the turns in the sweeps."""
+    known = np.isfinite(motions.turned_rad)
+    begins, duration_s = motions.stamps[known] + delay_s, motions.sweep_s[known]
+    by_odometry = odometry.at(begins + duration_s)[:, 2] - odometry.at(begins)[:, 2]
+    turning = np.abs(by_odometry) > 0.25 * LEAST_TURN_RAD
+    if np.count_nonzero(turning) < FEWEST_TURNS:
+        return None
+    (share,), covariance = _robust(by_odometry[turning, None], motions.turned_rad[known][turning])
+    return Estimate(float(share), float(np.sqrt(covariance[0, 0])))
+
+
+def _mounting(
+    motions: ScanMotions, odometry: OdometryTrack, pairs: Pairs, delay_s: float, turn_scale: float
+) -> tuple[Estimate, tuple[Estimate, Estimate, Estimate]]:
+    """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g)."""
+    first, last = pairs.T
+    moved = se2.between(odometry.at(motions.stamps[first] + delay_s), odometry.at(motions.stamps[last] + delay_s))
+    seen = se2.between(motions.T_local_base[first], motions.T_local_base[last])
+    cos, sin = np.cos(turn_scale * moved[:, 2]), np.sin(turn_scale * moved[:, 2])
+    rows_x = np.stack((1.0 - cos, sin, seen[:, 0], -seen[:, 1]), axis=1)
+    rows_y = np.stack((-sin, 1.0 - cos, seen[:, 1], seen[:, 0]), axis=1)
+    design, target = np.concatenate((rows_x, rows_y)), np.concatenate((moved[:, 0], moved[:, 1]))
+    (x, y, a, b), covariance = _robust(design, target)
+    scale = 1.0 / max(float(np.hypot(a, b)), 1e-9)
+    sigma_x, sigma_y, sigma_a, sigma_b = np.sqrt(np.diag(covariance)).tolist()
+    sigma = scale * float(np.hypot(sigma_a, sigma_b))
+    mounting = (
+        Estimate(float(scale * x), scale * sigma_x), Estimate(float(scale * y), scale * sigma_y),
+        Estimate(float(np.arctan2(b, a)), sigma),
+    )  # fmt: skip
+    return Estimate(scale, scale * sigma), mounting
+
+
+def _robust(design: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Huber's least squares of ``design x = target``, reweighted; returns x and its covariance."""
+    weights = np.ones(len(target))
+    for _ in range(10):
+        normal = design.T @ (weights[:, None] * design) + 1e-9 * np.eye(design.shape[1])
+        inverse = np.linalg.inv(normal)
+        x = inverse @ (design.T @ (weights * target))
+        residual = np.abs(target - design @ x)
+        sigma = max(1.4826 * float(np.median(residual)), 1e-9)
+        weights = np.asarray(np.minimum(1.0, HUBER * sigma / np.maximum(residual, 1e-12)))
+    return x, np.asarray((CORRELATED * sigma) ** 2 * inverse)

@@ -1,0 +1,221 @@
+"""Calibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with that."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from math import degrees
+from typing import Final
+
+import numpy as np
+
+from fcslam.lidar.calibration import Calibration, Estimate, OdometryTrack, ScanMotions, calibrate
+from fcslam.lidar.frontend import LidarConfig, LidarFrontend
+from fcslam.records import FloatArray, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.robot.mapped_scans import MappedScans
+from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
+from fcslam.sources.bags.options import Correction
+from fcslam.sources.bags.rosbag import RosBag
+from fcslam.sources.motion import OdometryUpdates
+from fcslam.sources.pose import pose_of
+from fcslam.sources.source import Source
+
+MOST_SCANS: Final = 1200
+"""Scans that are tracked at most."""
+ENOUGH_TURN_RAD: Final = 40.0
+"""Turns, all together, after which no more scans are tracked."""
+LARGEST_SCALE: Final = 2.0
+"""Odometry that turns more or less than the scans by a larger factor measures something else."""
+LONGEST_PERIOD_S: Final = 0.12
+"""Odometry that comes more seldom says nothing about delays: it is interpolated."""
+LEAST_DELAY_S: Final = 0.004
+LEAST_YAW_RAD: Final = 0.005
+LEAST_OFFSET_M: Final = 0.02
+LEAST_SCALE: Final = 0.01
+LEAST_SHARE: Final = 0.1
+"""Smaller differences from what the bag says are not corrected."""
+AT_ONCE_SHARE: Final = 0.15
+"""Beams that take a smaller share of the time between scans are measured at once."""
+STAMP_TOLERANCE_S: Final = 0.005
+"""Tolerance by which a delay is that of a stamp in the middle or at the end of a scan, and not of another clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What the motion in a bag says, and what of it is corrected."""
+
+    calibration: Calibration
+    correction: Correction
+    lines: tuple[str, ...]
+    """What is corrected and how sure it is, one sentence each."""
+
+
+def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
+    """Estimate the timing and the mounting of the first laser of a bag with one laser.
+
+    Raises:
+        SourceError: the bag cannot be mapped.
+    """
+    survey = bag.survey()
+    assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
+    if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:
+        return Calibrated(Calibration(), Correction(), ())
+    motions, odometry = _tracked(bag.records(), config, assumed_s)
+    if len(motions.stamps) < 2:
+        return Calibrated(Calibration(), Correction(), ())
+    if odometry is None:
+        odometry = OdometryTrack(motions.stamps, _unwrapped(motions.T_local_base))
+        calibration = Calibration(sweep_share=calibrate(motions, odometry).sweep_share)
+    else:
+        calibration = calibrate(motions, odometry)
+    scale = calibration.turn_scale
+    if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
+        return Calibrated(calibration, Correction(), _contradiction(scale))
+    if odometry is not None and np.median(np.diff(odometry.stamps)) > LONGEST_PERIOD_S:
+        calibration = replace(calibration, delay=None)
+    found = _corrected(calibration, float(np.median(motions.sweep_s)), bag.stream.states_sweep)
+    sweep = found.correction.sweep
+    if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
+        found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
+    return found
+
+
+def _contradiction(scale: Estimate) -> tuple[str, ...]:
+    """Lines that say what is wrong if the turns of the scans are not at all those of odometry."""
+    if abs(scale.value + 1.0) < 0.3:
+        return (
+            "the scans turn against the odometry: the laser is mounted upside down, or the heading of the odometry has "
+            "the wrong sign; not corrected: correct the mounting in tf, or the driver, or give --odom-topic none",
+        )
+    return (
+        f"the turns of the scans are {scale.value:.2f} (+- {scale.sigma:.2f}) of what odometry says: they are not of "
+        "one robot, or one of both is broken; not corrected: choose the topics by --scan-topic and --odom-topic",
+    )
+
+
+def calibrated(source: Source, config: LidarConfig) -> Source:
+    """A bag with what its motion says against its messages; another recording as it is.
+
+    Raises:
+        SourceError: the bag cannot be mapped.
+    """
+    if not isinstance(source, RosBag):
+        return source
+    found = calibrate_bag(source, config)
+    lines = tuple(f"{source.stream.path}: {line}" for line in found.lines)
+    return source.corrected(found.correction, lines) if lines else source
+
+
+def _tracked(
+    records: Iterator[SensorRecord], config: LidarConfig, assumed_s: float
+) -> tuple[ScanMotions, OdometryTrack | None]:
+    """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
+    frontend = LidarFrontend("calibration", without_odometry(config))
+    prediction, mapped = MotionPrediction(), MappedScans()
+    unknown = np.full(3, np.nan)
+    stamps: list[float] = []
+    poses: list[FloatArray] = []
+    turned: list[float] = []
+    durations: list[float] = []
+    odometry: list[Odometry] = []
+    turn_rad = 0.0
+    for record in records:
+        if isinstance(record, Odometry):
+            odometry.append(record)
+        if not isinstance(record, LaserScan):
+            continue
+        if len(stamps) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
+            break
+        times = Sweep(0.0, assumed_s) if record.sweep is None else Sweep(record.sweep.first_s, record.sweep.last_s)
+        scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=times)))
+        tracked = frontend.localize(scan)
+        frontend.process(scan, tracked)
+        sweep, is_matched = tracked.tracked.sweep, bool(tracked.tracked.information.any())
+        assert sweep is not None
+        prediction.observe(scan.stamp, tracked.tracked.T_local_base if is_matched else None, sweep)
+        turn = float(sweep.displacement(sweep.last_s)[2] - sweep.displacement(sweep.first_s)[2])
+        stamps.append(scan.stamp)
+        poses.append(tracked.tracked.T_local_base if is_matched or not stamps else unknown)
+        turned.append(turn if is_matched else np.nan)
+        durations.append(sweep.last_s - sweep.first_s)
+        turn_rad += abs(turn)
+    motions = ScanMotions(np.array(stamps), np.array(poses).reshape(-1, 3), np.array(turned), np.array(durations))
+    return motions, _track_of(odometry)
+
+
+def _track_of(odometry: list[Odometry]) -> OdometryTrack | None:
+    """The updates with growing stamps; None without any."""
+    updates = OdometryUpdates()
+    fresh = [reading for reading in odometry if updates.is_fresh(reading.stamp, pose_of(reading.T_odom_base))]
+    if not fresh:
+        return None
+    stamps = np.array([reading.stamp for reading in fresh])
+    grows = np.concatenate(([True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]))
+    poses = np.array([reading.T_odom_base for reading in fresh])
+    return OdometryTrack(stamps[grows], _unwrapped(poses[grows]))
+
+
+def _unwrapped(poses: FloatArray) -> FloatArray:
+    known = poses.copy()
+    known[:, 2] = np.unwrap(known[:, 2])
+    return known
+
+
+def _corrected(calibration: Calibration, assumed_s: float, states_sweep: bool) -> Calibrated:
+    """What is significant, as a correction and in words."""
+    correction, lines = Correction(), []
+    delay, sweep_share, turn_scale = calibration.delay, calibration.sweep_share, calibration.turn_scale
+    share = None
+    if sweep_share is not None:  # odometry's scale is in both
+        scale = 1.0 if turn_scale is None else turn_scale.value
+        share = Estimate(sweep_share.value / scale, sweep_share.sigma / abs(scale))
+    nominal = 1.0 if states_sweep else 0.0
+    first_s = 0.0 if delay is None or not delay.differs(0.0, LEAST_DELAY_S) else delay.value
+    taken = nominal if share is None or not share.differs(nominal, LEAST_SHARE) else share.value
+    last_s = first_s + (0.0 if abs(taken) < AT_ONCE_SHARE else taken) * assumed_s
+    earliest_s, latest_s = min(first_s, last_s), max(first_s, last_s)
+    stamped = next(
+        (
+            where
+            for where, time_s in (("first", earliest_s), ("last", latest_s), ("middle", 0.5 * (earliest_s + latest_s)))
+            if abs(time_s) <= STAMP_TOLERANCE_S
+        ),
+        None,
+    )
+    if stamped is None:
+        assert delay is not None
+        correction = replace(correction, odometry_delay_s=earliest_s)
+        lines.append(f"the clock of the odometry is {1e3 * earliest_s:.0f} ms ahead of that of the scans; corrected")
+        first_s, last_s, stamped = first_s - earliest_s, last_s - earliest_s, "first"
+    if (last_s - first_s != nominal * assumed_s) or stamped != "first":
+        correction = replace(correction, sweep=(first_s, last_s))
+        if abs(last_s - first_s) > 0.0:
+            lines.append(
+                f"a scan takes {1e3 * abs(last_s - first_s):.0f} ms{' clockwise' * (last_s < first_s)}, and its stamp "
+                f"is that of the {stamped} beam; used"
+            )
+        else:
+            lines.append("all beams of a scan are measured at once; used")
+    return _mounted(calibration, correction, lines)
+
+
+def _mounted(calibration: Calibration, correction: Correction, lines: list[str]) -> Calibrated:
+    for name, scale in (("distance", calibration.distance_scale), ("turn", calibration.turn_scale)):
+        if scale is not None and scale.differs(1.0, 5.0 * LEAST_SCALE):
+            lines.append(f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f})")
+    if calibration.mounting is None:
+        return Calibrated(calibration, correction, tuple(lines))
+    x, y, yaw = calibration.mounting
+    moved = [0.0, 0.0, 0.0]
+    if yaw.differs(0.0, LEAST_YAW_RAD):
+        side = "left" if yaw.value > 0.0 else "right"
+        lines.append(
+            f"the laser is mounted {degrees(abs(yaw.value)):.1f} deg (+- {degrees(yaw.sigma):.1f}) to the {side} of "
+            "what tf says; used"
+        )
+        moved[2] = yaw.value
+    if x.differs(0.0, LEAST_OFFSET_M) or y.differs(0.0, LEAST_OFFSET_M):
+        lines.append(
+            f"the laser is mounted {x.value:+.2f} m (+- {x.sigma:.2f}) along x and {y.value:+.2f} m (+- {y.sigma:.2f}) "
+            "along y from where tf says; used"
+        )
+        moved[0], moved[1] = x.value, y.value
+    return Calibrated(calibration, replace(correction, mounting=(moved[0], moved[1], moved[2])), tuple(lines))

@@ -1,0 +1,58 @@
+"""The motion during a scan by odometry, and odometry that is updated too rarely."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.records import Sweep
+from fcslam.sources.motion import OdometryUpdates, moving_sweep
+
+
+class Reading(NamedTuple):
+    stamp: float
+    T_odom_base: tuple[float, float, float]
+
+
+def turning(stamps, start=(1.0, 2.0, 3.0)):
+    """A robot that accelerates its turn."""
+    return [
+        Reading(float(t), tuple(se2.compose(start, (0.4 * t, 0.0, 0.9 * t + 0.5 * 2.0 * t * t)).tolist()))
+        for t in stamps
+    ]
+
+
+@pytest.mark.parametrize("times", [(0.0, 0.14), (-0.14, 0.0), (0.14, 0.0), (-0.07, 0.07)])
+def test_the_sweep_has_the_motion_of_the_odometry(times):
+    readings = turning(np.arange(0.0, 2.0, 0.01))
+    sweep = moving_sweep(Sweep(*times), 1.0, readings)
+    at = {round(reading.stamp, 3): reading.T_odom_base for reading in readings}
+    for t in np.linspace(*sorted(times), 5):
+        expected = se2.between(at[1.0], at[round(1.0 + round(float(t), 2), 3)])
+        np.testing.assert_allclose(sweep.displacement(round(float(t), 2)), expected, atol=1e-3)
+
+
+def test_odometry_that_ends_within_the_sweep_goes_on():
+    readings = turning(np.arange(0.0, 1.05, 0.01))
+    sweep = moving_sweep(Sweep(0.0, 0.2), 1.0, readings)
+    assert sweep.displacement(0.2)[2] == pytest.approx(0.2 * 2.9 + 0.5 * 2.0 * 0.04, rel=0.1)
+
+
+def test_without_readings_the_robot_stands():
+    assert moving_sweep(Sweep(0.0, 0.14), 1.0, []) == Sweep(0.0, 0.14)
+
+
+def test_readings_that_repeat_are_no_updates():
+    updates = OdometryUpdates()
+    stamps = np.arange(0.0, 3.0, 0.02)
+    fresh = [t for t in stamps if updates.is_fresh(float(t), (0.1 * (t // 0.2), 0.0, 0.0))]
+    late = [t for t in fresh if t > 0.5]
+    assert len(late) == pytest.approx((3.0 - 0.5) / 0.2, abs=2)
+
+
+def test_readings_at_rest_and_at_every_update_are_fresh():
+    updates = OdometryUpdates()
+    moving = [(0.02 * k, (0.01 * k, 0.0, 0.0)) for k in range(50)]
+    resting = [(1.0 + 0.02 * k, (0.5, 0.0, 0.0)) for k in range(100)]
+    assert all(updates.is_fresh(*reading) for reading in moving + resting)
