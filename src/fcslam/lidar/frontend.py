@@ -68,6 +68,13 @@ class KeyscanConfig(Settings):
 class LidarConfig(Settings):
     """The LiDAR front end."""
 
+    scan_duration_s: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="time from the first beam of a scan, which its stamp is that of, to the last; for text logs and "
+        "programs, as bags and ROS messages say it; 0: all beams are measured at once [s]",
+    )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
     tracker: TrackerConfig = Field(default=TrackerConfig(), description="scan-to-submap tracking")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")

@@ -18,10 +18,11 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.errors import FeatureError
+from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, has_moved_unseen, is_doubtful, is_lost
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
-from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
+from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord, Sweep
 from fcslam.robot.backend import (
     BackendInput,
     NewDetector,
@@ -36,7 +37,7 @@ from fcslam.robot.backend import (
 from fcslam.robot.beside import BackendRunner, Inline
 from fcslam.robot.map_localizer import MapLocalizationConfig
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
+from fcslam.robot.motion_prediction import LONGEST_S, MotionPrediction, without_odometry
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.sources.contradictions import CHANGED, changed_share
@@ -216,6 +217,10 @@ class RobotFrontend:
             self.prediction = MotionPrediction()
             self.lidar_config = without_odometry(self.lidar_config)
             self.begin_session()
+        if scan.sweep is None and self.lidar_config.scan_duration_s > 0.0:
+            scan = replace(scan, sweep=Sweep(0.0, self.lidar_config.scan_duration_s))
+            if self.prediction is None and self._previous is not None:
+                scan = _moving_on(scan, self._previous)
         return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
 
     def _is_without_odometry(self, scan: LaserScan) -> bool:
@@ -337,6 +342,15 @@ class RobotFrontend:
         is_known = last is not None and last.lasers == lasers
         hello = Hello(self.robot, done.epoch, lasers, {}) if last is None else replace(last, lasers=lasers)
         return [*([] if is_known else [hello]), *essential(done.input, self._config.sends)]
+
+
+def _moving_on(scan: LaserScan, before: LaserScan) -> LaserScan:
+    """The scan with the velocity since the one before, by odometry, in its sweep."""
+    elapsed_s = scan.stamp - before.stamp
+    if scan.sweep is None or not 0.0 < elapsed_s <= LONGEST_S:
+        return scan
+    x, y, theta = (se2.log(se2.between(before.T_odom_base, scan.T_odom_base)) / elapsed_s).tolist()
+    return replace(scan, sweep=scan.sweep._replace(velocity=(x, y, theta)))
 
 
 def _newest(pose: ScanPose, tracking: TrackingResult, is_deferred: bool) -> NewestScan:
