@@ -1,0 +1,69 @@
+"""A made-up robot with a scanner that spins, in a room with furniture: an oracle for motion during scans."""
+
+import numpy as np
+
+from fcslam.geometry import se2
+from fcslam.records import LaserModel, LaserScan, Sweep, frozen
+
+LASER = LaserModel(180, -np.pi, 2.0 * np.pi / 180, 12.0, (0.1, 0.0, 0.0))
+SCAN_S = 1.0 / 7.0
+SWEEP_S = SCAN_S * 179 / 180
+"""From the first beam to the last."""
+
+
+def _box(x, y, width, depth):
+    return [
+        (x, y, x + width, y),
+        (x + width, y, x + width, y + depth),
+        (x + width, y + depth, x, y + depth),
+        (x, y + depth, x, y),
+    ]
+
+
+WALLS = np.array(
+    _box(-4.0, -3.0, 8.5, 9.2) + _box(1.5, 1.2, 0.8, 0.5) + _box(-2.6, -2.0, 0.5, 1.1) + _box(2.4, -2.3, 1.0, 0.4)
+)
+
+
+def pose_at(stamps):
+    """True pose in ``odom`` at ``stamps``: a winding drive that turns at up to 1.6 rad/s."""
+    dense = np.arange(0.0, 40.0, 0.002)
+    turn = 0.9 * np.sin(0.8 * dense) + 0.7 * np.sin(1.9 * dense)
+    heading = np.cumsum(turn) * 0.002
+    x, y = np.cumsum(0.3 * np.cos(heading)) * 0.002, np.cumsum(0.3 * np.sin(heading)) * 0.002
+    return np.stack([np.interp(stamps, dense, axis) for axis in (x, y, heading)], axis=-1)
+
+
+def ranges_at(stamps, rng):
+    """A range for each beam, measured at its own time ``stamps`` (beam_count,)."""
+    T_odom_laser = se2.compose(pose_at(stamps), LASER.T_base_laser)
+    origins, angles = T_odom_laser[:, :2], T_odom_laser[:, 2] + LASER.angles_rad()
+    ways = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    begins, edges = WALLS[:, :2], WALLS[:, 2:] - WALLS[:, :2]
+    offsets = begins[None] - origins[:, None]
+    cross = ways[:, None, 0] * edges[None, :, 1] - ways[:, None, 1] * edges[None, :, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (offsets[..., 0] * edges[None, :, 1] - offsets[..., 1] * edges[None, :, 0]) / cross
+        share = (offsets[..., 0] * ways[:, None, 1] - offsets[..., 1] * ways[:, None, 0]) / cross
+    along[~((share >= 0.0) & (share <= 1.0) & (along > 0.0))] = np.inf
+    return (along.min(axis=1) + rng.normal(0.0, 0.005, len(angles))).astype(np.float32)
+
+
+def drive(seconds=20.0, states_sweep=True, odometry=None):
+    """Scans of the drive, with odometry ``odometry(stamp)`` at the stamp and in the sweep; None: unknown."""
+    rng = np.random.default_rng(3)
+    for stamp in np.arange(0.0, seconds, SCAN_S):
+        ranges = frozen(ranges_at(stamp + np.linspace(0.0, SWEEP_S, LASER.beam_count), rng), np.float32)
+        pose, sweep = np.full(3, np.nan), Sweep(0.0, SWEEP_S)
+        if odometry is not None:
+            pose = odometry(stamp)
+            velocity = se2.between(pose, odometry(stamp + SWEEP_S)) / SWEEP_S
+            sweep = sweep._replace(velocity=tuple(velocity.tolist()))
+        yield LaserScan(float(stamp), ranges, LASER, frozen(pose), sweep if states_sweep else None)
+
+
+def error_m(track):
+    """Largest distance of a robot's poses from the truth, once both are laid on each other at the first scan."""
+    estimated, true = track.T_odom_base(), pose_at(track.stamps)
+    aligned = se2.between(true[0], true)
+    return float(np.hypot(*(se2.between(estimated[0], estimated)[:, :2] - aligned[:, :2]).T).max())

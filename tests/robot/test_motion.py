@@ -1,0 +1,77 @@
+"""Robots with a scanner that spins: with odometry, without, and with odometry that is wrong."""
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.lidar.frontend import LidarConfig
+from fcslam.records import Keyscan
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from tests.robot import spinning
+
+
+def integrated(scale=1.0, turn=1.0, slip=None):
+    """Odometry that measures the true motion wrongly."""
+    ticks = np.arange(0.0, 25.0, 0.02)
+    steps = se2.relative(spinning.pose_at(ticks)) * (scale, scale, turn)
+    if slip is not None:
+        steps[slip] *= (0.4, 0.4, 0.6)
+    poses = [np.zeros(3)]
+    for step in steps:
+        poses.append(se2.compose(poses[-1], step))
+    known = np.array(poses)
+    known[:, 2] = np.unwrap(known[:, 2])
+    return lambda stamp: np.array([np.interp(stamp, ticks, axis) for axis in known.T])
+
+
+def mapped(scans, config=None):
+    frontend = RobotFrontend("r", config or RobotConfig())
+    packets = [packet for scan in scans for packet in frontend.process(scan)]
+    return frontend, packets + frontend.finish()
+
+
+@pytest.mark.parametrize(
+    ("odometry", "limit_m"),
+    [
+        (spinning.pose_at, 0.02),
+        (integrated(scale=1.15), 0.02),
+        (integrated(turn=1.1), 0.03),
+        (integrated(slip=slice(300, 450)), 0.03),
+        (None, 0.03),
+    ],
+    ids=["right", "15 % too long", "turns 10 % too far", "slips on a carpet", "none"],
+)
+def test_a_scanner_that_spins_maps_a_room(odometry, limit_m):
+    frontend, packets = mapped(spinning.drive(odometry=odometry))
+    assert len(frontend.tracks) == 1
+    assert spinning.error_m(frontend.tracks[0]) < limit_m
+    keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
+    assert all(keyscan.sweep is not None for keyscan in keyscans)
+    turns = [abs(keyscan.sweep.velocity[2]) for keyscan in keyscans]
+    assert max(turns) > 1.0
+
+
+def test_beam_times_that_are_ignored_bend_the_track():
+    frontend, _ = mapped(spinning.drive(odometry=spinning.pose_at, states_sweep=False))
+    assert max(map(spinning.error_m, frontend.tracks)) > 0.03
+
+
+def test_the_duration_of_a_scan_can_be_a_setting():
+    config = RobotConfig(lidar=LidarConfig(scan_duration_s=spinning.SWEEP_S))
+    frontend, _ = mapped(spinning.drive(odometry=spinning.pose_at, states_sweep=False), config)
+    assert len(frontend.tracks) == 1
+    assert spinning.error_m(frontend.tracks[0]) < 0.03
+
+
+def test_odometry_that_never_changes_is_not_used():
+    frontend, _ = mapped(spinning.drive(odometry=lambda _: np.zeros(3)))
+    assert frontend.prediction is not None
+    assert len(frontend.tracks) == 2
+    assert spinning.error_m(frontend.tracks[1]) < 0.1  # it begins in motion, at an unknown velocity
+
+
+def test_a_robot_at_rest_keeps_its_odometry():
+    scan = next(iter(spinning.drive(odometry=spinning.pose_at)))
+    frontend, _ = mapped([scan] * 40)
+    assert frontend.prediction is None
+    assert len(frontend.tracks) == 1
