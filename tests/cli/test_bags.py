@@ -1,11 +1,13 @@
 """`fcslam map` on bags, names for robots, and `fcslam convert`."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fcslam.cli import main
+from fcslam.records import LaserScan, Sweep
 from fcslam.runs import read_tum
 from fcslam.sources import open_source, write_recording
 from tests.sources import carmen_text
@@ -186,6 +188,18 @@ def test_only_force_replaces(tmp_path, bag, capsys, name):
     assert open_source(output).survey().scan_count == 12
     assert run("convert", output, output, "--force") == 0
     assert open_source(output).survey().scan_count == 12
+
+
+def test_the_times_of_beams_are_lost_in_a_carmen_log_alone(tmp_path, capsys):
+    spun = [replace(item, sweep=Sweep(0.0, 0.1)) if isinstance(item, LaserScan) else item for item in camera_drive()]
+    write_recording(tmp_path / "run.fcslam", (LASER,), CAMERA, spun)
+    said = "run.clf: a CARMEN log has no place for the times of beams, they are lost"
+    for name, is_told in (("run.mcap", False), ("run.clf", True)):
+        assert run("convert", tmp_path / "run.fcslam", tmp_path / name) == 0
+        assert (said in capsys.readouterr().err) is is_told
+    assert all(item.sweep for item in open_source(tmp_path / "run.mcap").records() if isinstance(item, LaserScan))
+    assert run("convert", tmp_path / "run.clf", tmp_path / "again.clf") == 0
+    assert "times of beams" not in capsys.readouterr().err
 
 
 def test_images_go_where_there_is_a_place_for_them(tmp_path, capsys):

@@ -51,7 +51,8 @@ def same(before, after):
     if poses[0] != poses[1]:
         return False
     if isinstance(before, LaserScan):
-        return before.laser == after.laser and before.ranges_m.tobytes() == after.ranges_m.tobytes()
+        sensed = before.laser == after.laser and before.ranges_m.tobytes() == after.ranges_m.tobytes()
+        return sensed and before.sweep == after.sweep
     if isinstance(before, CameraImage):
         return before.camera == after.camera and before.encoded == after.encoded
     return True

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
 from fcslam.errors import OutputError, SourceError
-from fcslam.records import LaserModel, LaserScan, Odometry, frozen
+from fcslam.records import LaserModel, LaserScan, Odometry, Sweep, frozen
 from fcslam.sources import open_source, write_bag
 from tests.sources.bag_messages import BEAMS, ROS1, ROS2, drive, save
 from tests.sources.carmen_text import pose_at
@@ -66,6 +66,54 @@ def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records, n
 def straight(count=20, laser=ROUND):
     one = frozen(np.full(laser.beam_count, 2.0), np.float32)
     return [LaserScan(100.0 + 0.2 * k, one, laser, frozen(pose_at(k))) for k in range(count)]
+
+
+def turning(sweep, count=40):
+    """Odometry at 50 Hz and scans of a robot that turns at 1.5 rad/s and drives at 0.5 m/s."""
+    ranges_m = frozen(np.arange(2.0, 2.0 + ROUND.beam_count), np.float32)
+    for k in range(count):
+        stamp, pose = 100.0 + 0.02 * k, frozen((0.01 * k, 0.0, 0.03 * k))
+        yield Odometry(stamp, pose)
+        if k % 10 == 5:
+            yield LaserScan(stamp, ranges_m, ROUND, pose, sweep)
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("sweep", [Sweep(0.0, 0.1), Sweep(0.1, 0.0)], ids=["counter-clockwise", "clockwise"])
+def test_the_times_of_the_beams_come_back_and_the_motion_from_the_odometry(tmp_path, name, sweep):
+    records = list(turning(sweep))
+    write_bag(tmp_path / name, records)
+    scans = [record for record in records if isinstance(record, LaserScan)]
+    read = [record for record in open_source(tmp_path / name).records() if isinstance(record, LaserScan)]
+    for before, after in zip(scans, read, strict=True):
+        assert after.stamp == before.stamp
+        np.testing.assert_allclose(after.T_odom_base, before.T_odom_base, atol=1e-9)
+        np.testing.assert_array_equal(after.ranges_m, np.where(before.ranges_m >= 12.5, np.inf, before.ranges_m))
+        np.testing.assert_allclose(after.laser.angles_rad(), ROUND.angles_rad(), atol=1e-6)
+        assert after.sweep[:2] == pytest.approx(sweep[:2], abs=1e-8)
+        assert after.sweep.velocity[2] == pytest.approx(1.5, abs=1e-6)
+        assert after.sweep.velocity[0] == pytest.approx(0.5 * math.cos(after.T_odom_base[2]), abs=0.01)
+
+
+def test_a_clockwise_scan_has_negative_increments_and_the_stamp_of_its_first_measured_beam(tmp_path):
+    write_bag(tmp_path / "run.mcap", turning(Sweep(0.06, -0.05), 10))
+    with AnyReader([tmp_path / "run.mcap"], default_typestore=ROS2) as reader:
+        (scan,) = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/scan"]
+    assert scan.header.stamp.sec + scan.header.stamp.nanosec * 1e-9 == pytest.approx(100.05, abs=1e-8)
+    assert scan.angle_increment == pytest.approx(-ROUND.angle_increment_rad)
+    assert scan.angle_min == pytest.approx(ROUND.angles_rad()[-1], abs=1e-6)
+    assert scan.angle_max == pytest.approx(ROUND.angles_rad()[0], abs=1e-6)
+    assert scan.ranges[-1] == 2.0
+    assert (scan.time_increment, scan.scan_time) == pytest.approx((0.01, 0.12))
+
+
+def test_a_robot_without_odometry_has_none_in_the_bag(tmp_path):
+    unknown = [LaserScan(s.stamp, s.ranges_m, s.laser, frozen((math.nan,) * 3)) for s in straight(5)]
+    write_bag(tmp_path / "run.mcap", unknown)
+    with AnyReader([tmp_path / "run.mcap"], default_typestore=ROS2) as reader:
+        assert {topic: info.msgcount for topic, info in reader.topics.items()} == {
+            "/scan": 5, "/odom": 0, "/tf": 0, "/tf_static": 1,
+        }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,22 +20,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import OutputError, SourceError
-from fcslam.records import Beams, GroundTruth, LaserModel, LaserScan, Odometry, frozen
+from fcslam.records import Beams, GroundTruth, LaserModel, LaserScan, Odometry, Sweep, frozen
 from fcslam.sources import Fault, FaultCount, Recording, RecordingWriter, open_source, split, write_recording
 from fcslam.sources.images import image_size
-from fcslam.sources.recording.layout import ODOMETRY_FILE, SCANS_FILE
+from fcslam.sources.recording.layout import ODOMETRY_FILE, SCANS_FILE, SWEEP_NUMBERS
 from tests.sources.camera_records import CAMERA, LASER, drive, image, png, same, scan
 
 GOLDEN = Path(__file__).parent / "golden" / "robot.fcslam"
 FILES = ("meta.yaml", "scans.bin", "ranges.bin", "odometry.bin", "images.bin")
-GOLDEN_1 = GOLDEN.with_name("version-1.fcslam")
+EARLIER = [GOLDEN.with_name(f"version-{version}.fcslam") for version in (1, 2)]
 ENTRY = 8 + 8 + 24
-HEADER, SCAN, IMAGE = 16, ENTRY + 4 + 4 + 8 + 8 + 8 + 4 + 4, ENTRY + 4 + 4 + 4 + 4
+HEADER, SCAN, IMAGE = 16, ENTRY + 4 + 4 + 8 + 8 + 8 + 4 + 64 + 4, ENTRY + 4 + 4 + 4 + 4
 REAR = LaserModel(9, -1.0, 0.25, 8.0, (-0.25, 0.0, 3.0))
+SWEEP = Sweep(0.1, 0.0, (0.5, 0.0, -1.5), (0.25, 0.0, 4.0))
+UNKNOWN = (math.nan,) * 3
 
 numbers = st.floats(-1e6, 1e6)
 poses = st.tuples(numbers, numbers, numbers)
 ranges = st.one_of(st.floats(0, 60, width=32), st.just(math.nan), st.just(math.inf))
+times_s = st.floats(-2.0, 2.0)
+speeds = st.tuples(*3 * [st.floats(-50.0, 50.0)])
+sweeps = st.none() | st.builds(Sweep, times_s, times_s, speeds, speeds).filter(lambda s: s.first_s != s.last_s)
 
 
 @st.composite
@@ -50,7 +56,8 @@ def recordings(draw):
         elif kind == "scan":
             laser = draw(st.sampled_from([LASER, REAR, LASER.with_beams(Beams(11, -3.0, math.tau / 11))]))
             values = draw(st.lists(ranges, min_size=laser.beam_count, max_size=laser.beam_count))
-            records.append(LaserScan(stamp, frozen(values, np.float32), laser, frozen(pose)))
+            known = pose if draw(st.booleans()) else UNKNOWN
+            records.append(LaserScan(stamp, frozen(values, np.float32), laser, frozen(known), draw(sweeps)))
         else:
             records.append(image(stamp, pose if kind == "image" else None, png(shade=draw(st.integers(0, 255)))))
     return records
@@ -117,12 +124,21 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def golden():
+    """The records of the golden recording, whose second scan was measured during a turn."""
+    turning = lambda record: replace(record, sweep=SWEEP) if record.stamp == 100.25 else record  # noqa: E731
+    return [turning(record) if isinstance(record, LaserScan) else record for record in drive(3)]
+
+
 def test_the_golden_recording_means_what_it_says():
     """Read by hand, as docs/reference/recording.md lays it out."""
     scans = (GOLDEN / "scans.bin").read_bytes()
-    assert struct.unpack_from("<8sII", scans) == (b"FCSLAMsc", 2, SCAN)
+    assert struct.unpack_from("<8sII", scans) == (b"FCSLAMsc", 3, SCAN)
     assert struct.unpack_from("<Qd3d", scans, HEADER + SCAN) == (4, 100.25, 0.125, 0.0, 0.0)
     *beams, offset, crc = struct.unpack_from("<IIddQI", scans, HEADER + SCAN + ENTRY)
+    sweep = struct.unpack_from("<8d", scans, HEADER + SCAN + ENTRY + 36)
+    assert sweep == (0.1, 0.0, 0.5, 0.0, -1.5, 0.25, 0.0, 4.0)
+    assert all(map(math.isnan, struct.unpack_from("<8d", scans, HEADER + ENTRY + 36)))
     assert beams == [0, 12, LASER.angle_min_rad, LASER.angle_increment_rad]
     ranges = (GOLDEN / "ranges.bin").read_bytes()[offset : offset + 48]
     assert (offset, crc, struct.unpack("<12f", ranges)) == (48, zlib.crc32(ranges), (2.0,) * 12)
@@ -136,22 +152,52 @@ def test_the_golden_recording_means_what_it_says():
 
 def test_the_golden_recording_is_read_and_written(tmp_path):
     source = Recording(GOLDEN, "robot")
-    records = drive(3)
+    records = golden()
     assert all(map(same, sensed(records), source.records()))
     assert [truth.T_building_base[0] for truth in source.ground_truth()] == [1.0, 1.125, 1.25]
     assert contents(written(tmp_path, records)) == contents(GOLDEN)
 
 
-def test_a_recording_of_version_1_is_read_but_not_continued(tmp_path):
-    source = Recording(GOLDEN_1, "robot")
-    assert source.survey().lasers == (LASER,)
-    assert all(map(same, sensed(drive(3)), source.records()))
-    copy = shutil.copytree(GOLDEN_1, tmp_path / "robot.fcslam")
-    with pytest.raises(SourceError, match="is of version 1, which is read but not continued"):
+@pytest.mark.parametrize("earlier", EARLIER, ids=lambda path: path.stem)
+def test_a_recording_of_an_earlier_version_is_read_but_not_continued(tmp_path, earlier):
+    source = Recording(earlier, "robot")
+    assert source.survey().lasers[0] == LASER
+    read = list(source.records())
+    assert len(read) == len(sensed(drive(3)))
+    assert all(map(same, sensed(drive(3)), read))
+    copy = shutil.copytree(earlier, tmp_path / "robot.fcslam")
+    with pytest.raises(SourceError, match=r"is of version \d, which is read but not continued"):
         RecordingWriter.resume(copy)
+
+
+def test_the_beams_of_version_1_are_those_of_its_frames(tmp_path):
+    copy = shutil.copytree(EARLIER[0], tmp_path / "robot.fcslam")
     edit(copy, lambda content: content["laser"].update(beam_count=13))
     with pytest.raises(SourceError, match="does not fit"):
         open_source(copy).survey()
+
+
+def test_a_recording_without_odometry_says_so(tmp_path):
+    records = [scan(5.0 + k, UNKNOWN) for k in range(3)]
+    source = open_source(written(tmp_path, records))
+    (note,) = source.survey().notes
+    assert "no odometry, so scan matching alone gives the motion" in note
+    assert source.survey().path_length_m == 0.0
+    assert all(map(same, records, source.records()))
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [(0.1, math.nan, *6 * (0.0,)), (0.1, 0.1, *6 * (0.0,)), (0.0, 9.0, *6 * (0.0,)), (0.0, 0.1, 0.0, 1e9, *4 * (0.0,))],
+)
+def test_a_sweep_that_no_scan_has_is_damage(tmp_path, numbers):
+    folder = written(tmp_path)
+    with (folder / "scans.bin").open("ab") as file:
+        for sweep in (numbers, (math.nan,) * SWEEP_NUMBERS):
+            file.write(SCANS_FILE.packed(1000, 200.0, (0.0, 0.0, 0.0), 0, *LASER.beams, 0, 0, sweep))
+    source = open_source(folder)
+    assert source.survey().scan_count == 21
+    assert source.survey().faults[Fault.BROKEN_RECORD].count == 1
 
 
 def test_damaged_ranges_cost_their_scan_alone(tmp_path):
@@ -171,7 +217,7 @@ def test_a_scan_of_no_laser_of_the_recording_is_damage(tmp_path):
         open_source(folder).survey()
     with (folder / "scans.bin").open("ab") as file:
         for beams in ((7, 9, -1.0, 0.25), (0, 2**32 - 1, -1.0, 0.25), (0, 9, math.nan, 0.25), (0, 9, -1.0, -0.25)):
-            file.write(SCANS_FILE.packed(1000, 200.0, (0.0, 0.0, 0.0), *beams, 0, 0))
+            file.write(SCANS_FILE.packed(1000, 200.0, (0.0, 0.0, 0.0), *beams, 0, 0, (math.nan,) * SWEEP_NUMBERS))
     with pytest.raises(SourceError, match="20 scans are not of"):
         open_source(folder).survey()
 
@@ -269,7 +315,7 @@ def test_without_the_images_file_the_laser_goes_on(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda content: content.update(version=3), "version 3"),
+        (lambda content: content.update(version=4), "version 4"),
         (lambda content: content.pop("version"), "no version"),
         (lambda content: content.pop("lasers"), "laser"),
         (lambda content: content.update(lasers=[]), "1 to 8 lasers"),
@@ -387,6 +433,9 @@ def test_a_full_disk_leaves_what_was_written(tmp_path):
     [
         (scan(math.nan), "finite"),
         (scan(1.0, (math.inf, 0.0, 0.0)), "finite"),
+        (scan(1.0, (math.nan, 0.0, 0.0)), "finite"),
+        (Odometry(1.0, frozen(UNKNOWN)), "finite"),
+        (replace(scan(1.0), sweep=Sweep(0.0, math.inf)), "no sane times of the beams"),
         (image(1.0, encoded=png(9, 6)), "9 x 6"),
         (image(1.0, encoded=b"GIF89a"), "neither JPEG nor PNG"),
         (image(1.0, encoded=png()[:12]), "ends in its header"),

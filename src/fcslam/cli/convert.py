@@ -3,6 +3,7 @@
 import re
 import shutil
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -25,7 +26,7 @@ from fcslam.cli.recordings import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.records import SensorRecord
+    from fcslam.records import LaserScan, SensorRecord
     from fcslam.sources import Source, Survey
 
 _CARMEN = re.compile(r"\.(clf|log)(\.(gz|xz|bz2))?$")
@@ -62,9 +63,17 @@ def convert(
         print_line(console, f"{output}: a CARMEN log has no place for images, they are left out")
     if len(survey.lasers) > 1 and _CARMEN.search(output.name):
         print_line(console, f"{output}: a CARMEN log has a place for one laser, the scans of the others are left out")
+    if _CARMEN.search(output.name) and any(scan.sweep is not None for scan in islice(_scans(source), 1)):
+        print_line(console, f"{output}: a CARMEN log has no place for the times of beams, they are lost")
     _write(output, survey, _with_progress(source, survey.scan_count, console))
     print_faults(console, {source.name: source.faults})
     print_line(answers(), f"{survey.scan_count} scans: {output}")
+
+
+def _scans(source: "Source") -> "Iterator[LaserScan]":
+    from fcslam.records import LaserScan
+
+    return (record for record in source.records() if isinstance(record, LaserScan))
 
 
 def _prepare(output: Path, force: bool) -> None:

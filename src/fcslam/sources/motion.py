@@ -7,7 +7,7 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.records import Sweep
+from fcslam.records import FloatArray, Sweep
 from fcslam.sources.pose import Pose, relative_pose
 
 SAMPLES: Final = 9
@@ -32,7 +32,7 @@ class Reading(Protocol):
         """Seconds."""
 
     @property
-    def T_odom_base(self) -> Pose:
+    def T_odom_base(self) -> Pose | FloatArray:
         """Metres and radians."""
 
 

@@ -15,7 +15,6 @@ from fcslam.records import (
     CameraModel,
     FloatArray,
     GroundTruth,
-    LaserModel,
     LaserScan,
     RecordedItem,
     Transform,
@@ -60,7 +59,9 @@ def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
     - /tf_static (base_link -> laser, laser_2, camera_optical_frame): the mounting of lasers and camera;
     - /ground_truth (building -> base_link).
 
-    Header stamps are the records' own, to the nanosecond; the time of recording only ever grows.
+    Header stamps are the records' own, to the nanosecond; the time of recording only ever grows. A scan whose beams
+    were measured at different times has the stamp of the first one measured; if that is its last beam, the scan is
+    written clockwise. The motion during a scan is not written, as it follows from the odometry.
 
     Raises:
         OutputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
@@ -119,7 +120,7 @@ class _Bag:
             header = self._codec.header(stamp_ns, _BUILDING)
             self._put(_GROUND_TRUTH_TOPIC, self._odometry(header, item.T_building_base))
             return
-        if item.T_odom_base is not None:
+        if item.T_odom_base is not None and not np.isnan(item.T_odom_base).all():
             self._put_odometry(stamp_ns, item.T_odom_base)
         if isinstance(item, LaserScan):
             self._put_scan(stamp_ns, item)
@@ -142,7 +143,9 @@ class _Bag:
         number = self._mountings.index(T_base_laser) + 1
         suffix = f"_{number}" * (number > 1)
         self._mount(stamp_ns, _LASER + suffix, in_space(np.array(T_base_laser)))
-        self._put(_SCAN_TOPIC + suffix, self._scan(self._codec.header(stamp_ns, _LASER + suffix), scan), SCAN)
+        begin_s = 0.0 if scan.sweep is None else min(scan.sweep.first_s, scan.sweep.last_s)
+        header = self._codec.header(stamp_ns + round(begin_s * _NANOSECONDS), _LASER + suffix)
+        self._put(_SCAN_TOPIC + suffix, self._scan(header, scan), SCAN)
 
     def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
         try:
@@ -184,18 +187,23 @@ class _Bag:
         )
 
     def _scan(self, header: Any, scan: LaserScan) -> Any:
-        laser: LaserModel = scan.laser
+        count, first_rad, increment_rad = scan.laser.beams
+        last_rad, far_m = first_rad + scan.laser.beams.span_rad, scan.laser.max_range_m
+        ranges_m = np.where(scan.ranges_m >= far_m, np.float32(np.inf), scan.ranges_m)
+        beam_s = 0.0 if scan.sweep is None else scan.sweep.duration_s / (count - 1)
+        if scan.sweep is not None and scan.sweep.last_s < scan.sweep.first_s:
+            first_rad, last_rad, increment_rad, ranges_m = last_rad, first_rad, -increment_rad, ranges_m[::-1]
         return self._codec.make(
             SCAN,
             header=header,
-            angle_min=laser.angle_min_rad,
-            angle_max=laser.angle_min_rad + (laser.beam_count - 1) * laser.angle_increment_rad,
-            angle_increment=laser.angle_increment_rad,
-            time_increment=0.0,
-            scan_time=0.0,
+            angle_min=first_rad,
+            angle_max=last_rad,
+            angle_increment=increment_rad,
+            time_increment=beam_s,
+            scan_time=count * beam_s,
             range_min=0.0,
-            range_max=laser.max_range_m,
-            ranges=np.where(scan.ranges_m >= laser.max_range_m, np.float32(np.inf), scan.ranges_m),
+            range_max=far_m,
+            ranges=np.ascontiguousarray(ranges_m),
             intensities=np.zeros(0, dtype=np.float32),
         )
 

@@ -31,7 +31,8 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
 
     Ranges have millimetre precision, poses and stamps 1e-6; no return (inf) is written as a value just above the
     laser's maximum. A laser with the default geometry of its beam count is written as FLASER, any other as ROBOTLASER1,
-    and so is one whose beams vary. Images and the scans of further lasers are dropped: there is no place for them.
+    and so is one whose beams vary. Images, the scans of further lasers and the times of beams are dropped: there is no
+    place for them. Unknown odometry is written as zeros, which readers take for none as it never changes.
 
     Raises:
         OutputError: the file cannot be written.
@@ -104,7 +105,7 @@ def _ranges(ranges_m: np.ndarray, max_range_m: float) -> str:
 
 
 def _numbers(pose: np.ndarray) -> str:
-    return " ".join(f"{value:.6f}" for value in pose.tolist())
+    return " ".join(f"{value:.6f}" for value in np.nan_to_num(pose).tolist())
 
 
 def _tail(stamp: float) -> str:

@@ -4,6 +4,7 @@ import heapq
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property, partial
+from math import isnan
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 from zlib import crc32
@@ -11,18 +12,18 @@ from zlib import crc32
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import Beams, LaserModel, Ranges
+from fcslam.records import Beams, LaserModel, Ranges, Sweep
 from fcslam.sources.faults import Fault
-from fcslam.sources.pose import Pose
+from fcslam.sources.pose import UNKNOWN_POSE, Pose
 from fcslam.sources.recording.layout import (
     HEADER_BYTES,
     META,
     RANGE,
     RANGES,
     SCANS,
-    SCANS_FILE,
     FrameFile,
     check_beams,
+    check_sweep,
     is_whole,
 )
 
@@ -53,9 +54,9 @@ class Frame(NamedTuple):
 
     @property
     def T_odom_base(self) -> Pose:
-        """The odometry; all NaN for an image without odometry."""
+        """The odometry; ``UNKNOWN_POSE`` of a scan or an image without odometry."""
         x, y, theta = self.content["T_odom_base"].tolist()
-        return x, y, theta
+        return UNKNOWN_POSE if isnan(x) and isnan(y) and isnan(theta) else (x, y, theta)
 
     @property
     def laser(self) -> int:
@@ -73,6 +74,17 @@ class Frame(NamedTuple):
         check_beams(beams)
         return beams
 
+    def sweep(self) -> Sweep | None:
+        """The scan's sweep; None: all beams were measured at the stamp. Raises ValueError if it is not sane."""
+        if self.file.version < 3:
+            return None
+        first_s, last_s, vx, vy, vtheta, ax, ay, atheta = numbers = self.content["sweep"].tolist()
+        if all(map(isnan, numbers)):
+            return None
+        sweep = Sweep(first_s, last_s, (vx, vy, vtheta), (ax, ay, atheta))
+        check_sweep(sweep)
+        return sweep
+
     def ranges_m(self, ranges: "RangesFile") -> Ranges:
         """Ranges of the scan in metres; raises ValueError if they are damaged."""
         if self._is_version_1:
@@ -84,7 +96,7 @@ class Frame(NamedTuple):
 
     @property
     def _is_version_1(self) -> bool:
-        return self.file is not SCANS_FILE
+        return self.file.version == 1
 
 
 class RangesFile:

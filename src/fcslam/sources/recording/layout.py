@@ -3,8 +3,8 @@
 ``scans.bin``, ``odometry.bin`` and ``images.bin`` have a header and frames of constant size, each with a checksum. So
 damage affects single frames, and the length of a file shows a frame that a crash cut off. The frames of all files share
 one sequence of numbers, which is the order of the recording. The ranges of a scan, as many as it has beams, are in
-``ranges.bin``, and its frame says where. In version 1, which is read and no longer written, they were in the frame, and
-all scans had the same beams.
+``ranges.bin``, and its frame says where. Versions 1 and 2 are read and no longer written. In version 2, all beams of a
+scan were measured at its stamp. In version 1 also, the ranges were in the frame, and all scans had the same beams.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from pydantic import ValidationError, model_validator
 from fcslam.config import Settings, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_field_of_view
-from fcslam.records import Beams, CameraModel, LaserModel
+from fcslam.records import Beams, CameraModel, LaserModel, Sweep
 from fcslam.sources.images import check_camera
 from fcslam.storage.files import write_file
 
@@ -30,9 +30,9 @@ SCANS = "scans.bin"
 RANGES = "ranges.bin"
 IMAGES = "images"
 GROUND_TRUTH = "ground_truth.tum"
-VERSION = 2
+VERSION = 3
 """Version that is written."""
-VERSIONS = (1, 2)
+VERSIONS = (1, 2, 3)
 """Versions that are read."""
 RANGE = np.dtype("<f4")
 """A range in metres."""
@@ -46,6 +46,8 @@ _MAX_LASERS = 8
 _MAX_BEAMS = 1 << 16
 _MAX_RANGE_M = 1e6
 _LONGEST_REASON = 200
+_LONGEST_SWEEP_S, _FASTEST, _STEEPEST = 2.0, 50.0, 500.0
+"""Limits of a sweep: times in seconds, velocities in m/s and rad/s, accelerations in m/s^2 and rad/s^2."""
 
 _ENTRY: list[Any] = [("sequence", "<u8"), ("stamp", "<f8"), ("T_odom_base", "<f8", (3,))]
 _CRC: list[Any] = [("crc32", "<u4")]
@@ -92,13 +94,16 @@ IMAGES_FILE = FrameFile(
 
 _BEAMS: list[Any] = [("laser", "<u4"), ("beam_count", "<u4"), ("angle_min_rad", "<f8"), ("angle_increment_rad", "<f8")]
 _PLACE: list[Any] = [("offset", "<u8"), ("ranges_crc32", "<u4")]
-SCANS_FILE = FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, *_BEAMS, *_PLACE, *_CRC]), version=2)
+SWEEP_NUMBERS = 8
+_SWEEP: list[Any] = [("sweep", "<f8", (SWEEP_NUMBERS,))]
+SCANS_FILE = FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, *_BEAMS, *_PLACE, *_SWEEP, *_CRC]), version=3)
+_SCANS_FILE_2 = FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, *_BEAMS, *_PLACE, *_CRC]), version=2)
 
 
 def scans_file(meta: "Meta") -> FrameFile:
     """The file of the scans of a recording."""
     if meta.version > 1:
-        return SCANS_FILE
+        return SCANS_FILE if meta.version > 2 else _SCANS_FILE_2
     (laser,) = meta.lasers
     return FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, ("ranges_m", RANGE, (laser.beam_count,)), *_CRC]))
 
@@ -111,7 +116,7 @@ def image_path(folder: Path, index: int, suffix: str) -> Path:
 class Meta(Settings):
     """The sensors of the robot."""
 
-    version: Literal[1, 2] = 2
+    version: Literal[1, 2, 3] = 3
     lasers: tuple[LaserModel, ...]
     camera: CameraModel | None = None
 
@@ -134,6 +139,16 @@ def check_beams(beams: Beams) -> None:
         raise ValueError(f"a laser has 2 to {_MAX_BEAMS} beams")
     if not (is_field_of_view(beams) and beams.angle_increment_rad > 0.0):
         raise ValueError("no sane field of view of the laser")
+
+
+def check_sweep(sweep: Sweep) -> None:
+    """Raise ValueError for a sweep that no scan has."""
+    first_s, last_s, velocity, acceleration = sweep
+    limits = *2 * (_LONGEST_SWEEP_S,), *3 * (_FASTEST,), *3 * (_STEEPEST,)
+    numbers = first_s, last_s, *velocity, *acceleration
+    is_within = all(abs(number) <= limit for number, limit in zip(numbers, limits, strict=True))  # false for NaN
+    if not is_within or first_s == last_s:
+        raise ValueError("no sane times of the beams, or no sane motion during the scan")
 
 
 def write_meta(folder: Path, meta: Meta) -> None:
@@ -164,7 +179,7 @@ def read_meta(folder: Path) -> Meta:
     if type(version) is not int:
         raise SourceError(f"{path}: does not describe a recording (no version); copy it again")
     if version not in VERSIONS:
-        known = " and ".join(map(str, VERSIONS))
+        known = f"{VERSIONS[0]} to {VERSIONS[-1]}"
         raise SourceError(f"{path}: is of version {str(version)[:20]}, but {known} are read here; update fcslam")
     if isinstance(content, dict) and version == 1 and "laser" in content:
         content["lasers"] = [content.pop("laser")]

@@ -31,8 +31,8 @@ from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
-from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.pose import pose_array
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
+from fcslam.sources.pose import UNKNOWN_POSE, pose_array
 from fcslam.sources.recording.frames import Frame, RangesFile, frame_count, merged_frames
 from fcslam.sources.recording.layout import (
     GROUND_TRUTH,
@@ -99,7 +99,7 @@ class Recording:
                     except ValueError:
                         audit.add(Fault.BROKEN_RECORD, number)
                     else:
-                        scan = LaserScan(frame.stamp, ranges_m, laser, pose_array(frame.T_odom_base))
+                        scan = LaserScan(frame.stamp, ranges_m, laser, pose_array(frame.T_odom_base), frame.sweep())
                         watch.add(number, scan)
                         yield scan
                 elif frame.file is ODOMETRY_FILE:
@@ -130,11 +130,13 @@ class Recording:
     @cached_property
     def _survey(self) -> Survey:
         """Summary from one pass over the whole recording; rejects a recording that cannot be mapped."""
-        audit, scans, odometry = _audit(), PathSummary(), PathSummary()
+        audit, scans, odometry, notes = _audit(), PathSummary(), PathSummary(), list[str]()
         if self._meta.version > 1:
             RangesFile(self._path).check()
         for _, frame in self._checked(audit):
             if frame.is_scan:
+                if not scans.count and frame.T_odom_base == UNKNOWN_POSE:
+                    notes.append(f"{self._path}: {WITHOUT_ODOMETRY}")
                 scans.add(frame.stamp, frame.T_odom_base)
             elif frame.file is ODOMETRY_FILE:
                 odometry.add(frame.stamp, frame.T_odom_base)
@@ -143,8 +145,9 @@ class Recording:
         if not scans.count:
             seen = f"; {faults}" if faults else ""
             raise SourceError(f"{self._path}: no laser scan in this recording{seen}; give one with scans")
-        camera, notes = self._camera_and_notes()
-        return Survey(scans.count, scans.duration_s, scans.length_m, self._meta.lasers, faults, notes, camera)
+        camera, camera_notes = self._camera_and_notes()
+        notes += camera_notes
+        return Survey(scans.count, scans.duration_s, scans.length_m, self._meta.lasers, faults, tuple(notes), camera)
 
     def _camera_and_notes(self) -> tuple[CameraModel | None, tuple[str, ...]]:
         camera, count = self._meta.camera, frame_count(self._path, IMAGES_FILE)
@@ -191,10 +194,11 @@ def _is_sane(frame: Frame, lasers: Sequence[LaserModel]) -> bool:
     try:
         if frame.is_scan:
             frame.beams(lasers)
+            frame.sweep()
     except ValueError:
         return False
     pose = frame.T_odom_base
-    unknown = frame.file is IMAGES_FILE and all(map(isnan, pose))
+    unknown = pose == UNKNOWN_POSE and frame.file is not ODOMETRY_FILE
     return abs(frame.stamp) < _MAX_STAMP_S and (unknown or all(abs(value) < _MAX_COORDINATE for value in pose))
 
 

@@ -28,9 +28,11 @@ from fcslam.sources.recording.layout import (
     RANGES,
     SCANS,
     SCANS_FILE,
+    SWEEP_NUMBERS,
     VERSION,
     FrameFile,
     Meta,
+    check_sweep,
     image_path,
     is_whole,
     read_meta,
@@ -38,6 +40,7 @@ from fcslam.sources.recording.layout import (
 )
 
 _NO_POSE = (nan, nan, nan)
+_NO_SWEEP = (nan,) * SWEEP_NUMBERS
 
 
 class RecordCounts(NamedTuple):
@@ -82,7 +85,7 @@ class RecordingWriter:
         """Continue the recording at ``folder``; incomplete last records are removed.
 
         Raises:
-            SourceError: the folder has no recording, or one of version 1.
+            SourceError: the folder has no recording, or one of an earlier version.
             OutputError: the recording cannot be written.
         """
         meta = read_meta(folder)
@@ -127,7 +130,8 @@ class RecordingWriter:
         """Append one record.
 
         Raises:
-            OutputError: the record cannot be written, has a stamp or pose that is not finite, or is of another sensor.
+            OutputError: the record cannot be written, has a stamp, pose or sweep that is not sane, or is of another
+                sensor. The pose of a scan may be unknown (NaN).
         """
         self._check(item)
         with _translate_errors(self._folder):
@@ -171,10 +175,19 @@ class RecordingWriter:
 
     def _check(self, item: RecordedItem) -> None:
         pose = item.T_building_base if isinstance(item, GroundTruth) else item.T_odom_base
-        if not np.isfinite(item.stamp) or (pose is not None and not np.all(np.isfinite(pose))):
+        is_scan = isinstance(item, LaserScan)
+        is_sound = pose is None or bool(np.isfinite(pose).all() or (is_scan and np.isnan(pose).all()))
+        if not (np.isfinite(item.stamp) and is_sound):
             raise OutputError(f"{self._folder}: a record at {item.stamp} s has no finite stamp or pose; leave it out")
-        if isinstance(item, LaserScan) and self._index(item.laser) is None:
-            raise OutputError(f"{self._folder}: a scan at {item.stamp} s is of no laser of the recording; use one each")
+        if isinstance(item, LaserScan):
+            if self._index(item.laser) is None:
+                what = f"a scan at {item.stamp} s is of no laser of the recording"
+                raise OutputError(f"{self._folder}: {what}; use one each")
+            try:
+                if item.sweep is not None:
+                    check_sweep(item.sweep)
+            except ValueError as error:
+                raise OutputError(f"{self._folder}: a scan at {item.stamp} s cannot be kept ({error})") from error
         if isinstance(item, CameraImage):
             if item.camera != self._meta.camera:
                 raise OutputError(f"{self._folder}: an image at {item.stamp} s is not of the recording's camera")
@@ -192,7 +205,8 @@ class RecordingWriter:
         offset = ranges.size
         ranges.append(content)
         place = (*scan.laser.beams, offset, crc32(content))
-        self._append(SCANS_FILE, scan.stamp, scan.T_odom_base, self._index(scan.laser), *place)
+        sweep = _NO_SWEEP if scan.sweep is None else np.hstack(scan.sweep)
+        self._append(SCANS_FILE, scan.stamp, scan.T_odom_base, self._index(scan.laser), *place, sweep)
 
     def _append(self, frames: FrameFile, *values: object) -> None:
         self._appenders[frames.name].append(frames.packed(self._next_sequence, *values))
