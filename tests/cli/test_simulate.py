@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.records import CameraImage, GroundTruth, LaserScan
+from fcslam.records import CameraImage, GroundTruth, LaserScan, Odometry
 from fcslam.runs import open_run, read_tum
 from fcslam.simulation import engine
 from fcslam.sources import open_source
@@ -66,6 +66,19 @@ def test_the_robot_of_a_yard_is_as_asked(tmp_path):
     assert main([*tiny, "--output", str(tmp_path / "default")]) == 0
     settings = (tmp_path / "default" / "simulation.yaml").read_text(encoding="utf-8")
     assert "max_range_m: 30.0" in settings
+
+
+def test_a_scanner_is_as_asked_and_options_override_it(tmp_path):
+    tiny = [*TINY, "--path-length", "2", "--robots", "1", "--no-camera", "--scanner", "ld19"]
+    changes = ["--beams", "100", "--lidar-rate", "5", "--lidar-range", "8", "--turn-rate", "2", "--odometry", "none"]
+    for name, options, expected in (("ld19", [], (450, 12.0, 0.1)), ("other", changes, (100, 8.0, 0.2))):
+        assert main([*tiny, *options, "--output", str(tmp_path / name)]) == 0
+        records = list(open_source(tmp_path / name / "robot_1").records())
+        scan = next(record for record in records if isinstance(record, LaserScan))
+        period_s = scan.sweep.duration_s * scan.laser.beam_count / (scan.laser.beam_count - 1)
+        assert (scan.laser.beam_count, scan.laser.max_range_m, period_s) == pytest.approx(expected)
+        assert any(isinstance(record, Odometry) for record in records) is not bool(options)
+    assert "turn_rate_rad_s: 2.0" in (tmp_path / "other" / "simulation.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -9,7 +9,8 @@ from fcslam.geometry import se2
 from fcslam.records import LaserModel
 from fcslam.simulation.floorplan import draw_floor_plan
 from fcslam.simulation.noise import LidarSettings, simulate_ranges
-from fcslam.simulation.odometry import OdometryNoiseSettings, simulate_odometry
+from fcslam.simulation.odometry import KINDS, OdometryFaults, OdometryNoiseSettings, read_odometry, simulate_odometry
+from fcslam.simulation.options import OdometryKind
 from fcslam.simulation.route import drive
 from fcslam.simulation.simulated_fleet import SimulationSettings
 from tests.simulation.driving import route
@@ -72,6 +73,58 @@ def test_slips_make_odometry_longer_and_nothing_else():
     ends = np.array([simulate_odometry(STRAIGHT, settings, rng)[-1] for _ in range(300)])
     assert np.mean(ends[:, 0]) == pytest.approx(20.0 + 20.0 * 0.5 * 0.04, abs=0.04)
     np.testing.assert_allclose(ends[:, 1:], 0.0, atol=1e-12)
+
+
+STAMPS = 100.0 + 0.02 * np.arange(401)
+
+
+def read(truth=STRAIGHT, seed=3, noise=NO_DRIFT, **faults):
+    settings = noise.model_copy(update={"faults": OdometryFaults(**faults)})
+    return read_odometry(STAMPS, truth, settings, np.random.default_rng(seed))
+
+
+def test_carpet_makes_distances_and_turns_too_long_on_a_quarter_of_the_floor():
+    truth = STRAIGHT + np.array((0.0, 5.0, 0.3))
+    steps = se2.relative(read(truth, carpet_slip=0.2).T_odom_base)
+    on_carpet = (truth[:-1, 0] // 4.0) % 2 == 1
+    np.testing.assert_allclose(np.hypot(*steps[:, :2].T), np.where(on_carpet, 0.06, 0.05), atol=1e-9)
+    beside = read(STRAIGHT + np.array((0.0, 1.0, 0.0)), carpet_slip=0.2).T_odom_base
+    np.testing.assert_allclose(beside, STRAIGHT, atol=1e-9)
+    turning = np.column_stack((np.full((401, 2), 5.0), np.linspace(0.0, 2.0, 401)))
+    assert read(turning, carpet_slip=0.2).T_odom_base[-1, 2] == pytest.approx(2.4)
+
+
+def test_steps_hold_the_pose_between_updates():
+    readings = read(update_hz=5.0)
+    changes = np.flatnonzero(np.diff(readings.T_odom_base[:, 0])) + 1
+    np.testing.assert_allclose(readings.stamps[changes] - 100.0, 0.2 * np.arange(1, 41), atol=1e-9)
+    np.testing.assert_allclose(readings.T_odom_base[changes], STRAIGHT[changes], atol=1e-9)
+
+
+def test_late_messages_have_the_poses_of_earlier():
+    sound, late = read(), read(delay_s=0.2)
+    np.testing.assert_array_equal(late.T_odom_base, sound.T_odom_base)
+    stamps = np.array([100.01, 101.2, 103.21])
+    np.testing.assert_allclose(late.at(stamps + 0.2), sound.at(stamps), atol=1e-12)
+    assert late.at(np.array([100.1]))[0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_reset_starts_at_zero_and_changes_no_motion():
+    noise = KINDS[OdometryKind.GOOD]
+    sound, reset = (read(noise=noise, **faults).T_odom_base for faults in ({}, {"reset_at": 0.5}))
+    np.testing.assert_allclose(reset[200], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(reset[:200], sound[:200])
+    np.testing.assert_allclose(se2.relative(reset)[200:], se2.relative(sound)[200:], atol=1e-9)
+
+
+def test_scales_are_wrong_by_eight_percent_in_the_mean():
+    ends = [read(noise=KINDS[OdometryKind.SCALED], seed=seed).T_odom_base[-1, 0] for seed in range(300)]
+    assert np.mean(np.abs(np.array(ends) / 20.0 - 1.0)) == pytest.approx(0.08, abs=0.01)
+
+
+def test_every_kind_of_odometry_has_its_settings():
+    assert set(KINDS) == set(OdometryKind)
+    assert {kind for kind, settings in KINDS.items() if settings is None} == {OdometryKind.NONE}
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import typer
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.show import Live, OpenBrowser, Port, live_page
-from fcslam.simulation.options import Building
+from fcslam.simulation.options import Building, Scanner
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,6 +50,7 @@ def demo(
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
     from fcslam.mission import MissionConfig
+    from fcslam.simulation.noise import SCANNERS
     from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
     from fcslam.sources import open_source
@@ -58,7 +59,13 @@ def demo(
     if learn:
         _check_learning(no_camera)
     camera = None if no_camera else CameraSettings()
-    settings = SimulationSettings(building=building, robots=robots, path_length_m=path_length, camera=camera)
+    settings = SimulationSettings(
+        building=building,
+        robots=robots,
+        path_length_m=path_length,
+        lidar=SCANNERS[Scanner.LD19],
+        camera=camera,
+    )
     _check_libraries(settings)
     fleet = simulate_fleet(settings, seed)
     _prepare(output)

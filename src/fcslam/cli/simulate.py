@@ -12,7 +12,7 @@ import typer
 
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
-from fcslam.simulation.options import Building, LidarKind, Lighting, OdometryKind
+from fcslam.simulation.options import Building, Lighting, OdometryKind, Scanner
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -46,19 +46,41 @@ def simulate(
             help="Share of the furniture, or in a yard of the cars, that moves between drives.",
         ),
     ] = 0.0,
+    scanner: Annotated[
+        Scanner,
+        typer.Option(
+            help="Scanner of each robot. One with the name of a product spins and measures each beam at its own time."
+        ),
+    ] = Scanner.INSTANT,
     lidar_range: Annotated[
         float | None,
-        typer.Option(min=1.0, max=500.0, help="Range of the LiDARs, in metres.", show_default="12; in a yard 30"),
+        typer.Option(
+            min=1.0,
+            max=500.0,
+            help="Range of the LiDARs, in metres.",
+            show_default="the scanner's; in a yard 30 if it does not spin",
+        ),
     ] = None,
-    lidar_rate: Annotated[float, typer.Option(min=0.1, max=100.0, help="Scans of a LiDAR per second.")] = 10.0,
-    beams: Annotated[int, typer.Option(min=8, max=10_000, help="Beams of a scan.")] = 360,
+    lidar_rate: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=100.0, help="Scans of a LiDAR per second.", show_default="the scanner's"),
+    ] = None,
+    beams: Annotated[
+        int | None, typer.Option(min=8, max=10_000, help="Beams of a scan.", show_default="the scanner's")
+    ] = None,
     field_of_view: Annotated[
-        float, typer.Option(min=10.0, max=360.0, help="Angle that a scan covers, in degrees, centred ahead.")
-    ] = 360.0,
-    lidar: Annotated[
-        LidarKind, typer.Option(help="Kind of LiDAR: what varies from scan to scan, or two of half a turn each.")
-    ] = LidarKind.STEADY,
-    odometry: Annotated[OdometryKind, typer.Option(help="Kind of wheel odometry.")] = OdometryKind.DEFAULT,
+        float | None,
+        typer.Option(
+            min=10.0,
+            max=360.0,
+            help="Angle that a scan covers, in degrees, centred ahead.",
+            show_default="the scanner's",
+        ),
+    ] = None,
+    turn_rate: Annotated[float, typer.Option(min=0.1, max=6.0, help="Rate at which the robots turn, in rad/s.")] = 0.9,
+    odometry: Annotated[
+        OdometryKind, typer.Option(help="Kind of wheel odometry, or what is wrong with it.")
+    ] = OdometryKind.DEFAULT,
     no_camera: NoCamera = False,
     bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
     resume: Annotated[
@@ -68,26 +90,30 @@ def simulate(
 ) -> None:
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
     from fcslam.errors import OutputError
-    from fcslam.simulation.noise import LidarSettings
+    from fcslam.simulation.noise import SCANNERS
     from fcslam.simulation.odometry import KINDS
     from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 
     if resume and output is None:
         raise OutputError("--resume continues a simulation in its folder; give --output")
+    lidar = SCANNERS[scanner]
+    if lidar_range is None and building is Building.YARD and not lidar.spin:
+        lidar_range = 30.0
+    given = {
+        "beams": beams,
+        "field_of_view_rad": None if field_of_view is None else math.radians(field_of_view),
+        "max_range_m": lidar_range,
+        "rate_hz": lidar_rate,
+    }
     settings = SimulationSettings(
         building=building,
         robots=robots,
         path_length_m=path_length,
         lighting=tuple(lighting or (Lighting.DAY,)),
         moved_furniture=moved_furniture,
-        lidar=LidarSettings(
-            kind=lidar,
-            beams=beams,
-            field_of_view_rad=math.radians(field_of_view),
-            max_range_m=lidar_range or (30.0 if building is Building.YARD else 12.0),
-            rate_hz=lidar_rate,
-        ),
+        turn_rate_rad_s=turn_rate,
+        lidar=lidar.model_copy(update={key: value for key, value in given.items() if value is not None}),
         drift=KINDS[odometry],
         camera=None if no_camera else CameraSettings(),
     )

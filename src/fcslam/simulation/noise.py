@@ -6,8 +6,8 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.records import Beams, FloatArray, LaserModel
-from fcslam.simulation.options import LidarKind
+from fcslam.records import Beams, FloatArray, LaserModel, Sweep
+from fcslam.simulation.options import LidarKind, Scanner
 
 _CYCLE: Final = 4
 """Scans in a cycle of an interleaved LiDAR."""
@@ -37,6 +37,13 @@ class LidarSettings(Settings):
         default=0.01, ge=0.0, le=1.0, description="probability that a LiDAR beam that hits a surface returns nothing"
     )
     rate_hz: float = Field(default=5.0, gt=0.0, description="scan rate of the LiDAR [Hz]")
+    spin: int = Field(
+        default=0,
+        ge=-1,
+        le=1,
+        description="1: the LiDAR spins counter-clockwise and measures each beam at its own time; -1: clockwise; "
+        "0: it measures all beams of a scan at once",
+    )
 
     def models(self, T_base_laser: tuple[float, float, float]) -> tuple[LaserModel, ...]:
         """Geometry and mounting of each laser; a single one is mounted at ``T_base_laser``.
@@ -49,6 +56,30 @@ class LidarSettings(Settings):
         increment = view_rad / (self.beams if full else self.beams - 1)
         mountings = (_T_BASE_FRONT, _T_BASE_REAR) if two else (T_base_laser,)
         return tuple(LaserModel(self.beams, -0.5 * view_rad, increment, self.max_range_m, at) for at in mountings)
+
+    def sweep(self, beams: Beams) -> Sweep | None:
+        """Times of the beams of a scan, whose stamp is that of the first one measured; None if it has all at once."""
+        if not self.spin:
+            return None
+        duration_s = beams.span_rad / (2.0 * np.pi * self.rate_hz)
+        return Sweep(0.0, duration_s) if self.spin > 0 else Sweep(duration_s, 0.0)
+
+
+_AT_ONCE: Final = LidarSettings(rate_hz=10.0)
+
+SCANNERS: Final = {
+    Scanner.INSTANT: _AT_ONCE,
+    Scanner.INTERLEAVED: _AT_ONCE.model_copy(update={"kind": LidarKind.INTERLEAVED}),
+    Scanner.JITTERING: _AT_ONCE.model_copy(update={"kind": LidarKind.JITTERING}),
+    Scanner.FRONT_REAR: _AT_ONCE.model_copy(update={"kind": LidarKind.FRONT_REAR}),
+    Scanner.RPLIDAR_A1: LidarSettings(beams=1454, rate_hz=5.5, range_noise_m=0.02, dropout=0.03, spin=-1),
+    Scanner.LD19: LidarSettings(beams=450, rate_hz=10.0, range_noise_m=0.015, dropout=0.02, spin=-1),
+    Scanner.UTM_30LX: LidarSettings(
+        beams=1081, field_of_view_rad=1.5 * np.pi, max_range_m=30.0, range_noise_m=0.01, dropout=0.005, rate_hz=40.0,
+        spin=1,
+    ),
+}  # fmt: skip
+"""The settings of each scanner."""
 
 
 def scan_beams(kind: LidarKind, laser: LaserModel, number: int, rng: np.random.Generator) -> Beams:

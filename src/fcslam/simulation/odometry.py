@@ -1,12 +1,34 @@
-"""Errors of simulated wheel odometry."""
+"""Readings of simulated wheel odometry with their errors."""
+
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.records import FloatArray
+from fcslam.records import SAME_STAMP_S, FloatArray, Odometry, frozen
 from fcslam.simulation.options import OdometryKind
+
+READING_RATE_HZ = 50.0
+"""Readings per second beside a LiDAR that spins."""
+_CARPET_M = 4.0
+"""Side of a piece of carpet."""
+
+
+class OdometryFaults(Settings):
+    """Faults of wheel odometry beyond noise."""
+
+    carpet_slip: float = Field(
+        default=0.0, ge=0.0, description="share by which wheels turn too far on carpet, a quarter of the floor"
+    )
+    update_hz: float | None = Field(
+        default=None, gt=0.0, description="changes of the pose per second [Hz]; null: every reading is new"
+    )
+    delay_s: float = Field(default=0.0, ge=0.0, description="time by which the stamp of a reading is late [s]")
+    reset_at: float | None = Field(
+        default=None, gt=0.0, lt=1.0, description="share of the drive after which the odometry starts at zero again"
+    )
 
 
 class OdometryNoiseSettings(Settings):
@@ -41,18 +63,65 @@ class OdometryNoiseSettings(Settings):
     slip_turn_rad: float = Field(
         default=0.0, ge=0.0, description="largest turn that a wheel slip adds, to either side [rad]"
     )
+    faults: OdometryFaults = Field(default=OdometryFaults(), description="faults beyond noise")
 
 
 _GOOD = OdometryNoiseSettings(heading_noise_rad=0.003, veer_bias_rad_m=0.001, scale_bias=0.015)
 
-KINDS = {
+KINDS: dict[OdometryKind, OdometryNoiseSettings | None] = {
     OdometryKind.DEFAULT: OdometryNoiseSettings(slips_per_m=0.05),
     OdometryKind.GOOD: _GOOD,
     OdometryKind.SLIPPING: _GOOD.model_copy(
         update={"slips_per_m": 0.05, "slip_m": 0.25, "slip_limit_m": 0.7, "slip_turn_rad": 0.1}
     ),
+    OdometryKind.SCALED: _GOOD.model_copy(update={"scale_bias": 0.1}),
+    OdometryKind.CARPET: _GOOD.model_copy(update={"faults": OdometryFaults(carpet_slip=0.2)}),
+    OdometryKind.STEPS: _GOOD.model_copy(update={"faults": OdometryFaults(update_hz=5.0)}),
+    OdometryKind.LATE: _GOOD.model_copy(update={"faults": OdometryFaults(delay_s=0.2)}),
+    OdometryKind.RESET: _GOOD.model_copy(update={"faults": OdometryFaults(reset_at=0.5)}),
+    OdometryKind.NONE: None,
 }
 """The errors of each kind of wheel odometry."""
+
+
+class Readings(NamedTuple):
+    """The odometry of a robot as it is recorded."""
+
+    stamps: FloatArray
+    """Shape (N,), seconds."""
+    T_odom_base: FloatArray
+    """Shape (N, 3)."""
+
+    def at(self, stamps: FloatArray) -> FloatArray:
+        """Poses (M, 3) at ``stamps`` (M,), interpolated along SE(2) twists, but never beyond the first and the last."""
+        if np.array_equal(stamps, self.stamps):
+            return self.T_odom_base
+        before = np.clip(np.searchsorted(self.stamps, stamps) - 1, 0, len(self.stamps) - 2)
+        share = (stamps - self.stamps[before]) / (self.stamps[before + 1] - self.stamps[before])
+        step = se2.log(se2.between(self.T_odom_base[before], self.T_odom_base[before + 1]))
+        return frozen(se2.compose(self.T_odom_base[before], se2.exp(np.clip(share, 0.0, 1.0)[:, None] * step)))
+
+    def around(self, begin_s: float, end_s: float) -> list[Odometry]:
+        """The readings between two stamps, and one more before and after if there is one."""
+        first, last = np.searchsorted(self.stamps, (begin_s, end_s))
+        kept = slice(max(0, first - 1), last + 1)
+        return list(map(Odometry, self.stamps[kept].tolist(), self.T_odom_base[kept]))
+
+
+def read_odometry(
+    stamps: FloatArray, T_building_base: FloatArray, settings: OdometryNoiseSettings, rng: np.random.Generator
+) -> Readings:
+    """The readings of a robot that is at the true poses (N, 3) at ``stamps`` (N,), with all faults."""
+    faults, poses = settings.faults, simulate_odometry(T_building_base, settings, rng)
+    if faults.update_hz is not None:
+        _, first, number = np.unique(
+            np.floor((stamps - stamps[0] + SAME_STAMP_S) * faults.update_hz), return_index=True, return_inverse=True
+        )
+        poses = poses[first[number]]
+    if faults.reset_at is not None:
+        after = int(faults.reset_at * len(poses))
+        poses = np.concatenate((poses[:after], se2.between(poses[after], poses[after:])))
+    return Readings(frozen(stamps + faults.delay_s), frozen(poses))
 
 
 def simulate_odometry(
@@ -86,6 +155,9 @@ def simulate_odometry(
         wrong[:, 0] += slipped_m * np.sign(twists[:, 0])
         if settings.slip_turn_rad:
             wrong[:, 2] += rng.uniform(-settings.slip_turn_rad, settings.slip_turn_rad, len(travel)) * (slips > 0)
+    if settings.faults.carpet_slip:
+        column, row = np.floor(T_building_base[:-1, :2] / _CARPET_M).T % 2
+        wrong *= 1.0 + settings.faults.carpet_slip * (column * row)[:, None]
     return _chain(se2.exp(wrong))
 
 

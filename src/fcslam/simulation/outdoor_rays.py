@@ -95,19 +95,25 @@ class OutdoorRayCaster:
         self._world = _world(plan, plan.terrain)
 
     def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
-        """Ranges (beam_count,) in metres on level ground from pose (3,), as if everything returned every beam."""
+        """Ranges (beam_count,) in metres on level ground, as if everything returned every beam.
+
+        Args:
+            T_building_base: pose of the robot, shape (3,), or its poses at each beam, shape (beam_count, 3).
+            laser: the laser.
+        """
         return self._cast(T_building_base, laser, np.zeros(2), None)
 
     def scan(self, T_building_base: FloatArray, laser: LaserModel, rng: np.random.Generator) -> FloatArray:
-        """Ranges (beam_count,) in metres without noise, from pose (3,); ``max_range_m`` without a return."""
-        tilt = self._terrain.slope(T_building_base[:2]) + rng.normal(0.0, _SHAKE_RAD, 2)
+        """Ranges (beam_count,) in metres without noise, as ``cast``; ``max_range_m`` without a return."""
+        tilt = self._terrain.slope(np.atleast_2d(T_building_base)[0, :2]) + rng.normal(0.0, _SHAKE_RAD, 2)
         return self._cast(T_building_base, laser, tilt, int(rng.integers(2**62)))
 
     def _cast(self, T_building_base: FloatArray, laser: LaserModel, tilt: FloatArray, seed: int | None) -> FloatArray:
-        pose = se2.compose(T_building_base, np.array(laser.T_base_laser))
-        angles = pose[2] + laser.angles_rad()
+        x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser)).T
+        angles = heading + laser.angles_rad()
+        origins = np.stack(np.broadcast_arrays(x, y, angles)[:2], axis=1)
         ideal, far = seed is None, laser.max_range_m
-        return np.asarray(_cast_beams(pose[:2], angles, tilt, far, np.uint64(seed or 0), ideal, self._world))
+        return np.asarray(_cast_beams(origins, angles, tilt, far, np.uint64(seed or 0), ideal, self._world))
 
 
 def _world(plan: FloorPlan, terrain: Terrain) -> _World:
@@ -255,16 +261,17 @@ def _first_hit(start, direction, far, seed, beam, ideal, world):  # type: ignore
 
 
 @njit(nogil=True)
-def _cast_beams(position, angles, tilt, far, seed, ideal, world):  # type: ignore[no-untyped-def]
+def _cast_beams(origins, angles, tilt, far, seed, ideal, world):  # type: ignore[no-untyped-def]
     ranges = np.full(len(angles), far)
-    height = _ground_m(world.heights_m, position[0], position[1]) + LASER_HEIGHT_M
     for beam in range(len(angles)):
+        x, y = origins[beam]
+        height = _ground_m(world.heights_m, x, y) + LASER_HEIGHT_M
         angle = angles[beam]
         if not ideal:
             angle += _BEAM_HALF_WIDTH_RAD * (2.0 * _uniform(seed, beam, -1) - 1.0)
         dx, dy = np.cos(angle), np.sin(angle)
         dz = tilt[0] * dx + tilt[1] * dy
-        start, before = (position[0], position[1], height), 0.0
+        start, before = (x, y, height), 0.0
         distance, hit, cosine = _first_hit(start, (dx, dy, dz), far, seed, beam, ideal, world)
         if hit >= 0 and world.surfaces[hit, 0] == 0.0 and world.surfaces[hit, 9] > 0.0 and not ideal:
             mirrors = _GLASS_MIRRORS / (1.0 - _GLASS_PASSES)

@@ -56,7 +56,7 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter, resum
     with _writer(robot, folder, resume) as writer:
         counts = writer.counts
         known = counts.ground_truth
-        with closing(robot.items(counts.scans, counts.images)) as items:
+        with closing(robot.items(counts.scans, counts.images, counts.odometry)) as items:
             for item in watch(items):
                 if isinstance(item, GroundTruth) and known:
                     known -= 1

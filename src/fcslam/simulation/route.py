@@ -14,6 +14,9 @@ from fcslam.simulation.floorplan import FloorPlan
 
 SPEED_M_S = 0.5
 TURN_RATE_RAD_S = 0.9
+"""The usual rate of a turn."""
+_RAMP_S, _RAMP_STEP_S = 0.3, 0.02
+"""Time in which an eased drive changes its speed, and the time between its poses."""
 _STRETCH, _SHIFT = 0.85, 0.55
 """Length of a robot's part of the common walk, and offset of the next robot's part, as shares of the path length."""
 _NEXT = 2
@@ -103,13 +106,22 @@ class Schedule:
         poses[:, 2] = se2.wrap_angle(poses[:, 2])
         return poses
 
+    def eased(self) -> "Schedule":
+        """The same drive with speeds that change steadily, not at once: the mean pose of the last ``_RAMP_S``."""
+        times = np.arange(0.0, self.duration_s + _RAMP_S + _RAMP_STEP_S, _RAMP_STEP_S)
+        last = times[:, None] - np.arange(0.5 * _RAMP_STEP_S, _RAMP_S, _RAMP_STEP_S)
+        return Schedule(
+            frozen(times),
+            frozen(np.stack([np.interp(last, self.times_s, axis).mean(axis=1) for axis in self.poses.T], axis=1)),
+        )
 
-def schedule(waypoints: FloatArray) -> Schedule:
+
+def schedule(waypoints: FloatArray, turn_rate_rad_s: float = TURN_RATE_RAD_S) -> Schedule:
     """Schedule a drive along waypoints (K, 2), metres in ``building``."""
     legs = np.diff(waypoints, axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 1e-9]
     headings = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
-    turns_s = np.abs(np.diff(headings, prepend=headings[0])) / TURN_RATE_RAD_S
+    turns_s = np.abs(np.diff(headings, prepend=headings[0])) / turn_rate_rad_s
     straights_s = np.linalg.norm(legs, axis=1) / SPEED_M_S
     times = np.insert(np.cumsum(np.column_stack((turns_s, straights_s)).ravel()), 0, 0.0)
     corners = np.vstack((waypoints[:1], waypoints[0] + np.cumsum(legs, axis=0)))

@@ -31,16 +31,28 @@ class RayCaster:
         self._groups[SOLID] = 1
 
     def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
-        """Ranges (beam_count,) in metres without noise, from pose (3,); ``max_range_m`` without a hit."""
-        x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser))
+        """Ranges (beam_count,) in metres without noise; ``max_range_m`` without a hit.
+
+        Args:
+            T_building_base: pose of the robot, shape (3,), or its poses at each beam, shape (beam_count, 3).
+            laser: the laser.
+        """
+        x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser)).T
         angles = heading + laser.angles_rad()
         directions = np.column_stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)))
         count, far = laser.beam_count, laser.max_range_m
         hits, distances = np.empty(count, dtype=np.int32), np.empty(count)
-        self._mujoco.mj_multiRay(
-            self._model, self._data, np.array([x, y, LASER_HEIGHT_M]), directions.ravel(), self._groups, True, -1,
-            hits, distances, None, count, far,
-        )  # fmt: skip
+        if T_building_base.ndim > 1:
+            origins = np.column_stack((x, y, np.full(count, LASER_HEIGHT_M)))
+            for k in range(count):
+                distances[k] = self._mujoco.mj_ray(
+                    self._model, self._data, origins[k], directions[k], self._groups, True, -1, hits[:1]
+                )
+        else:
+            self._mujoco.mj_multiRay(
+                self._model, self._data, np.array([x, y, LASER_HEIGHT_M]), directions.ravel(), self._groups, True, -1,
+                hits, distances, None, count, far,
+            )  # fmt: skip
         return np.where(distances < 0.0, far, np.minimum(distances, far))
 
 

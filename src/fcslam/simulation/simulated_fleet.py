@@ -16,7 +16,6 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.errors import SimulationError
-from fcslam.geometry import se2
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -24,6 +23,7 @@ from fcslam.records import (
     GroundTruth,
     LaserModel,
     LaserScan,
+    Odometry,
     RecordedItem,
     Transform,
     frozen,
@@ -31,15 +31,17 @@ from fcslam.records import (
 from fcslam.simulation.decoration import Decoration, decorate
 from fcslam.simulation.floorplan import FloorPlan, doors_after, draw_floor_plan, move_furniture, with_closed_doors
 from fcslam.simulation.lighting import light_of
-from fcslam.simulation.noise import LidarSettings, scan_beams, simulate_ranges
-from fcslam.simulation.odometry import KINDS, OdometryNoiseSettings, simulate_odometry
-from fcslam.simulation.options import Building, Lighting, OdometryKind
+from fcslam.simulation.noise import SCANNERS, LidarSettings, scan_beams, simulate_ranges
+from fcslam.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
+from fcslam.simulation.options import Building, Lighting, OdometryKind, Scanner
 from fcslam.simulation.outdoor_rays import OutdoorRayCaster
-from fcslam.simulation.route import Schedule, draw_goals, plan_route, schedule
+from fcslam.simulation.route import TURN_RATE_RAD_S, Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
 from fcslam.simulation.walk import draw_starts, plan_walk
 from fcslam.simulation.yard import draw_yard, move_cars
+from fcslam.sources.motion import moving_sweep
+from fcslam.sources.pose import UNKNOWN_POSE
 
 FIRST_STAMP = 1000.0
 STAMP_SHIFT_S = 0.001
@@ -103,8 +105,13 @@ class SimulationSettings(Settings):
         le=1.0,
         description="share of the doors that a robot drives by, but not through, which are closed",
     )
-    lidar: LidarSettings = LidarSettings(rate_hz=10.0)
-    drift: OdometryNoiseSettings = KINDS[OdometryKind.DEFAULT]
+    turn_rate_rad_s: float = Field(
+        default=TURN_RATE_RAD_S, gt=0.0, le=6.0, description="rate at which the robots turn [rad/s]"
+    )
+    lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
+    drift: OdometryNoiseSettings | None = Field(
+        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: there is none"
+    )
     camera: CameraSettings | None = CameraSettings()
 
 
@@ -121,7 +128,9 @@ class SimulatedRobot:
     T_building_base: FloatArray
     """True poses at these stamps, shape (N, 3)."""
     T_odom_base: FloatArray
-    """Wheel odometry at these stamps, shape (N, 3); the first is zero."""
+    """Wheel odometry at these stamps, shape (N, 3); NaN without odometry."""
+    readings: Readings | None
+    """Wheel odometry as it is read; None without odometry. A LiDAR that does not spin has one reading at each scan."""
     image_stamps: FloatArray
     """Stamps of its images, shape (M,), seconds; empty without a camera."""
     plan: FloorPlan
@@ -140,18 +149,33 @@ class SimulatedRobot:
         """Time from the first scan to the last."""
         return float(self.stamps[-1] - self.stamps[0])
 
-    def items(self, first_scan: int = 0, first_image: int = 0) -> Generator[RecordedItem, None, None]:
-        """Scans and images in the order of time, each followed by the true pose at its stamp.
+    @property
+    def odometry(self) -> Readings:
+        """The readings that are records of their own: those of a robot whose LiDAR spins."""
+        if self.readings is None or not self.settings.lidar.spin:
+            return Readings(np.empty(0), np.empty((0, 3)))
+        return self.readings
 
-        Scans before number ``first_scan`` and images before ``first_image`` are skipped; their true poses are not.
+    def items(
+        self, first_scan: int = 0, first_image: int = 0, first_odometry: int = 0
+    ) -> Generator[RecordedItem, None, None]:
+        """Scans, images and odometry in the order of time; a scan or an image is followed by the true pose.
+
+        Scans before number ``first_scan``, images before ``first_image`` and readings of the odometry before
+        ``first_odometry`` are skipped; true poses are not.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
         """
-        stamps = np.concatenate((self.stamps, self.image_stamps))
-        scans, count = self.scans(first_scan), len(self.stamps)
+        odometry = self.odometry
+        stamps = np.concatenate((self.stamps, self.image_stamps, odometry.stamps))
+        scans, count, end = self.scans(first_scan), len(self.stamps), len(self.stamps) + len(self.image_stamps)
         with closing(self._images(first_image)) as images:
             for k in np.argsort(stamps, kind="stable"):
+                if k >= end:
+                    if k >= end + first_odometry:
+                        yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
+                    continue
                 if first_scan <= k < count:
                     yield next(scans)
                 elif k >= count + first_image:
@@ -169,12 +193,18 @@ class SimulatedRobot:
         """
         caster, settings = ray_caster(self.plan), self.settings.lidar
         for k in range(first, len(self.stamps)):
-            rng, pose = self._generator(_RandomStream.SCANS, k), self.T_building_base[k]
+            rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
             number, index = divmod(k, len(self.lasers))
             laser = self.lasers[index].with_beams(scan_beams(settings.kind, self.lasers[index], number, rng))
-            met = caster.scan(pose, laser, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(pose, laser)
+            sweep = settings.sweep(laser.beams)
+            if sweep is not None:
+                times_s = np.linspace(sweep.first_s, sweep.last_s, laser.beam_count)
+                poses = self.route.at(stamp - self.first_stamp + times_s)
+                if self.readings is not None:
+                    sweep = moving_sweep(sweep, stamp, self.readings.around(stamp, stamp + sweep.duration_s))
+            met = caster.scan(poses, laser, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(poses, laser)
             ranges = simulate_ranges(met, laser, settings, rng)
-            yield LaserScan(float(self.stamps[k]), frozen(ranges, np.float32), laser, self.T_odom_base[k])
+            yield LaserScan(stamp, frozen(ranges, np.float32), laser, self.T_odom_base[k], sweep)
 
     def _images(self, first: int) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
@@ -184,13 +214,14 @@ class SimulatedRobot:
         fov_y_rad = 2.0 * math.atan(0.5 * self.camera.height / self.camera.fy)
         model = furnished_model(self.plan, self.decoration, light, (settings.width, settings.height), fov_y_rad)
         poses = self.route.at(self.image_stamps - self.first_stamp)
-        odometry = _between(self.image_stamps, self.stamps, self.T_odom_base)
+        odometry = None if self.readings is None else self.readings.at(self.image_stamps)
         shape = (settings.height, settings.width, 1)
         with Camera(model, self.camera, light) as camera:
             for k in range(first, len(self.image_stamps)):
                 noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
                 encoded = _jpeg(camera.take(poses[k]) + settings.noise * noise, settings.jpeg_quality)
-                yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, frozen(odometry[k]))
+                T_odom_base = None if odometry is None else odometry[k]
+                yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
 
     def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
         """A generator for each record, so that a recording can be resumed at any record."""
@@ -284,19 +315,24 @@ def _robot(
     rng: np.random.Generator,
 ) -> SimulatedRobot:
     find_way = plan_route if plan.terrain is None else plan_walk
-    route = schedule(find_way(plan, goals, settings.path_length_m, rng))
+    route = schedule(find_way(plan, goals, settings.path_length_m, rng), settings.turn_rate_rad_s)
+    if settings.lidar.spin:
+        route = route.eased()
     lasers = settings.lidar.models(_T_BASE_LASER)
     times = np.arange(0.0, route.duration_s, 1.0 / (settings.lidar.rate_hz * len(lasers)))
     poses, camera = route.at(times), settings.camera
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
+    stamps: FloatArray = frozen(np.round(first_stamp + times, 6))
+    readings = _readings(route, times, first_stamp, settings, rng)
     image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
     return SimulatedRobot(
         name=f"robot_{number + 1}",
         lasers=lasers,
         camera=camera.model() if camera else None,
-        stamps=frozen(np.round(first_stamp + times, 6)),
+        stamps=stamps,
         T_building_base=frozen(poses),
-        T_odom_base=frozen(simulate_odometry(poses, settings.drift, rng)),
+        T_odom_base=frozen(np.tile(UNKNOWN_POSE, (len(stamps), 1))) if readings is None else readings.at(stamps),
+        readings=readings,
         image_stamps=frozen(np.round(first_stamp + image_times, 6)),
         plan=plan,
         lighting=settings.lighting[number % len(settings.lighting)],
@@ -309,6 +345,17 @@ def _robot(
     )
 
 
+def _readings(
+    route: Schedule, times: FloatArray, first_stamp: float, settings: SimulationSettings, rng: np.random.Generator
+) -> Readings | None:
+    """The odometry of a robot that scans at ``times`` (N,)."""
+    if settings.drift is None:
+        return None
+    if settings.lidar.spin:
+        times = np.arange(0.0, times[-1] + 1.0 / settings.lidar.rate_hz + 1.0 / READING_RATE_HZ, 1.0 / READING_RATE_HZ)
+    return read_odometry(np.round(first_stamp + times, 6), route.at(times), settings.drift, rng)
+
+
 def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
     """Return the ray caster for a building or a yard.
 
@@ -316,14 +363,6 @@ def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
         SimulationError: MuJoCo is missing, which buildings need.
     """
     return RayCaster(bare_model(plan)) if plan.terrain is None else OutdoorRayCaster(plan)
-
-
-def _between(stamps: FloatArray, known: FloatArray, poses: FloatArray) -> FloatArray:
-    """Interpolate ``poses`` (M, 3) at the stamps ``known`` (M,) to ``stamps`` (N,), along SE(2) twists: (N, 3)."""
-    before = np.clip(np.searchsorted(known, stamps) - 1, 0, len(known) - 2)
-    share = (stamps - known[before]) / (known[before + 1] - known[before])
-    step = se2.log(se2.between(poses[before], poses[before + 1]))
-    return se2.compose(poses[before], se2.exp(share[:, None] * step))
 
 
 def _jpeg(pixels: FloatArray, quality: int) -> bytes:
