@@ -66,6 +66,8 @@ def test_the_robot_of_a_yard_is_as_asked(tmp_path):
     assert main([*tiny, "--output", str(tmp_path / "default")]) == 0
     settings = (tmp_path / "default" / "simulation.yaml").read_text(encoding="utf-8")
     assert "max_range_m: 30.0" in settings
+    assert main([*tiny, "--scanner", "ld19", "--output", str(tmp_path / "ld19")]) == 0
+    assert "max_range_m: 12.0" in (tmp_path / "ld19" / "simulation.yaml").read_text(encoding="utf-8")
 
 
 def test_a_scanner_is_as_asked_and_options_override_it(tmp_path):
