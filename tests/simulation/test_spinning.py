@@ -146,6 +146,14 @@ def test_records_come_in_order_and_the_motion_is_that_of_the_odometry():
         assert scan.sweep == moving_sweep(scan.sweep, scan.stamp, odometry)
 
 
+def test_a_reset_within_a_scan_leaves_its_motion_unknown(tmp_path):
+    drive = robot(Scanner.LD19, OdometryKind.RESET, building=Building.DEFAULT, path_length_m=20.0)
+    reset = drive.readings.stamps[len(drive.readings.stamps) // 2]
+    sweeps = [scan.sweep for scan in drive.scans() if 0.0 <= reset - scan.stamp < 0.1]
+    assert [sweep.velocity for sweep in sweeps] == [(0.0, 0.0, 0.0)]
+    record_robot(drive, tmp_path / "robot")
+
+
 def test_without_odometry_poses_and_motion_are_unknown():
     settings = robot(Scanner.LD19, OdometryKind.NONE).settings
     items = list(simulate_fleet(settings, 1).robots[0].items())

@@ -12,6 +12,8 @@ from fcslam.sources.pose import Pose, relative_pose
 
 SAMPLES: Final = 9
 """Poses by odometry that the motion during a sweep is fitted to."""
+LARGEST_SPEED: Final = 10.0
+"""Largest speed of a robot, m/s and rad/s; odometry that starts at zero again shows more and says nothing."""
 LARGEST_ACCELERATION: Final = 50.0
 """Largest acceleration of a robot, m/s^2 and rad/s^2; odometry that jumps shows more."""
 
@@ -78,7 +80,7 @@ class _Track(NamedTuple):
 
 
 def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Sweep:
-    """The sweep with the motion by odometry: the least-squares fit of a constant acceleration.
+    """The sweep with the motion by odometry: the least-squares fit of a constant acceleration, or none if it jumps.
 
     Args:
         sweep: the times of the beams.
@@ -100,6 +102,8 @@ def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Swe
     (velocity, acceleration), *_ = np.linalg.lstsq(design, motion, rcond=None)
     if np.abs(acceleration).max() > LARGEST_ACCELERATION:
         velocity, acceleration = np.linalg.lstsq(design[:, :1], motion, rcond=None)[0][0], np.zeros(3)
+    if np.abs(velocity).max() > LARGEST_SPEED:
+        return sweep
     (vx, vy, vtheta), (ax, ay, atheta) = velocity.tolist(), acceleration.tolist()
     return sweep._replace(velocity=(vx, vy, vtheta), acceleration=(ax, ay, atheta))
 
