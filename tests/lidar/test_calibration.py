@@ -30,7 +30,7 @@ def drive(delay_s=0.0, turn_scale=1.0, distance_scale=1.0, correction=(0.0, 0.0,
     turned = (
         base_at(stamps + share * SWEEP_S)[:, 2] - base_at(stamps)[:, 2] + noise * rng.normal(0.0, 0.003, len(stamps))
     )
-    motions = ScanMotions(stamps, seen, turned, np.full(len(stamps), SWEEP_S))
+    motions = ScanMotions(stamps, seen, turned, np.zeros(len(stamps)), np.full(len(stamps), SWEEP_S))
     ticks = np.arange(0.0, 130.0, 0.02)
     steps = se2.relative(base_at(ticks)) / (distance_scale, distance_scale, turn_scale)
     poses = [np.zeros(3)]
@@ -74,9 +74,8 @@ def test_odometry_of_the_wrong_sign_shows():
 
 def test_a_robot_that_hardly_moves_says_nothing():
     motions, odometry = drive()
-    still = ScanMotions(
-        motions.stamps, np.zeros_like(motions.T_local_base), np.zeros(len(motions.stamps)), motions.sweep_s
-    )
+    none = np.zeros(len(motions.stamps))
+    still = ScanMotions(motions.stamps, np.zeros_like(motions.T_local_base), none, none, motions.last_s)
     found = calibrate(still, odometry)
     assert found.delay is None
     assert found.mounting is None

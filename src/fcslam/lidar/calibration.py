@@ -1,4 +1,4 @@
-"""Calibration from motion: what the scans of a drive say about stamps, odometry and the mounting of the laser.
+"""MotionCalibration from motion: what the scans of a drive say about stamps, odometry and the mounting of the laser.
 
 The scans are tracked without odometry. Their motion is then compared with that of odometry, by robust least squares:
 
@@ -25,6 +25,8 @@ LONGEST_S: Final = 2.0
 FEWEST_TURNS: Final = 20
 FEWEST_MOTIONS: Final = 30
 """Fewer turns and motions say nothing."""
+LARGEST_RESIDUAL_M: Final = 0.015
+"""Motions of scans and odometry that differ by more, as a standard deviation, are no measure of each other."""
 LARGEST_DELAY_S: Final = 0.4
 DELAY_STEP_S: Final = 0.01
 """Range and step of the search for the delay, before it is refined."""
@@ -58,9 +60,11 @@ class ScanMotions:
     T_local_base: FloatArray
     """Poses at the stamps, shape (N, 3), metres and radians; NaN starts a new track."""
     turned_rad: FloatArray
-    """Turn in each sweep, shape (N,), as the scan was matched; NaN for a scan at once."""
-    sweep_s: FloatArray
-    """Assumed duration of each sweep, shape (N,)."""
+    """Turn from the first beam to the last, shape (N,), as the scan was matched; NaN if it is unknown."""
+    first_s: FloatArray
+    """Assumed time of the first beam after the stamp, shape (N,)."""
+    last_s: FloatArray
+    """Assumed time of the last beam after the stamp, shape (N,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +75,8 @@ class OdometryTrack:
     """Shape (M,), seconds."""
     T_odom_base: FloatArray
     """Shape (M, 3), headings unwrapped."""
+    period_s: float = 0.0
+    """Usual time between two updates."""
 
     def at(self, stamps: FloatArray) -> FloatArray:
         """Interpolated poses, shape (K, 3)."""
@@ -78,7 +84,7 @@ class OdometryTrack:
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class MotionCalibration:
     """What a drive says about the robot; None where it says nothing."""
 
     delay: Estimate | None = None
@@ -93,19 +99,21 @@ class Calibration:
     """True duration of a sweep per assumed duration."""
 
 
-def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> Calibration:
+def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibration:
     """Compare the motion of the scans with that of the odometry."""
     pairs = _pairs(motions)
     turned = np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD
     if np.count_nonzero(turned) < FEWEST_TURNS:
-        return Calibration()
+        return MotionCalibration()
     delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
     share = _sweep_share(motions, odometry, delay.value)
-    calibration = Calibration(delay, turn_scale, sweep_share=share)
+    calibration = MotionCalibration(delay, turn_scale, sweep_share=share)
     if len(pairs) < FEWEST_MOTIONS:
         return calibration
-    distance_scale, mounting = _mounting(motions, odometry, pairs, delay.value, turn_scale.value)
-    return Calibration(delay, turn_scale, distance_scale, mounting, share)
+    fit = _mounting(motions, odometry, pairs, delay.value, turn_scale.value)
+    if fit is None:
+        return MotionCalibration(turn_scale=turn_scale)
+    return MotionCalibration(delay, turn_scale, *fit, share)
 
 
 def _pairs(motions: ScanMotions) -> Pairs:
@@ -151,8 +159,8 @@ def _delay_and_scale(motions: ScanMotions, odometry: OdometryTrack, pairs: Pairs
 def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) -> Estimate | None:
     """Share of the assumed duration in which the beams were measured, by the turns in the sweeps."""
     known = np.isfinite(motions.turned_rad)
-    begins, duration_s = motions.stamps[known] + delay_s, motions.sweep_s[known]
-    by_odometry = odometry.at(begins + duration_s)[:, 2] - odometry.at(begins)[:, 2]
+    stamps = motions.stamps[known] + delay_s
+    by_odometry = odometry.at(stamps + motions.last_s[known])[:, 2] - odometry.at(stamps + motions.first_s[known])[:, 2]
     turning = np.abs(by_odometry) > 0.25 * LEAST_TURN_RAD
     if np.count_nonzero(turning) < FEWEST_TURNS:
         return None
@@ -162,8 +170,12 @@ def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) 
 
 def _mounting(
     motions: ScanMotions, odometry: OdometryTrack, pairs: Pairs, delay_s: float, turn_scale: float
-) -> tuple[Estimate, tuple[Estimate, Estimate, Estimate]]:
-    """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g)."""
+) -> tuple[Estimate, tuple[Estimate, Estimate, Estimate]] | None:
+    """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g).
+
+    Returns:
+        The scale s of distances and the correction C; None if the motions do not agree.
+    """
     first, last = pairs.T
     moved = se2.between(odometry.at(motions.stamps[first] + delay_s), odometry.at(motions.stamps[last] + delay_s))
     seen = se2.between(motions.T_local_base[first], motions.T_local_base[last])
@@ -172,6 +184,8 @@ def _mounting(
     rows_y = np.stack((-sin, 1.0 - cos, seen[:, 1], seen[:, 0]), axis=1)
     design, target = np.concatenate((rows_x, rows_y)), np.concatenate((moved[:, 0], moved[:, 1]))
     (x, y, a, b), covariance = _robust(design, target)
+    if 1.4826 * float(np.median(np.abs(target - design @ (x, y, a, b)))) > LARGEST_RESIDUAL_M:
+        return None
     scale = 1.0 / max(float(np.hypot(a, b)), 1e-9)
     sigma_x, sigma_y, sigma_a, sigma_b = np.sqrt(np.diag(covariance)).tolist()
     sigma = scale * float(np.hypot(sigma_a, sigma_b))

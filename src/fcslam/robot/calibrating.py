@@ -1,18 +1,18 @@
-"""Calibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with that."""
+"""MotionCalibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with that."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from math import degrees
 from typing import Final
 
 import numpy as np
 
-from fcslam.lidar.calibration import Calibration, Estimate, OdometryTrack, ScanMotions, calibrate
+from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.records import FloatArray, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
-from fcslam.sources.bags.options import Correction
+from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
@@ -34,6 +34,8 @@ LEAST_SHARE: Final = 0.1
 """Smaller differences from what the bag says are not corrected."""
 AT_ONCE_SHARE: Final = 0.15
 """Beams that take a smaller share of the time between scans are measured at once."""
+WHOLE_SHARE: Final = 0.05
+"""A scanner that spins without a pause measures all the time between scans."""
 STAMP_TOLERANCE_S: Final = 0.005
 """Tolerance by which a delay is that of a stamp in the middle or at the end of a scan, and not of another clock."""
 
@@ -42,8 +44,8 @@ STAMP_TOLERANCE_S: Final = 0.005
 class Calibrated:
     """What the motion in a bag says, and what of it is corrected."""
 
-    calibration: Calibration
-    correction: Correction
+    calibration: MotionCalibration
+    correction: BagCorrection
     lines: tuple[str, ...]
     """What is corrected and how sure it is, one sentence each."""
 
@@ -57,21 +59,22 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     survey = bag.survey()
     assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
     if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:
-        return Calibrated(Calibration(), Correction(), ())
+        return Calibrated(MotionCalibration(), BagCorrection(), ())
     motions, odometry = _tracked(bag.records(), config, assumed_s)
     if len(motions.stamps) < 2:
-        return Calibrated(Calibration(), Correction(), ())
+        return Calibrated(MotionCalibration(), BagCorrection(), ())
     if odometry is None:
         odometry = OdometryTrack(motions.stamps, _unwrapped(motions.T_local_base))
-        calibration = Calibration(sweep_share=calibrate(motions, odometry).sweep_share)
+        calibration = MotionCalibration(sweep_share=calibrate(motions, odometry).sweep_share)
     else:
         calibration = calibrate(motions, odometry)
     scale = calibration.turn_scale
     if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
-        return Calibrated(calibration, Correction(), _contradiction(scale))
-    if odometry is not None and np.median(np.diff(odometry.stamps)) > LONGEST_PERIOD_S:
+        return Calibrated(calibration, BagCorrection(), _contradiction(scale))
+    if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
-    found = _corrected(calibration, float(np.median(motions.sweep_s)), bag.stream.states_sweep)
+    assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
+    found = _corrected(calibration, assumed, bag.stream.states_sweep)
     sweep = found.correction.sweep
     if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
         found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
@@ -114,7 +117,7 @@ def _tracked(
     stamps: list[float] = []
     poses: list[FloatArray] = []
     turned: list[float] = []
-    durations: list[float] = []
+    times: list[tuple[float, float]] = []
     odometry: list[Odometry] = []
     turn_rad = 0.0
     for record in records:
@@ -124,8 +127,8 @@ def _tracked(
             continue
         if len(stamps) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break
-        times = Sweep(0.0, assumed_s) if record.sweep is None else Sweep(record.sweep.first_s, record.sweep.last_s)
-        scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=times)))
+        beams = Sweep(0.0, assumed_s) if record.sweep is None else Sweep(record.sweep.first_s, record.sweep.last_s)
+        scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
         tracked = frontend.localize(scan)
         frontend.process(scan, tracked)
         sweep, is_matched = tracked.tracked.sweep, bool(tracked.tracked.information.any())
@@ -135,9 +138,10 @@ def _tracked(
         stamps.append(scan.stamp)
         poses.append(tracked.tracked.T_local_base if is_matched or not stamps else unknown)
         turned.append(turn if is_matched else np.nan)
-        durations.append(sweep.last_s - sweep.first_s)
+        times.append((sweep.first_s, sweep.last_s))
         turn_rad += abs(turn)
-    motions = ScanMotions(np.array(stamps), np.array(poses).reshape(-1, 3), np.array(turned), np.array(durations))
+    first_s, last_s = np.array(times).reshape(-1, 2).T
+    motions = ScanMotions(np.array(stamps), np.array(poses).reshape(-1, 3), np.array(turned), first_s, last_s)
     return motions, _track_of(odometry)
 
 
@@ -150,7 +154,8 @@ def _track_of(odometry: list[Odometry]) -> OdometryTrack | None:
     stamps = np.array([reading.stamp for reading in fresh])
     grows = np.concatenate(([True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]))
     poses = np.array([reading.T_odom_base for reading in fresh])
-    return OdometryTrack(stamps[grows], _unwrapped(poses[grows]))
+    period_s = max(updates.period_s, float(np.median(np.diff(stamps[grows]))) if len(stamps) > 1 else 0.0)
+    return OdometryTrack(stamps[grows], _unwrapped(poses[grows]), period_s)
 
 
 def _unwrapped(poses: FloatArray) -> FloatArray:
@@ -159,45 +164,59 @@ def _unwrapped(poses: FloatArray) -> FloatArray:
     return known
 
 
-def _corrected(calibration: Calibration, assumed_s: float, states_sweep: bool) -> Calibrated:
-    """What is significant, as a correction and in words."""
-    correction, lines = Correction(), []
-    delay, sweep_share, turn_scale = calibration.delay, calibration.sweep_share, calibration.turn_scale
-    share = None
-    if sweep_share is not None:  # odometry's scale is in both
-        scale = 1.0 if turn_scale is None else turn_scale.value
-        share = Estimate(sweep_share.value / scale, sweep_share.sigma / abs(scale))
-    nominal = 1.0 if states_sweep else 0.0
-    first_s = 0.0 if delay is None or not delay.differs(0.0, LEAST_DELAY_S) else delay.value
-    taken = nominal if share is None or not share.differs(nominal, LEAST_SHARE) else share.value
-    last_s = first_s + (0.0 if abs(taken) < AT_ONCE_SHARE else taken) * assumed_s
-    earliest_s, latest_s = min(first_s, last_s), max(first_s, last_s)
-    stamped = next(
-        (
-            where
-            for where, time_s in (("first", earliest_s), ("last", latest_s), ("middle", 0.5 * (earliest_s + latest_s)))
-            if abs(time_s) <= STAMP_TOLERANCE_S
-        ),
-        None,
-    )
-    if stamped is None:
-        assert delay is not None
-        correction = replace(correction, odometry_delay_s=earliest_s)
-        lines.append(f"the clock of the odometry is {1e3 * earliest_s:.0f} ms ahead of that of the scans; corrected")
-        first_s, last_s, stamped = first_s - earliest_s, last_s - earliest_s, "first"
-    if (last_s - first_s != nominal * assumed_s) or stamped != "first":
+def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], states_sweep: bool) -> Calibrated:
+    """What is significant, as a correction and in words.
+
+    Args:
+        calibration: the estimates.
+        assumed: times of the first and the last beam after the stamp with which the scans were tracked, seconds.
+        states_sweep: whether the bag says these times; otherwise it says that all beams are measured at once.
+    """
+    share, nominal = _share(calibration), 1.0 if states_sweep else 0.0
+    is_late = calibration.delay is not None and calibration.delay.differs(0.0, LEAST_DELAY_S)
+    is_other = share is not None and share.differs(nominal, LEAST_SHARE)
+    if not is_late and not is_other:
+        return _mounted(calibration, BagCorrection(), [])
+    delay_s = calibration.delay.value if calibration.delay is not None and is_late else 0.0
+    taken = share.value if share is not None and is_other else nominal
+    if abs(abs(taken) - 1.0) < WHOLE_SHARE:
+        taken = math.copysign(1.0, taken)
+    first_s = assumed[0] * nominal + delay_s
+    last_s = first_s + (0.0 if abs(taken) < AT_ONCE_SHARE else taken) * (assumed[1] - assumed[0])
+    correction, lines = BagCorrection(), []
+    where = _stamped(first_s, last_s)
+    if where is None:  # no beam is measured at the stamp: another clock
+        ahead_s = min(first_s, last_s)
+        correction = replace(correction, odometry_delay_s=ahead_s)
+        lines.append(f"the clock of the odometry is {1e3 * ahead_s:.0f} ms ahead of that of the scans; corrected")
+        first_s, last_s, where = first_s - ahead_s, last_s - ahead_s, "first"
+    if is_other or where != "first":
         correction = replace(correction, sweep=(first_s, last_s))
-        if abs(last_s - first_s) > 0.0:
-            lines.append(
-                f"a scan takes {1e3 * abs(last_s - first_s):.0f} ms{' clockwise' * (last_s < first_s)}, and its stamp "
-                f"is that of the {stamped} beam; used"
-            )
-        else:
-            lines.append("all beams of a scan are measured at once; used")
+        duration = f"takes {1e3 * abs(last_s - first_s):.0f} ms{' clockwise' * (last_s < first_s)}"
+        lines.append(
+            "all beams of a scan are measured at once; used"
+            if first_s == last_s
+            else f"a scan {duration}, and its stamp is that of the {where} beam; used"
+        )
     return _mounted(calibration, correction, lines)
 
 
-def _mounted(calibration: Calibration, correction: Correction, lines: list[str]) -> Calibrated:
+def _share(calibration: MotionCalibration) -> Estimate | None:
+    """Duration of a sweep per assumed duration, without the scale of the odometry's turns."""
+    if calibration.sweep_share is None:
+        return None
+    scale = 1.0 if calibration.turn_scale is None else abs(calibration.turn_scale.value)
+    return Estimate(calibration.sweep_share.value / scale, calibration.sweep_share.sigma / scale)
+
+
+def _stamped(first_s: float, last_s: float) -> str | None:
+    """Which beam is measured at the stamp, in the order of time; None if it is none of these."""
+    earliest_s, latest_s = min(first_s, last_s), max(first_s, last_s)
+    times = (("first", earliest_s), ("last", latest_s), ("middle", 0.5 * (earliest_s + latest_s)))
+    return next((where for where, time_s in times if abs(time_s) <= STAMP_TOLERANCE_S), None)
+
+
+def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: list[str]) -> Calibrated:
     for name, scale in (("distance", calibration.distance_scale), ("turn", calibration.turn_scale)):
         if scale is not None and scale.differs(1.0, 5.0 * LEAST_SCALE):
             lines.append(f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f})")
@@ -208,8 +227,8 @@ def _mounted(calibration: Calibration, correction: Correction, lines: list[str])
     if yaw.differs(0.0, LEAST_YAW_RAD):
         side = "left" if yaw.value > 0.0 else "right"
         lines.append(
-            f"the laser is mounted {degrees(abs(yaw.value)):.1f} deg (+- {degrees(yaw.sigma):.1f}) to the {side} of "
-            "what tf says; used"
+            f"the laser is mounted {math.degrees(abs(yaw.value)):.1f} deg (+- {math.degrees(yaw.sigma):.1f}) to the "
+            f"{side} of what tf says; used"
         )
         moved[2] = yaw.value
     if x.differs(0.0, LEAST_OFFSET_M) or y.differs(0.0, LEAST_OFFSET_M):

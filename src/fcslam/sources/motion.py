@@ -46,7 +46,7 @@ class OdometryUpdates:
     """
 
     def __init__(self) -> None:
-        self._period_s = 0.0
+        self.period_s = 0.0
         """Longest time between two updates of a moving robot; 0 if every reading is an update."""
         self._update: tuple[float, Pose] | None = None
         """Stamp and pose of the newest reading that differs from the one before."""
@@ -59,11 +59,11 @@ class OdometryUpdates:
             held_s = stamp - changed_s
             if T_odom_base == pose:
                 self._repeats += 1
-                return not 0.0 <= held_s <= self._period_s
+                return not 0.0 <= held_s <= self.period_s
             x, y, theta = relative_pose(pose, T_odom_base)
             is_step = hypot(x, y) > LEAST_STEP_M or abs(theta) > LEAST_STEP_RAD
             if self._repeats >= FEWEST_REPEATS and 0.0 < held_s <= LONGEST_UPDATE_S and is_step:
-                self._period_s = max(self._period_s, held_s)
+                self.period_s = max(self.period_s, held_s)
         self._update, self._repeats = (stamp, T_odom_base), 0
         return True
 

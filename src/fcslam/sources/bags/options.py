@@ -10,7 +10,7 @@ NO_ODOMETRY: Final = "none"
 
 
 @dataclass(frozen=True, slots=True)
-class Correction:
+class BagCorrection:
     """What the motion in a bag says against its messages."""
 
     odometry_delay_s: float = 0.0
@@ -33,4 +33,4 @@ class BagOptions:
     camera_topic: str | None = None
     laser_poses: tuple[Pose, ...] = ()
     """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf."""
-    correction: Correction = field(default_factory=Correction)
+    correction: BagCorrection = field(default_factory=BagCorrection)

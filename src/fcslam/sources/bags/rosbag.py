@@ -16,7 +16,7 @@ from fcslam.geometry import se2
 from fcslam.records import CameraModel, Odometry, SensorRecord
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import OdometryReading
-from fcslam.sources.bags.options import BagOptions, Correction
+from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
     USUAL_BASES,
@@ -170,7 +170,7 @@ class RosBag:
         """Whether the first laser is."""
         return self._reading.rig.upside_down[0]
 
-    def corrected(self, correction: Correction, notes: tuple[str, ...]) -> "RosBag":
+    def corrected(self, correction: BagCorrection, notes: tuple[str, ...]) -> "RosBag":
         """The same bag, read with a correction that ``notes`` explain."""
         if self._options.laser_poses:
             correction = replace(correction, mounting=(0.0, 0.0, 0.0))
@@ -215,7 +215,7 @@ def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]
     return [RosBag(bag.stream.path, bag.name, agreed, () if k else notes) for k, bag in enumerate(bags)]
 
 
-def _moved(mounted: Mounting, correction: Correction) -> Mounting:
+def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
     x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
     return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
 
