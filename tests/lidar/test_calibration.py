@@ -21,7 +21,7 @@ def base_at(stamps):
 
 
 def drive(delay_s=0.0, turn_scale=1.0, distance_scale=1.0, correction=(0.0, 0.0, 0.0), share=1.0, noise=1.0):
-    """What the scans show, with the laser at ``correction`` from where it is believed to be, and odometry."""
+    """Motions of the scans, with the laser at ``correction`` from its stated mounting, and of the odometry."""
     rng = np.random.default_rng(5)
     stamps = np.arange(1.0, 110.0, SCAN_S)
     laser = se2.compose(base_at(stamps), se2.compose(correction, MOUNTING))

@@ -1,4 +1,4 @@
-"""MotionCalibration from motion: what the scans of a drive say about stamps, odometry and the mounting of the laser.
+"""Calibration from motion: what the scans of a drive say about stamps, odometry and the mounting of the laser.
 
 The scans are tracked without odometry. Their motion is then compared with that of odometry, by robust least squares:
 
@@ -33,7 +33,7 @@ DELAY_STEP_S: Final = 0.01
 HUBER: Final = 1.5
 """Residuals beyond this many standard deviations count less."""
 CORRELATED: Final = 3.0
-"""Standard deviations are larger by this: residuals that follow each other are alike."""
+"""Factor of the standard deviations: consecutive residuals are correlated."""
 
 
 Pairs = NDArray[np.int64]
@@ -85,7 +85,7 @@ class OdometryTrack:
 
 @dataclass(frozen=True, slots=True)
 class MotionCalibration:
-    """What a drive says about the robot; None where it says nothing."""
+    """Estimates from a drive; None where it holds no information."""
 
     delay: Estimate | None = None
     """Time by the clock of the odometry at a stamp of the scans, less this stamp, seconds."""

@@ -85,9 +85,9 @@ def match_scan(
 ) -> ScanMatch:
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
-    The points of a sweep were measured at different times. Their positions assume a motion, whose velocity is corrected
-    together with the pose: a point of time t moves by t times the correction (continuous-time matching as in Dellenbach
-    et al., "CT-ICP", ICRA 2022, with one velocity for a scan).
+    The points of a sweep were measured at different times, and their positions assume a motion. Its velocity is corrected
+    together with the pose: a point of time t moves by t times the correction. This is continuous-time matching as in
+    Dellenbach et al., "CT-ICP", ICRA 2022, with one velocity for a scan.
 
     Args:
         scan: points in ``base``.
@@ -124,8 +124,8 @@ def _match(scan, guess, prior, velocity_prior, field, iterations, wide, narrow, 
     """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``narrow``.
 
     It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + v^T diag(velocity_prior) v. The
-    Jacobian of e_i is (J_i, t_i J_i) over pose and velocity v, so the normal equations are made of the sums of J^T J,
-    t J^T J and t^2 J^T J; v is eliminated by the Schur complement.
+    Jacobian of e_i over pose and velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J,
+    t J^T J and t^2 J^T J. The Schur complement eliminates v.
     """
     pose, velocity = guess.copy(), np.zeros(3)
     scale = wide
@@ -231,8 +231,8 @@ def _sums(scan, pose, velocity, field, scale):  # type: ignore[no-untyped-def]
 def _terms(scan, i, pose, cos, sin, t, velocity, field, c2):  # type: ignore[no-untyped-def]
     """w J^T J (upper triangle) and w J^T e of point i, measured at t.
 
-    e is the distance from the point to the line of its surfel, and J = (n_x, n_y, n x r) its Jacobian over the pose,
-    with the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
+    e is the distance from the point to the line of its surfel. Its Jacobian over the pose is J = (n_x, n_y, n x r), with
+    the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
     and along y. The weight w is that of Geman and McClure.
     """
     none = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

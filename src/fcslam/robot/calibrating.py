@@ -1,4 +1,4 @@
-"""MotionCalibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with that."""
+"""Calibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with it."""
 
 import math
 from collections.abc import Iterator
@@ -42,12 +42,12 @@ STAMP_TOLERANCE_S: Final = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What the motion in a bag says, and what of it is corrected."""
+    """Estimates from the motion in a bag, and the corrections that they allow."""
 
     calibration: MotionCalibration
     correction: BagCorrection
     lines: tuple[str, ...]
-    """What is corrected and how sure it is, one sentence each."""
+    """A sentence for each correction, with its standard deviation."""
 
 
 def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
@@ -165,7 +165,7 @@ def _unwrapped(poses: FloatArray) -> FloatArray:
 
 
 def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], states_sweep: bool) -> Calibrated:
-    """What is significant, as a correction and in words.
+    """The significant estimates as a correction and in words.
 
     Args:
         calibration: the estimates.

@@ -11,7 +11,7 @@ NO_ODOMETRY: Final = "none"
 
 @dataclass(frozen=True, slots=True)
 class BagCorrection:
-    """What the motion in a bag says against its messages."""
+    """Corrections of the messages of a bag, from the motion in it."""
 
     odometry_delay_s: float = 0.0
     """Stamps of the odometry are this much later than those of scans made at the same time."""
