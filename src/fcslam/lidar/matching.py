@@ -85,8 +85,8 @@ def match_scan(
 ) -> ScanMatch:
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
-    The points of a sweep were measured at different times, and their positions assume a motion. Its velocity is corrected
-    together with the pose: a point of time t moves by t times the correction. This is continuous-time matching as in
+    The points of a sweep were measured at different times, and their positions assume a motion. Its velocity is
+    corrected together with the pose: a point of time t moves by t times the correction. This is continuous-time matching as in
     Dellenbach et al., "CT-ICP", ICRA 2022, with one velocity for a scan.
 
     Args:
@@ -231,8 +231,8 @@ def _sums(scan, pose, velocity, field, scale):  # type: ignore[no-untyped-def]
 def _terms(scan, i, pose, cos, sin, t, velocity, field, c2):  # type: ignore[no-untyped-def]
     """w J^T J (upper triangle) and w J^T e of point i, measured at t.
 
-    e is the distance from the point to the line of its surfel. Its Jacobian over the pose is J = (n_x, n_y, n x r), with
-    the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
+    e is the distance from the point to the line of its surfel. Its Jacobian over the pose is J = (n_x, n_y, n x r),
+    with the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
     and along y. The weight w is that of Geman and McClure.
     """
     none = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
