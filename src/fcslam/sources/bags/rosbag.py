@@ -114,7 +114,13 @@ class RosBag:
         tilts = (
             self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
-        notes = (*self._notes, *self.stream.topics.notes, *filter(None, tilts), *camera_notes)
+        notes = (
+            *self._notes,
+            *self.stream.reading_notes,
+            *self.stream.topics.notes,
+            *filter(None, tilts),
+            *camera_notes,
+        )
         rig = rig_of([laser.first for laser in self.stream.lasers], mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
         return _Reading(survey, rig)
@@ -162,7 +168,8 @@ class RosBag:
         except NoTransformError as error:
             raise SourceError(
                 f"{self.stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
-                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}"
+                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
+                "if it is in another part of this recording, give both joined by a comma"
             ) from error
         except TiltedLaserError as error:
             raise SourceError(

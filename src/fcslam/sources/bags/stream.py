@@ -53,6 +53,11 @@ class BagStream:
         self._bag = BagFile(path)
         self._options = options
 
+    @property
+    def reading_notes(self) -> tuple[str, ...]:
+        """How the bag was read, if it is not whole; complete after a pass over all messages."""
+        return self._bag.notes
+
     @cached_property
     def candidates(self) -> Candidates:
         """The topics that can be read.
