@@ -13,7 +13,7 @@ from typing import NamedTuple
 from fcslam.errors import SourceError
 from fcslam.records import CameraModel, Odometry, SensorRecord
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading
+from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
@@ -114,9 +114,15 @@ class RosBag:
         tilts = (
             self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
+        unlimited = (
+            f"{self.stream.path}: {laser.topic.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
+            for laser in self.stream.lasers
+            if laser.first.range_max_m == UNKNOWN_RANGE_M
+        )
         notes = (
             *self._notes,
             *self.stream.reading_notes,
+            *unlimited,
             *self.stream.topics.notes,
             *filter(None, tilts),
             *camera_notes,
@@ -138,7 +144,7 @@ class RosBag:
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
-        check_consistency(path, faults, scans.count, odometry.count)
+        check_consistency(path, faults, scans.count, odometry.count, self._first_errors())
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
             raise SourceError(
@@ -146,6 +152,11 @@ class RosBag:
                 f"the first scan has the stamp {laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from "
                 f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
             )
+
+    def _first_errors(self) -> str:
+        """What is wrong with the first messages that cannot be read, in brackets."""
+        errors = [f"{topic}, {error}" for topic, error in self.stream.first_errors.items()]
+        return f" ({'; '.join(errors)})" * bool(errors)
 
     def _mountings(self, tree: TransformTree, base_frame: str) -> list[Mounting]:
         lasers = self.stream.lasers
@@ -167,7 +178,8 @@ class RosBag:
             return level_mounting(tree, base_frame, laser_frame)
         except NoTransformError as error:
             raise SourceError(
-                f"{self.stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
+                f"{self.stream.path}: tf has {error}{self._first_errors()}, so it does not say where the laser of "
+                f"{topic} sits; say it by "
                 f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
                 "if it is in another part of this recording, give both joined by a comma"
             ) from error

@@ -1,6 +1,7 @@
 """The scans of a bag with their odometry, in the order of recording."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -35,6 +36,7 @@ from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
 
 _EDGES_NAMED = 10
 _IMAGES_TRIED = 5
+_READINGS_TRIED, _TRANSFORMS_TRIED = 20, 200
 
 
 class RecordedLaser(NamedTuple):
@@ -52,6 +54,8 @@ class BagStream:
         self.path = path
         self._bag = BagFile(path)
         self._options = options
+        self.first_errors: dict[str, str] = {}
+        """What is wrong with the first message of each topic that cannot be read."""
 
     @property
     def reading_notes(self) -> tuple[str, ...]:
@@ -65,7 +69,8 @@ class BagStream:
         Raises:
             SourceError: the bag cannot be read.
         """
-        return find_candidates(self._bag, self._field_of_view_rad, self._has_images)
+        found = find_candidates(self._bag, self._field_of_view_rad, self._has_images)
+        return found._replace(measured=[topic for topic in found.measured if not self._odometry_error(topic)])
 
     @cached_property
     def topics(self) -> Topics:
@@ -74,7 +79,30 @@ class BagStream:
         Raises:
             SourceError: the bag cannot be read, or a topic is missing.
         """
-        return choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
+        topics = choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
+        chosen = topics.odometry[0]
+        error = "" if self._options.odom_topic is not None else self._odometry_error(chosen)
+        if not error or not any(map(is_odometry, self._first_transforms(topics))):
+            return topics
+        note = f"{self.path}: {chosen.name} cannot be read ({error}), so the odometry is read from tf"
+        return topics._replace(odometry=topics.transforms, notes=(*topics.notes, note))
+
+    def _odometry_error(self, topic: Topic) -> str:
+        """What is wrong with the first messages of a topic of odometry; empty if one of them can be read."""
+        errors = []
+        for message in islice(self._bag.messages([topic]), _READINGS_TRIED if topic.type == ODOMETRY else 0):
+            try:
+                odometry_of(self._bag.decode(message), message.bag_time_ns)
+            except ValueError as error:
+                errors.append(str(error))
+            else:
+                return ""
+        return next(iter(errors), "")
+
+    def _first_transforms(self, topics: Topics) -> Iterator[StampedTransform]:
+        for message in islice(self._bag.messages(topics.transforms), _TRANSFORMS_TRIED):
+            with suppress(ValueError):
+                yield from self._transforms_in(message)
 
     @cached_property
     def lasers(self) -> list[RecordedLaser]:
@@ -90,7 +118,7 @@ class BagStream:
         if not scans:
             raise SourceError(
                 f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read"
-                f"{self._reason(topic)}; record it again"
+                f"{self._reason(topic)}; correct the laser's driver, or copy the bag again"
             )
         usual = usual_beams([scan.beams for scan in scans])
         return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual))
@@ -132,7 +160,8 @@ class BagStream:
                 items = self._items_in(message, tree)
             except BeamsError:
                 audit.add(Fault.BAD_BEAMS, message.number)
-            except ValueError:
+            except ValueError as error:
+                self.first_errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
                 is_image = message.topic == topics.camera
                 audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
             else:
@@ -191,14 +220,12 @@ class BagStream:
             yield scan
 
     def _reason(self, topic: Topic) -> str:
-        """Return the fault of the angles of the first scan, if they have one."""
+        """What is wrong with the first scan."""
         for message in islice(self._bag.messages([topic]), 1):
             try:
                 scan_of(self._bag.decode(message), message.bag_time_ns)
-            except BeamsError as error:
+            except ValueError as error:
                 return f" ({error})"
-            except ValueError:
-                break
         return ""
 
     def _image_in(self, message: RawMessage) -> ImageMessage:
