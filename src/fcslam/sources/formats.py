@@ -10,7 +10,7 @@ from fcslam.sources.bags.container import ZSTD, is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag, as_fleet
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
-from fcslam.sources.logs.carmen import CARMEN
+from fcslam.sources.logs.carmen import CARMEN, RAW_CARMEN
 from fcslam.sources.logs.cmu import CMU
 from fcslam.sources.logs.dialect import Dialect
 from fcslam.sources.logs.duke import DUKE
@@ -41,7 +41,7 @@ def _text_format(dialect: Dialect) -> Format:
 
 
 FORMATS: tuple[Format, ...] = (
-    *map(_text_format, (CARMEN, CMU, DUKE, MINES)),
+    *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES)),
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format(_BAG, is_bag, RosBag, takes_options=True),
 )
@@ -90,7 +90,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
 
 def _robot_name(path: Path) -> str:
     """The name of the file, or the common beginning of the names of several."""
-    names = [robot_name(path)] if path.is_dir() else list(map(robot_name, parts_of(path)))
+    names = [robot_name(path)] if os.path.isdir(path) else list(map(robot_name, parts_of(path)))
     return os.path.commonprefix(names).strip("._-") or names[0]  # noqa: RUF071  of letters
 
 
@@ -101,7 +101,7 @@ def format_of(path: Path) -> Format:
         SourceError: as ``open_source``.
     """
     parts = parts_of(path)
-    if len(parts) > 1 and not path.is_dir():
+    if len(parts) > 1 and not os.path.isdir(path):
         for part in parts:
             if (kind := format_of(part)).name != _BAG:
                 raise SourceError(f"{part}: a {kind.name} is no part of several; give one recording, or parts of a bag")

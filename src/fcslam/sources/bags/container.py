@@ -81,8 +81,9 @@ def is_bag(path: Path, head: bytes) -> bool:
 
 def parts_of(path: Path) -> tuple[Path, ...]:
     """The files of one recording: of a folder without metadata, or several joined by commas; else the path itself."""
-    if path.is_dir():
-        return (path,) if (path / _METADATA).is_file() else tuple(_storage_files(path))
+    if os.path.isdir(path):
+        with translate_errors(path):
+            return (path,) if (path / _METADATA).is_file() else tuple(_storage_files(path)) or (path,)
     names = str(path).split(",")
     return (path,) if os.path.lexists(path) or not all(names) else tuple(map(Path, names))
 

@@ -6,7 +6,9 @@ shows that there is odometry.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +35,7 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
+from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 
@@ -41,6 +44,8 @@ class _Reading(NamedTuple):
 
     survey: Survey
     rig: Rig
+    placeholders: tuple[tuple[float, ...], ...]
+    """Values that are no ranges, of each laser."""
 
 
 class RosBag:
@@ -77,10 +82,12 @@ class RosBag:
         """As in Source."""
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
-        rig = self._reading.rig
+        rig, placeholders = self._reading.rig, self._reading.placeholders
         for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
+                if values := placeholders[entry.scan.laser]:
+                    record = replace(record, ranges_m=without(record.ranges_m, values))
                 watch.add(number, record)
                 yield record
             elif isinstance(entry, OdometryReading):
@@ -100,14 +107,22 @@ class RosBag:
         """Summary from one pass over the whole bag; rejects a bag that cannot be mapped."""
         audit, tree = _audit(), TransformTree()
         scans, odometry = PathSummary(), PathSummary()
+        samples = [RangeSample() for _ in self.stream.lasers]
         base_frame = ""
         for _, entry in self.stream.entries(audit, tree):
             if isinstance(entry, PosedScan):
+                if (sample := samples[entry.scan.laser]).wants(entry.T_odom_base):
+                    scan = entry.scan
+                    sample.add(entry.T_odom_base, scan.raw_ranges_m, scan.range_min_m, scan.range_max_m)
                 scans.add(entry.scan.stamp, entry.T_odom_base)
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
+        which = [f" of {laser.topic.name}" for laser in self.stream.lasers]
+        for sample, its in zip(samples, which, strict=True):
+            sample.check(self.stream.path, its)
+        placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = self._mountings(tree, base_frame)
         camera, camera_notes = self._camera(tree, base_frame)
@@ -123,13 +138,16 @@ class RosBag:
             *self._notes,
             *self.stream.reading_notes,
             *unlimited,
+            *chain.from_iterable(
+                placeholder_note(self.stream.path, values, its) for values, its in zip(placeholders, which, strict=True)
+            ),
             *self.stream.topics.notes,
             *filter(None, tilts),
             *camera_notes,
         )
         rig = rig_of([laser.first for laser in self.stream.lasers], mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
-        return _Reading(survey, rig)
+        return _Reading(survey, rig, placeholders)
 
     def _check_options(self, path: Path) -> None:
         topics, poses = self._options.scan_topics, self._options.laser_poses

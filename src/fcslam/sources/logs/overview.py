@@ -26,6 +26,8 @@ class LogReading(NamedTuple):
     interleaving: Interleaving | None
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
+    placeholders: tuple[float, ...] = ()
+    """Values that are no ranges."""
 
 
 class MountingEstimate:

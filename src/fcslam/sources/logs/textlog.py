@@ -7,11 +7,15 @@ Besides the rules of ``gate``:
   and is rejected. If only the odometry messages change, a scan takes the pose of the message before it.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
 from fcslam.sources.contradictions import OdometryWatch
@@ -19,15 +23,19 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
 from fcslam.sources.logs.archive import numbered_lines
 from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLine, ScanLine
-from fcslam.sources.logs.laser import Interleaving, LogBeams, first_beams
+from fcslam.sources.logs.laser import SICK_MAX_RANGE_M, Interleaving, LogBeams, first_beams
 from fcslam.sources.logs.overview import LogReading, Overview
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose, pose_array
+from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 KEPT_BYTES = 1 << 25
 """A log with more bytes is decompressed and parsed again in each pass, so that memory does not grow with its length."""
+
+
+_WORDS_NAMED, _LONGEST_WORD = 5, 20
 
 
 class _Scan(NamedTuple):
@@ -85,6 +93,7 @@ class TextLog:
             if ranges_m is None or len(ranges_m) != model.beam_count:
                 audit.add(Fault.BROKEN_LINE, number)
                 continue
+            ranges_m = without(ranges_m, self._reading.placeholders)
             scan = LaserScan(entry.line.stamp, ranges_m, model, T_odom_base)
             watch.add(number, scan)
             yield scan
@@ -93,16 +102,29 @@ class TextLog:
     def _reading(self) -> LogReading:
         """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit = Audit()
-        overview = Overview()
+        overview, sample = Overview(), RangeSample()
         declared, interleaving = self._first_look()
         gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
         for number, line in _sound(self._all_lines(), audit):
             if isinstance(line, ScanLine):
                 if not gate.admits(number, line.stamp, log_beams.of(line)):
                     continue
-                self._note_clock(number, audit)
+                _note_clock(number, line, audit)
+                self._sample(sample, line)
             overview.add(line)
-        return overview.conclude(self._path, audit.faults(), interleaving)
+        reading = overview.conclude(self._path, audit.faults(), interleaving)
+        sample.check(self._path, "")
+        placeholders = sample.placeholders()
+        notes = (*reading.survey.notes, *placeholder_note(self._path, placeholders, ""))
+        return reading._replace(survey=replace(reading.survey, notes=notes), placeholders=placeholders)
+
+    def _sample(self, sample: RangeSample, line: ScanLine) -> None:
+        if not sample.wants(line.T_odom_base):
+            return
+        max_range_m = line.stated.max_range_m if line.stated is not None else SICK_MAX_RANGE_M
+        with suppress(ValueError):
+            ranges_m = parse_ranges(line, self._dialect.metres_per_range_unit, 0, Audit())
+            sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
 
     def _first_look(self) -> tuple[Beams, Interleaving | None]:
         """The usual beams of the first scans, and whether they interleave."""
@@ -116,8 +138,17 @@ class TextLog:
                 break
         if not scans:
             seen = f"; {audit.faults()}" if audit.faults() else ""
-            raise SourceError(f"{self._path}: no laser scan in this {self._dialect.name}{seen}; give a log with scans")
+            raise SourceError(
+                f"{self._path}: no laser scan in this {self._dialect.name}{seen}; its lines are {self._kinds()}; "
+                "give a log with scans"
+            )
         return first_beams(scans, parameters)
+
+    def _kinds(self) -> str:
+        """The most common first words of the lines, with their numbers."""
+        words = (text.split(None, 1)[:1] for _, text in numbered_lines(self._path))
+        counts = Counter(word[0][:_LONGEST_WORD].decode("ascii", "replace") for word in words if word)
+        return ", ".join(f"{count} {one_line(word)}" for word, count in counts.most_common(_WORDS_NAMED))
 
     def _all_lines(self) -> Iterable[NumberedLine]:
         return self._kept or self._parsed()
@@ -148,7 +179,7 @@ class TextLog:
             self._posed(lines, audit), scans, lambda entry: isinstance(entry, _Scan), audit
         ):
             if isinstance(entry, _Scan):
-                self._note_clock(number, audit)
+                _note_clock(number, entry.line, audit)
             yield number, entry
 
     def _posed(self, lines: Iterable[NumberedLine], audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
@@ -166,9 +197,10 @@ class TextLog:
                     late = latest if reading.pose_from_odometry else None
                     yield number, _Scan(line, beams, (late or line).T_odom_base)
 
-    def _note_clock(self, number: int, audit: Audit) -> None:
-        if not self._dialect.timed:
-            audit.add(Fault.NO_STAMP, number)
+
+def _note_clock(number: int, line: ScanLine, audit: Audit) -> None:
+    if not line.is_timed:
+        audit.add(Fault.NO_STAMP, number)
 
 
 def _sound(lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, Line]]:
