@@ -12,6 +12,7 @@ from fcslam.sources.bags.rosbag import RosBag, as_fleet
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
 from fcslam.sources.logs.carmen import CARMEN, RAW_CARMEN
 from fcslam.sources.logs.cmu import CMU
+from fcslam.sources.logs.csm import CSM
 from fcslam.sources.logs.dialect import Dialect
 from fcslam.sources.logs.duke import DUKE
 from fcslam.sources.logs.mines import MINES
@@ -41,7 +42,7 @@ def _text_format(dialect: Dialect) -> Format:
 
 
 FORMATS: tuple[Format, ...] = (
-    *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES)),
+    *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES, CSM)),
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format(_BAG, is_bag, RosBag, takes_options=True),
 )

@@ -32,8 +32,8 @@ _MILLIMETRES = 900.0
 """Values of which half are larger are millimetres and not centimetres."""
 _REPEATED, _PLACES = 0.1, 0.5
 """Share of the beams that have a placeholder, and of the places at which as many have it."""
-_NEAR, _ABOVE_NEAR = 0.05, 5
-"""Share of a value by which others are near it, and how many times more frequent than these a placeholder is."""
+_NEAR, _ABOVE_NEAR = 2, 5
+"""How many values to each side are near another, and how many times more frequent than these a placeholder is."""
 _FIRST, _KEPT = 20, 256
 """Scans that are kept wherever they are from, and most that are kept."""
 _APART_M, _APART_RAD = 0.3, 0.3
@@ -80,9 +80,10 @@ class RangeSample:
         values, counts = np.unique(np.concatenate([_returns(place) for place in places]), return_counts=True)
         found = []
         for value, count in zip(values[counts > _REPEATED * beams], counts[counts > _REPEATED * beams], strict=True):
-            near = (np.abs(values - value) <= _NEAR * value) & (values != value)
+            at_index = int(np.searchsorted(values, value))
+            near = np.concatenate((counts[max(at_index - _NEAR, 0) : at_index], counts[at_index + 1 :][:_NEAR]))
             at = sum(np.count_nonzero(place.values == value) > _REPEATED * len(place.values) for place in places)
-            if at > _PLACES * len(places) and count > _ABOVE_NEAR * counts[near].max(initial=0):
+            if at > _PLACES * len(places) and count > _ABOVE_NEAR * near.max(initial=0):
                 found.append(float(value))
         return tuple(found)
 
