@@ -56,7 +56,7 @@ class RangeSample:
         self._seen, self._step = 0, 1
 
     def wants(self, T_odom_base: Pose) -> bool:
-        """Whether the next scan is worth to be added."""
+        """Whether to add the next scan."""
         if self._last is not None and self._seen >= _FIRST and not _is_apart(self._last, T_odom_base):
             return False
         self._seen += 1
@@ -126,7 +126,7 @@ def without(values: Ranges, placeholders: Sequence[float]) -> Ranges:
 
 
 def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> list[str]:
-    """What is said about placeholders, as sentences."""
+    """The notice about placeholders; empty without any."""
     shown = ", ".join(f"{value:g}" for value in placeholders)
     return [f"{path}: {shown} m repeats exactly in many beams{which} everywhere, so it is no range"] * bool(shown)
 

@@ -34,7 +34,7 @@ _SQLITE_HEADER_BYTES = 100
 _LONGEST_TOPIC = 255
 """Characters in a topic's name, as in ROS 2."""
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""Begins a file or a message that is compressed by itself; only the metadata beside a file says so."""
+"""The first bytes of a file or message in zstd; only the metadata beside a file states this compression."""
 _LONGEST_PAUSE_NS, _LONGEST_OVERLAP_NS = 60 * 10**9, 10**9
 """Of the scans in two parts of one recording, from the end of one to the beginning of the next."""
 
@@ -116,7 +116,7 @@ class BagFile:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What had to be done to read it, as sentences; complete after a pass over all messages."""
+        """How each part was read without an index, as sentences; complete after a pass over all messages."""
         return tuple(part.note for part in self._parts if part.note)
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
@@ -307,7 +307,7 @@ class _Part:
 
     @property
     def remedy(self) -> str:
-        """What helps if it cannot be read."""
+        """Commands that mend a damaged file of this kind."""
         if self.is_ros1:
             return "copy it again, or mend it with `rosbag reindex`"
         if self._magic.startswith(_MCAP):

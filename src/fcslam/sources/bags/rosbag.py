@@ -172,7 +172,7 @@ class RosBag:
             )
 
     def _first_errors(self) -> str:
-        """What is wrong with the first messages that cannot be read, in brackets."""
+        """The faults of the first invalid message of each topic, in brackets."""
         errors = [f"{topic}, {error}" for topic, error in self.stream.first_errors.items()]
         return f" ({'; '.join(errors)})" * bool(errors)
 

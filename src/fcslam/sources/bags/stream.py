@@ -55,7 +55,7 @@ class BagStream:
         self._bag = BagFile(path)
         self._options = options
         self.first_errors: dict[str, str] = {}
-        """What is wrong with the first message of each topic that cannot be read."""
+        """The fault of the first invalid message of each topic, by its name."""
 
     @property
     def reading_notes(self) -> tuple[str, ...]:
@@ -88,7 +88,7 @@ class BagStream:
         return topics._replace(odometry=topics.transforms, notes=(*topics.notes, note))
 
     def _odometry_error(self, topic: Topic) -> str:
-        """What is wrong with the first messages of a topic of odometry; empty if one of them can be read."""
+        """The fault of the first message of a topic of odometry; empty if one of the first ones is valid."""
         errors = []
         for message in islice(self._bag.messages([topic]), _READINGS_TRIED if topic.type == ODOMETRY else 0):
             try:
@@ -220,7 +220,7 @@ class BagStream:
             yield scan
 
     def _reason(self, topic: Topic) -> str:
-        """What is wrong with the first scan."""
+        """The fault of the first scan, in brackets."""
         for message in islice(self._bag.messages([topic]), 1):
             try:
                 scan_of(self._bag.decode(message), message.bag_time_ns)
