@@ -114,7 +114,7 @@ def localize(
 
     Args:
         recording: a recording of any known format, or an object of your own that implements ``Source``.
-        map: a run folder or mission file; the YAML file of a ROS map with the PGM file beside it; or a map.
+        map: a run folder or mission file; the YAML file of a ROS map; or a map.
         initial_pose: about where the recording starts in the map, (x, y, theta), metres and radians; None: anywhere.
         config: as for ``map_recordings``; ``robot`` counts.
         output: run folder to write; by default nothing is written.

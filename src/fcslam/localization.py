@@ -25,6 +25,7 @@ from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
 from fcslam.runs.folder import MISSION, ROBOTS
 from fcslam.runs.map_files import map_stem, map_yaml, parse_map, pgm_bytes
+from fcslam.runs.ros_map import parse_ros_map
 from fcslam.runs.tables import read_robots
 from fcslam.sources import Source
 
@@ -50,14 +51,14 @@ class LocalizationProgress:
 
 def read_map(path: Path, floor: str = "") -> OccupancyMap:
     """Read the first map of a floor from a run folder, a mission file or a map of ROS. fcslam maps the packets of a
-    mission file. A map of ROS is a YAML file of map_server and the PGM file that it names.
+    mission file. A map of ROS is a YAML file of map_server and the image that it names.
 
     Args:
         path: the folder or file.
         floor: the floor; name it where the run has several, because they may look the same.
 
     Raises:
-        SourceError: there is no map, or it cannot be read. The image must lie in the folder of the YAML file.
+        SourceError: there is no map, or it cannot be read.
     """
     if path.suffix == Path(MISSION).suffix:
         return _mission_map(path, floor)
@@ -93,9 +94,9 @@ def _read_map_file(description: Path) -> OccupancyMap:
     try:
         text = _content(description).decode("utf-8")
         image = parse_yaml(text)["image"]
-        if not isinstance(image, str) or Path(image).name != image:
-            raise SourceError(f"{description}: the image {one_line(repr(image))} must be a file beside the description")
-        return parse_map(str(description), _content(description.parent / image), text)
+        if not isinstance(image, str):
+            raise TypeError(image)
+        return parse_ros_map(str(description), _content(_image_of(description, image)), text)
     except OSError as error:
         raise SourceError(
             f"{one_line(str(error.filename))}: no map can be read ({error.strerror}); give a run folder or a map.yaml"
@@ -104,6 +105,13 @@ def _read_map_file(description: Path) -> OccupancyMap:
         raise SourceError(f"{description}: names no image; give a run folder or the YAML file of a map") from error
     except EvaluationError as error:
         raise SourceError(str(error)) from error
+
+
+def _image_of(description: Path, image: str) -> Path:
+    """Where the image of a map lies; map_saver writes the whole path, which is wrong after the map was moved."""
+    named = description.parent / Path(image).expanduser()
+    beside = description.parent / named.name
+    return beside if beside.is_file() and not named.is_file() else named
 
 
 def run_localization(

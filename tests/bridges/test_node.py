@@ -303,7 +303,7 @@ def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(netwo
     [
         (given_pose(0.0, 0.0, 0.0, "odom"), "it is in frame 'odom'; give it in 'map'"),
         (given_pose(1e300, 0.0, 0.0), "is outside of the map"),
-        (given_pose(np.nan, 0.0, 0.0), "no sane transform"),
+        (given_pose(np.nan, 0.0, 0.0), "the translation is not finite"),
     ],
 )
 def test_an_initial_pose_that_cannot_be_used_is_refused(network, own_map, message, reason):

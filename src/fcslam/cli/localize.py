@@ -43,7 +43,7 @@ def localize(
         typer.Option(
             "--map",
             metavar="MAP",
-            help="Run folder, mission file, or the YAML file of a ROS map with its PGM file beside it.",
+            help="Run folder, mission file, or the YAML file of a ROS map.",
         ),
     ],
     output: Annotated[Path | None, output_option("Run folder to write.", RUNS)] = None,

@@ -86,8 +86,8 @@ def match_scan(
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
     The points of a sweep were measured at different times, and their positions assume a motion. Its velocity is
-    corrected together with the pose: a point of time t moves by t times the correction. This is continuous-time matching as in
-    Dellenbach et al., "CT-ICP", ICRA 2022, with one velocity for a scan.
+    corrected together with the pose: a point of time t moves by t times the correction. This is continuous-time
+    matching as in Dellenbach et al., "CT-ICP", ICRA 2022, with one velocity for a scan.
 
     Args:
         scan: points in ``base``.

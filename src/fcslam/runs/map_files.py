@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
@@ -172,13 +173,11 @@ def _described(description: str) -> tuple[float, tuple[float, float], float, flo
     content: Any = parse_yaml(description)
     if not isinstance(content, dict):
         raise ValueError("the description is no YAML mapping")
-    resolution_m, occupied, free = (
-        _number(key, content.get(key)) for key in ("resolution", "occupied_thresh", "free_thresh")
-    )
+    resolution_m, occupied, free = (number_in(content, key) for key in ("resolution", "occupied_thresh", "free_thresh"))
     origin = content.get("origin")
     if not isinstance(origin, list) or len(origin) != 3:
         raise ValueError("`origin` in the description must be [x, y, theta]")
-    x, y, theta = (_number("origin", value) for value in origin)
+    x, y, theta = (number_in({"origin": value}, "origin") for value in origin)
     if not (resolution_m > 0.0 and 0.0 <= free <= occupied <= 1.0):
         raise ValueError("the description needs `resolution` > 0 and 0 <= `free_thresh` <= `occupied_thresh` <= 1")
     if content.get("negate", 0) or content.get("mode", "trinary") != "trinary" or theta != 0.0:
@@ -186,8 +185,13 @@ def _described(description: str) -> tuple[float, tuple[float, float], float, flo
     return resolution_m, (x, y), occupied, free
 
 
-def _number(key: str, value: object) -> float:
-    """A finite number of the description; YAML 1.1 reads ``5e-2`` as text."""
+def number_in(description: Mapping[str, object], key: str) -> float:
+    """A finite number of the description; YAML 1.1 reads ``5e-2`` as text.
+
+    Raises:
+        ValueError: it is missing or no finite number.
+    """
+    value = description.get(key)
     try:
         number = float(value) if isinstance(value, int | float | str) else math.nan
     except (ValueError, OverflowError):

@@ -1,22 +1,26 @@
 """The known formats of recordings, and opening a recording by its content."""
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from fcslam.errors import SourceError
-from fcslam.sources.bags.container import is_bag
+from fcslam.sources.bags.container import ZSTD, is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag, as_fleet
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
-from fcslam.sources.logs.carmen import CARMEN
+from fcslam.sources.logs.carmen import CARMEN, RAW_CARMEN
 from fcslam.sources.logs.cmu import CMU
+from fcslam.sources.logs.csm import CSM
 from fcslam.sources.logs.dialect import Dialect
 from fcslam.sources.logs.duke import DUKE
 from fcslam.sources.logs.mines import MINES
 from fcslam.sources.logs.textlog import TextLog
 from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
+
+_BAG = "ROS bag"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +42,9 @@ def _text_format(dialect: Dialect) -> Format:
 
 
 FORMATS: tuple[Format, ...] = (
-    *map(_text_format, (CARMEN, CMU, DUKE, MINES)),
+    *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES, CSM)),
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
-    Format("ROS bag", is_bag, RosBag, takes_options=True),
+    Format(_BAG, is_bag, RosBag, takes_options=True),
 )
 """Tried in this order. To add a format, add an entry."""
 
@@ -67,7 +71,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
     Only the beginning is read; ``Source.survey`` checks the rest.
 
     Args:
-        path: file or folder.
+        path: file or folder; several files of one bag, joined by commas.
         options: options of a bag.
         name: the robot's name; None takes the name of the file.
 
@@ -82,7 +86,13 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
             "--camera-topic, --laser-pose) go with ROS bags only, leave them out"
         )
-    return kind.open(path, name or robot_name(path), options)
+    return kind.open(path, name or _robot_name(path), options)
+
+
+def _robot_name(path: Path) -> str:
+    """The name of the file, or the common beginning of the names of several."""
+    names = [robot_name(path)] if os.path.isdir(path) else list(map(robot_name, parts_of(path)))
+    return os.path.commonprefix(names).strip("._-") or names[0]  # noqa: RUF071  of letters
 
 
 def format_of(path: Path) -> Format:
@@ -91,6 +101,12 @@ def format_of(path: Path) -> Format:
     Raises:
         SourceError: as ``open_source``.
     """
+    parts = parts_of(path)
+    if len(parts) > 1 and not os.path.isdir(path):
+        for part in parts:
+            if (kind := format_of(part)).name != _BAG:
+                raise SourceError(f"{part}: a {kind.name} is no part of several; give one recording, or parts of a bag")
+        return kind
     content = b"" if is_folder(path) else head(path)
     with translate_errors(path):
         for kind in FORMATS:
@@ -100,4 +116,8 @@ def format_of(path: Path) -> Format:
     known = f"{', '.join(others)} or {last}"
     if is_folder(path):
         raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")
+    if path.name == "metadata.yaml":
+        raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")
+    if content.startswith(ZSTD):
+        raise SourceError(f"{path}: is compressed by zstd; give its folder, or unpack it by `zstd -d {path.name}`")
     raise SourceError(f"{path}: no recording of a known format (it starts with {content[:16]!r}); give a {known}")

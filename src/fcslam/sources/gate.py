@@ -85,8 +85,8 @@ def scan_window(
             yield number, entry
 
 
-def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int) -> None:
-    """Reject a recording with too many inconsistent or damaged scans.
+def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, first_errors: str = "") -> None:
+    """Reject a recording with too many inconsistent or damaged scans; ``first_errors`` say what is damaged.
 
     Raises:
         SourceError: it is mostly damaged, most scans are of another laser than the first ones, or its time jumps or
@@ -97,7 +97,9 @@ def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_coun
         faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.BAD_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
     )
     if broken > scan_count + odometry_count:
-        raise SourceError(f"{path}: most {faults.unit}s are damaged, {faults}; copy or export the recording again")
+        raise SourceError(
+            f"{path}: most {faults.unit}s are damaged{first_errors}, {faults}; copy or export the recording again"
+        )
     if contradictory.count > scan_count:
         raise SourceError(
             f"{path}: {faults.unit} {contradictory.first_line}: the ranges of {contradictory.count} scans do not fit "

@@ -11,7 +11,8 @@ from fcslam.records import Beams, Ranges, Sweep, Transform
 from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.sources.pose import Pose
 
-_LONGEST_RANGE_M = 1000.0
+UNKNOWN_RANGE_M = 1000.0
+"""Taken as the maximum of a laser that states none: 0, below 0 or not a number; and of one that states more."""
 SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 1e-4, 1.0
 """A scan that takes less is one at once; one that takes more is of no 2D LiDAR, so its time increment is wrong."""
 _OVER_SCAN_TIME = 1.2
@@ -82,8 +83,9 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     _check_angles(count, first_rad, increment_rad, float(content.angle_max))
     span_rad = (count - 1) * increment_rad
     range_min_m = range_min_m if range_min_m > 0.0 else 0.0
+    range_max_m = min(range_max_m, UNKNOWN_RANGE_M) if range_max_m > 0.0 else UNKNOWN_RANGE_M
     if not range_max_m > range_min_m:
-        raise ValueError("no sane range")
+        raise ValueError(f"range_min {range_min_m:g} is not below range_max {range_max_m:g}")
     sweep = _sweep(count, float(content.time_increment), float(content.scan_time))
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
@@ -92,7 +94,7 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
         first_rad = remainder(first_rad, FULL_TURN_RAD)
     stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
-    return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges, sweep=sweep)
+    return ScanMessage(stamp, frame, beams, range_min_m, range_max_m, ranges, sweep=sweep)
 
 
 def _sweep(count: int, increment_s: float, scan_time_s: float) -> Sweep | None:
@@ -192,7 +194,7 @@ def _frame(name: str) -> str:
 def _transform(translation: Any, rotation: Any) -> Transform:
     x, y, z = translation.x, translation.y, translation.z
     if not max(abs(x), abs(y), abs(z)) < _MAX_COORDINATE_M:
-        raise ValueError("no sane position")
+        raise ValueError(f"the position {x:g}, {y:g}, {z:g} is none of a robot")
     if not all(map(isfinite, (x, y, z))):
-        raise ValueError("no finite position")
+        raise ValueError(f"the position {x:g}, {y:g}, {z:g} is not finite")
     return transform_of((x, y, z), (rotation.x, rotation.y, rotation.z, rotation.w))

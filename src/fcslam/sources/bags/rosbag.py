@@ -8,6 +8,7 @@ shows that there is odometry.
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Odometry, SensorRecord
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading
+from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
@@ -35,6 +36,7 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
+from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 
@@ -43,6 +45,8 @@ class _Reading(NamedTuple):
 
     survey: Survey
     rig: Rig
+    placeholders: tuple[tuple[float, ...], ...]
+    """Values that are no ranges, of each laser."""
 
 
 class RosBag:
@@ -80,10 +84,12 @@ class RosBag:
         """As in Source."""
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
-        rig = self._reading.rig
+        rig, placeholders = self._reading.rig, self._reading.placeholders
         for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
+                if values := placeholders[entry.scan.laser]:
+                    record = replace(record, ranges_m=without(record.ranges_m, values))
                 watch.add(number, record)
                 yield record
             elif isinstance(entry, OdometryReading):
@@ -103,22 +109,40 @@ class RosBag:
         """Summary from one pass over the whole bag; rejects a bag that cannot be mapped."""
         audit, tree = _audit(), TransformTree()
         scans, odometry = PathSummary(), PathSummary()
+        samples = [RangeSample() for _ in self.stream.lasers]
         base_frame = ""
         for _, entry in self.stream.entries(audit, tree):
             if isinstance(entry, PosedScan):
+                if (sample := samples[entry.scan.laser]).wants(entry.T_odom_base):
+                    scan = entry.scan
+                    sample.add(entry.T_odom_base, scan.raw_ranges_m, scan.range_min_m, scan.range_max_m)
                 scans.add(entry.scan.stamp, entry.T_odom_base)
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
+        which = [f" of {laser.topic.name}" for laser in self.stream.lasers]
+        for sample, its in zip(samples, which, strict=True):
+            sample.check(self.stream.path, its)
+        placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
         camera, camera_notes = self._camera(tree, base_frame)
         tilts = (
             self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
+        unlimited = (
+            f"{self.stream.path}: {laser.topic.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
+            for laser in self.stream.lasers
+            if laser.first.range_max_m == UNKNOWN_RANGE_M
+        )
         notes = (
             *self._notes,
+            *self.stream.reading_notes,
+            *unlimited,
+            *chain.from_iterable(
+                placeholder_note(self.stream.path, values, its) for values, its in zip(placeholders, which, strict=True)
+            ),
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
             *filter(None, tilts),
@@ -126,7 +150,7 @@ class RosBag:
         )
         rig = rig_of([laser.first for laser in self.stream.lasers], mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
-        return _Reading(survey, rig)
+        return _Reading(survey, rig, placeholders)
 
     def _check_options(self, path: Path) -> None:
         topics, poses = self._options.scan_topics, self._options.laser_poses
@@ -141,7 +165,7 @@ class RosBag:
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
-        check_consistency(path, faults, scans.count, odometry.count)
+        check_consistency(path, faults, scans.count, odometry.count, self._first_errors())
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
             raise SourceError(
@@ -149,6 +173,11 @@ class RosBag:
                 f"the first scan has the stamp {laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from "
                 f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
             )
+
+    def _first_errors(self) -> str:
+        """The faults of the first invalid message of each topic, in brackets."""
+        errors = [f"{topic}, {error}" for topic, error in self.stream.first_errors.items()]
+        return f" ({'; '.join(errors)})" * bool(errors)
 
     def _mountings(self, tree: TransformTree, base_frame: str) -> list[Mounting]:
         lasers = self.stream.lasers
@@ -182,8 +211,10 @@ class RosBag:
             return level_mounting(tree, base_frame, laser_frame)
         except NoTransformError as error:
             raise SourceError(
-                f"{self.stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
-                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}"
+                f"{self.stream.path}: tf has {error}{self._first_errors()}, so it does not say where the laser of "
+                f"{topic} sits; say it by "
+                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
+                "if it is in another part of this recording, give both joined by a comma"
             ) from error
         except TiltedLaserError as error:
             raise SourceError(

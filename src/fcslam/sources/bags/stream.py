@@ -37,10 +37,12 @@ from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
+from fcslam.sources.pose import Pose
 
 _IMAGES_TRIED = 5
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
+_READINGS_TRIED = 20
 
 
 class RecordedLaser(NamedTuple):
@@ -78,6 +80,13 @@ class BagStream:
         self._options = options
         self.odometry_notes: list[str] = []
         """Why an odometry is not used."""
+        self.first_errors: dict[str, str] = {}
+        """The fault of the first invalid message of each topic, by its name."""
+
+    @property
+    def reading_notes(self) -> tuple[str, ...]:
+        """How the bag was read, if it is not whole; complete after a pass over all messages."""
+        return self._bag.notes
 
     @cached_property
     def candidates(self) -> Candidates:
@@ -86,7 +95,8 @@ class BagStream:
         Raises:
             SourceError: the bag cannot be read.
         """
-        return find_candidates(self._bag, self._field_of_view_rad, self._has_images)
+        found = find_candidates(self._bag, self._field_of_view_rad, self._has_images)
+        return found._replace(measured=[topic for topic in found.measured if not self._odometry_error(topic)])
 
     @cached_property
     def topics(self) -> Topics:
@@ -96,6 +106,18 @@ class BagStream:
             SourceError: the bag cannot be read, or a topic is missing.
         """
         return choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
+
+    def _odometry_error(self, topic: Topic) -> str:
+        """The fault of the first message of a topic of odometry; empty if one of the first ones is valid."""
+        errors = []
+        for message in islice(self._bag.messages([topic]), _READINGS_TRIED if topic.type == ODOMETRY else 0):
+            try:
+                odometry_of(self._bag.decode(message), message.bag_time_ns)
+            except ValueError as error:
+                errors.append(str(error))
+            else:
+                return ""
+        return next(iter(errors), "")
 
     @cached_property
     def lasers(self) -> list[RecordedLaser]:
@@ -111,7 +133,7 @@ class BagStream:
         if not scans:
             raise SourceError(
                 f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read"
-                f"{self._reason(topic)}; record it again"
+                f"{self._reason(topic)}; correct the laser's driver, or copy the bag again"
             )
         usual = usual_beams([scan.beams for scan in scans])
         return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual))
@@ -154,7 +176,8 @@ class BagStream:
                 items = self._items_in(message, tree)
             except BeamsError:
                 audit.add(Fault.BAD_BEAMS, message.number)
-            except ValueError:
+            except ValueError as error:
+                self.first_errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
                 is_image = message.topic == topics.camera
                 audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
             else:
@@ -197,8 +220,9 @@ class BagStream:
         if self._options.odom_topic == NO_ODOMETRY:
             return None
         for candidate in self._odometry_candidates():
-            fault = fault_of_odometry(reading.T_odom_base for reading in self._readings_of(candidate))
-            if fault is None or not self._scans_change:
+            error = "" if candidate.edge is not None else self._odometry_error(candidate.topics[0])
+            fault = f"cannot be read ({error})" if error else fault_of_odometry(self._poses_of(candidate))
+            if fault is None or not (error or self._scans_change):
                 return candidate
             self.odometry_notes.append(f"{self.path}: {candidate.name} {fault}, so it is not used")
         self.odometry_notes.append(f"{self.path}: {WITHOUT_ODOMETRY}")
@@ -230,14 +254,14 @@ class BagStream:
         transforms = self._transforms_of(self.topics.transforms)
         return next(((each.parent, each.child) for each in transforms if is_odometry(each)), None)
 
-    def _readings_of(self, odometry: "OdometryInput") -> Iterator[OdometryReading]:
+    def _poses_of(self, odometry: "OdometryInput") -> Iterator[Pose]:
         if odometry.edge is not None:
             for transform in self._transforms_of(odometry.topics):
-                yield from odometry.readings_in(odometry.topics[0], [transform])
+                yield from (each.T_odom_base for each in odometry.readings_in(odometry.topics[0], [transform]))
             return
         for message in self._bag.messages(odometry.topics):
             with suppress(ValueError):
-                yield odometry_of(self._bag.decode(message), message.bag_time_ns)
+                yield odometry_of(self._bag.decode(message), message.bag_time_ns).T_odom_base
 
     def _transforms_of(self, topics: Sequence[Topic]) -> Iterator[StampedTransform]:
         for message in self._bag.messages(topics):
@@ -256,14 +280,12 @@ class BagStream:
             yield scan
 
     def _reason(self, topic: Topic) -> str:
-        """Return the fault of the angles of the first scan, if they have one."""
+        """The fault of the first scan, in brackets."""
         for message in islice(self._bag.messages([topic]), 1):
             try:
                 scan_of(self._bag.decode(message), message.bag_time_ns)
-            except BeamsError as error:
+            except ValueError as error:
                 return f" ({error})"
-            except ValueError:
-                break
         return ""
 
     def _image_in(self, message: RawMessage) -> ImageMessage:

@@ -38,8 +38,10 @@ def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
     """Check a transform and normalise its quaternion; raises ValueError if it is invalid."""
     x, y, z, w = rotation
     length = sqrt(x * x + y * y + z * z + w * w)
-    if not (abs(length - 1.0) < 0.1 and all(map(isfinite, translation_m))):
-        raise ValueError("no sane transform")
+    if not abs(length - 1.0) < 0.1:
+        raise ValueError(f"the orientation {x:g}, {y:g}, {z:g}, {w:g} is no unit quaternion")
+    if not all(map(isfinite, translation_m)):
+        raise ValueError("the translation is not finite")
     if abs(length - 1.0) < _ROUNDING:
         return Transform(translation_m, rotation)
     return Transform(translation_m, (x / length, y / length, z / length, w / length))

@@ -3,12 +3,16 @@
     PARAM name value ipc_hostname logger_timestamp
     ODOM x y theta tv rv accel ipc_timestamp ipc_hostname logger_timestamp
     FLASER n r1..rn x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
+    RAWLASER1 type start_angle fov resolution max_range accuracy remission_mode n r1..rn n_remission [..]
+        ipc_timestamp ipc_hostname logger_timestamp
     ROBOTLASER1 type start_angle fov resolution max_range accuracy remission_mode n r1..rn n_remission [..]
         laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward_safety side_safety turn_axis
         ipc_timestamp ipc_hostname logger_timestamp
 
 A scan's stamp is the IPC timestamp. Both poses are in ``odom``: the first the laser's, the second the robot's.
-Other messages (rear lasers, SYNC, TRUEPOS ...) are passed over; a line that starts with no message name is broken.
+RAWLASER1 is read where the beginning of a log has no other scans, as logs often have each scan twice; its pose is
+that of the odometry before it. The times may be missing: then scans are 1 s apart. Other messages (rear lasers, SYNC,
+TRUEPOS ...) are passed over; a line that starts with no message name is broken.
 """
 
 import re
@@ -17,6 +21,7 @@ from collections.abc import Callable
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams
 from fcslam.sources.logs.dialect import (
+    UNTIMED_STEP_S,
     Dialect,
     Line,
     OdometryLine,
@@ -26,9 +31,14 @@ from fcslam.sources.logs.dialect import (
     check_beams,
     pose_of,
     stamp_of,
+    with_points,
 )
 from fcslam.sources.logs.laser import SICK_MAX_RANGE_M
+from fcslam.sources.pose import Pose
 
+_RAW, _SCAN = (
+    re.compile(rb"^[ \t]*(" + name + rb")\s", re.MULTILINE) for name in (rb"RAWLASER1", rb"FLASER|ROBOTLASER1")
+)
 SICK_TYPES = (0, 1)
 """Values of ROBOTLASER1's ``type`` that mean a SICK LMS or PLS."""
 
@@ -38,20 +48,60 @@ _KNOWN = re.compile(
 )
 
 
-def _parse(line: bytes) -> Line | None:
-    message = _MESSAGE.match(line)
-    if message is None:
-        raise ValueError("no CARMEN message")
-    parser = _PARSERS.get(message[1])
-    return parser(line) if parser else None
+class _CarmenParser:
+    """Holds the latest odometry, and counts the scans without a time."""
 
+    def __init__(self, raw: bool = False) -> None:
+        """``raw``: scans are RAWLASER1 only."""
+        self._T_odom_base: Pose | None = None
+        self._untimed = 0
+        self._parsers: dict[bytes, Callable[[bytes], Line]] = {
+            **({b"RAWLASER1": self._rawlaser} if raw else {b"FLASER": self._flaser, b"ROBOTLASER1": _parse_robotlaser}),
+            b"ODOM": self._odometry,
+            b"PARAM": _parse_parameter,
+        }
 
-def _parse_flaser(line: bytes) -> ScanLine:
-    front, *tail = line.rsplit(None, 9)
-    _, count, range_text = front.split(None, 2)
-    beam_count = int(count)
-    check_beams(range_text, beam_count)
-    return ScanLine(stamp_of(tail[6]), pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text)
+    def __call__(self, line: bytes) -> Line | None:
+        message = _MESSAGE.match(line)
+        if message is None:
+            raise ValueError("no CARMEN message")
+        parser = self._parsers.get(message[1])
+        return parser(with_points(line)) if parser else None
+
+    def _flaser(self, line: bytes) -> ScanLine:
+        front, *tail = line.rsplit(None, 9)
+        _, count, range_text = front.split(None, 2)
+        beam_count = int(count)
+        is_timed = len(front.split()) - 2 == beam_count
+        if not is_timed:
+            front, *tail = line.rsplit(None, 6)
+            _, _, range_text = front.split(None, 2)
+        check_beams(range_text, beam_count)
+        stamp = stamp_of(tail[6]) if is_timed else self._next_stamp()
+        return ScanLine(stamp, pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text, is_timed=is_timed)
+
+    def _rawlaser(self, line: bytes) -> ScanLine:
+        front, *tail = line.rsplit(None, 3)
+        _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
+        beam_count = int(count)
+        range_text = _without_remissions(body, beam_count)
+        check_beams(range_text, beam_count)
+        stated = _stated_laser(int(kind), [float(token) for token in (start, fov, resolution, max_range)], beam_count)
+        if self._T_odom_base is None:
+            raise ValueError("no odometry before the scan")
+        return ScanLine(stamp_of(tail[0]), self._T_odom_base, self._T_odom_base, beam_count, range_text, stated)
+
+    def _odometry(self, line: bytes) -> OdometryLine:
+        words = line.split()
+        if len(words) < 7:
+            raise ValueError("too few words")
+        self._T_odom_base = pose_of(words[1:4])
+        is_timed = len(words) >= 10
+        return OdometryLine(stamp_of(words[7]) if is_timed else self._untimed * UNTIMED_STEP_S, self._T_odom_base)
+
+    def _next_stamp(self) -> float:
+        self._untimed += 1
+        return (self._untimed - 1) * UNTIMED_STEP_S
 
 
 def _parse_robotlaser(line: bytes) -> ScanLine:
@@ -85,23 +135,14 @@ def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> StatedLas
     return StatedLaser(start_rad, increment_rad, max_range_m)
 
 
-def _parse_odometry(line: bytes) -> OdometryLine:
-    words = line.split()
-    if len(words) < 10:
-        raise ValueError("too few words")
-    return OdometryLine(stamp_of(words[7]), pose_of(words[1:4]))
-
-
 def _parse_parameter(line: bytes) -> ParameterLine:
     _, name, value, *_ = line.decode("ascii", errors="replace").split()
     return ParameterLine(name, value)
 
 
-_PARSERS: dict[bytes, Callable[[bytes], Line]] = {
-    b"FLASER": _parse_flaser,
-    b"ROBOTLASER1": _parse_robotlaser,
-    b"ODOM": _parse_odometry,
-    b"PARAM": _parse_parameter,
-}
+def _is_raw(head: bytes) -> bool:
+    return _RAW.search(head) is not None and _SCAN.search(head) is None
 
-CARMEN = Dialect("CARMEN log", lambda head: _KNOWN.search(head) is not None, lambda: _parse)
+
+CARMEN = Dialect("CARMEN log", lambda head: _KNOWN.search(head) is not None, _CarmenParser)
+RAW_CARMEN = Dialect("CARMEN log of raw scans", _is_raw, lambda: _CarmenParser(raw=True))

@@ -8,14 +8,24 @@ Both poses are in ``odom``; the laser sits 25 cm ahead of the robot's centre, as
 
 import re
 
-from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ScanLine, check_beams, pose_of, stamp_of
+from fcslam.sources.logs.dialect import (
+    Dialect,
+    Line,
+    OdometryLine,
+    ScanLine,
+    check_beams,
+    pose_of,
+    stamp_of,
+    with_points,
+)
 
 _METRES = 0.01
-_NUMBER = rb"[ \t]+[-+]?[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]+)?"
+_NUMBER = rb"[ \t]+[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?"
 _KNOWN = re.compile(rb"^(O(" + _NUMBER + rb"){4}|L(" + _NUMBER + rb"){9})", re.MULTILINE)
 
 
 def _parse(line: bytes) -> Line | None:
+    line = with_points(line)
     keyword = line[:2]
     if keyword == b"L ":
         return _parse_laser(line)

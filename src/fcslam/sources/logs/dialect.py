@@ -32,6 +32,8 @@ class ScanLine(NamedTuple):
     stated: StatedLaser | None = None
     ranges_m: Ranges | None = None
     """The ranges, if they are parsed already, shape (beam_count,)."""
+    is_timed: bool = True
+    """Whether the log states the stamp; otherwise the parser makes it, ``UNTIMED_STEP_S`` after the scan before."""
 
 
 class OdometryLine(NamedTuple):
@@ -65,8 +67,6 @@ class Dialect:
     parser: Callable[[], LineParser]
     """Makes a parser for one pass over a log; a line may depend on the lines before it."""
     metres_per_range_unit: float = 1.0
-    timed: bool = True
-    """Whether the log states stamps; otherwise the parser makes them, ``UNTIMED_STEP_S`` from scan to scan."""
 
 
 UNTIMED_STEP_S = 1.0
@@ -88,6 +88,11 @@ def stamp_of(token: bytes) -> float:
     if not isfinite(stamp):
         raise ValueError("no finite stamp")
     return stamp
+
+
+def with_points(line: bytes) -> bytes:
+    """A line whose numbers may have decimal commas, as some languages write them, with points."""
+    return line.replace(b",", b".") if b"," in line else line
 
 
 def check_beams(range_text: bytes, beam_count: int) -> None:

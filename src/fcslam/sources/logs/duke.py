@@ -17,13 +17,14 @@ from fcslam.sources.logs.dialect import (
     StatedLaser,
     check_beams,
     pose_of,
+    with_points,
 )
 from fcslam.sources.pose import Pose
 
 _LASER_AHEAD_M = 0.40
 """As DP-SLAM has it; scans matched while the robot turned in place say 0.37."""
 _MAX_RANGE_M = 8.18
-_NUMBER = rb"[ \t]+[-+]?[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]+)?"
+_NUMBER = rb"[ \t]+[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?"
 _KNOWN = re.compile(rb"^(Odometry(" + _NUMBER + rb"){3}\s*$|Laser[ \t]+[0-9]+(" + _NUMBER + rb"){2})", re.MULTILINE)
 
 
@@ -35,6 +36,7 @@ class _DukeParser:
         self._scan_count = 0
 
     def __call__(self, line: bytes) -> ScanLine | None:
+        line = with_points(line)
         keyword, *words = line.strip().split(None, 2) or [b"#"]
         if keyword == b"Laser":
             return self._scan(words)
@@ -55,7 +57,7 @@ class _DukeParser:
         geometry = StatedLaser(-pi / 2.0, pi / (beam_count - 1), _MAX_RANGE_M)
         x, y, theta = self._T_odom_base
         T_odom_laser = x + _LASER_AHEAD_M * cos(theta), y + _LASER_AHEAD_M * sin(theta), theta
-        return ScanLine(stamp, self._T_odom_base, T_odom_laser, beam_count, range_text, geometry)
+        return ScanLine(stamp, self._T_odom_base, T_odom_laser, beam_count, range_text, geometry, is_timed=False)
 
 
-DUKE = Dialect("DP-SLAM log", lambda head: _KNOWN.search(head) is not None, _DukeParser, timed=False)
+DUKE = Dialect("DP-SLAM log", lambda head: _KNOWN.search(head) is not None, _DukeParser)

@@ -2,7 +2,8 @@
 
 A geometry stated in a scan line (ROBOTLASER1) is used. Otherwise the beam count decides:
 
-- parameters ``laser_front_laser_resolution`` and ``laser_front_laser_fov`` where both are there and fit the count;
+- parameters ``laser_front_laser_resolution`` and ``laser_front_laser_fov`` where both are there and fit the count, or
+  ``laser_front_laser_fov`` alone;
 - 101, 201 and 401 beams are a SICK that looks over 100 degrees, 541 and 1081 a scanner that looks over 270 degrees;
 - any other count spans 180 degrees: 180 beams are 1 degree apart (-90 .. +89), 181 too (-90 .. +90), 360 and 361
   are 0.5 degrees apart.
@@ -30,6 +31,7 @@ SICK_MAX_RANGE_M = 50.0
 FEWEST_INTERLEAVED = 2
 """Least number of scans with each of two counts, among the first ones, of a scanner that interleaves."""
 
+_FULL_TURN_DEG = 360.0
 _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 
@@ -111,9 +113,13 @@ def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) 
 def _parameter_resolution_deg(beam_count: int, parameters: Mapping[str, str]) -> float | None:
     resolution_deg = parameter(parameters, "laser_front_laser_resolution")
     fov = parameter(parameters, "laser_front_laser_fov")
-    if resolution_deg is None or fov is None or resolution_deg <= 0.0:
+    if fov is None or fov <= 0.0:
         return None
     fov_deg = degrees(fov) if fov < 7.0 else fov
+    if resolution_deg is None and fov_deg < _FULL_TURN_DEG + 1.0:
+        return fov_deg / (beam_count - (fov_deg < _FULL_TURN_DEG - 1.0))
+    if resolution_deg is None or resolution_deg <= 0.0:
+        return None
     fits = abs((beam_count - 1) * resolution_deg - fov_deg) < 1.5 * resolution_deg
     return resolution_deg if fits else None
 

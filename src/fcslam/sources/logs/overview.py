@@ -24,6 +24,8 @@ class LogReading(NamedTuple):
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
     has_odometry: bool
     """Whether the poses are those of wheels."""
+    placeholders: tuple[float, ...] = ()
+    """Values that are no ranges."""
 
 
 class MountingEstimate:

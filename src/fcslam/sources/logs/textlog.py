@@ -7,11 +7,15 @@ Besides the rules of ``gate``:
 - Poses that say nothing (``PathSummary.fault``) are no odometry.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
 from fcslam.sources.contradictions import OdometryWatch
@@ -19,15 +23,20 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
 from fcslam.sources.logs.archive import numbered_lines
 from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLine, ScanLine
-from fcslam.sources.logs.laser import Interleaving, LogBeams, first_beams
+from fcslam.sources.logs.laser import SICK_MAX_RANGE_M, Interleaving, LogBeams, first_beams
 from fcslam.sources.logs.overview import LogReading, Overview
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
+from fcslam.sources.logs.turns import TurnCheck
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import UNKNOWN_POSE, Pose, pose_array
+from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 KEPT_BYTES = 1 << 25
 """A log with more bytes is decompressed and parsed again in each pass, so that memory does not grow with its length."""
+
+
+_WORDS_NAMED, _LONGEST_WORD = 5, 20
 
 
 class _Scan(NamedTuple):
@@ -86,6 +95,7 @@ class TextLog:
             if ranges_m is None or len(ranges_m) != model.beam_count:
                 audit.add(Fault.BROKEN_LINE, number)
                 continue
+            ranges_m = without(ranges_m, self._reading.placeholders)
             scan = LaserScan(entry.line.stamp, ranges_m, model, T_odom_base)
             watch.add(number, scan)
             yield scan
@@ -94,16 +104,36 @@ class TextLog:
     def _reading(self) -> LogReading:
         """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit = Audit()
-        overview = Overview()
+        overview, sample, turns = Overview(), RangeSample(), TurnCheck()
         declared, interleaving = self._first_look()
         gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
         for number, line in _sound(self._all_lines(), audit):
             if isinstance(line, ScanLine):
                 if not gate.admits(number, line.stamp, log_beams.of(line)):
                     continue
-                self._note_clock(number, audit)
+                _note_clock(number, line, audit)
+                self._sample(sample, turns, line, declared)
             overview.add(line)
-        return overview.conclude(self._path, audit.faults(), interleaving)
+        reading = overview.conclude(self._path, audit.faults(), interleaving)
+        sample.check(self._path, "")
+        placeholders = sample.placeholders()
+        found = (*placeholder_note(self._path, placeholders, ""), *turns.note(self._path, declared))
+        notes = (*reading.survey.notes, *found)
+        return reading._replace(survey=replace(reading.survey, notes=notes), placeholders=placeholders)
+
+    def _sample(self, sample: RangeSample, turns: TurnCheck, line: ScanLine, declared: Beams) -> None:
+        for_sample = sample.wants(line.T_odom_base)
+        is_assumed = line.stated is None and line.beam_count == declared.beam_count
+        for_turns = is_assumed and turns.wants(line.T_odom_base)
+        if not (for_sample or for_turns):
+            return
+        max_range_m = line.stated.max_range_m if line.stated is not None else SICK_MAX_RANGE_M
+        with suppress(ValueError):
+            ranges_m = parse_ranges(line, self._dialect.metres_per_range_unit, 0, Audit())
+            if for_sample:
+                sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
+            if for_turns:
+                turns.add(line.T_odom_base, ranges_m, declared)
 
     def _first_look(self) -> tuple[Beams, Interleaving | None]:
         """The usual beams of the first scans, and whether they interleave."""
@@ -117,8 +147,17 @@ class TextLog:
                 break
         if not scans:
             seen = f"; {audit.faults()}" if audit.faults() else ""
-            raise SourceError(f"{self._path}: no laser scan in this {self._dialect.name}{seen}; give a log with scans")
+            raise SourceError(
+                f"{self._path}: no laser scan in this {self._dialect.name}{seen}; its lines are {self._kinds()}; "
+                "give a log with scans"
+            )
         return first_beams(scans, parameters)
+
+    def _kinds(self) -> str:
+        """The most common first words of the lines, with their numbers."""
+        words = (text.split(None, 1)[:1] for _, text in numbered_lines(self._path))
+        counts = Counter(word[0][:_LONGEST_WORD].decode("ascii", "replace") for word in words if word)
+        return ", ".join(f"{count} {one_line(word)}" for word, count in counts.most_common(_WORDS_NAMED))
 
     def _all_lines(self) -> Iterable[NumberedLine]:
         return self._kept or self._parsed()
@@ -149,7 +188,7 @@ class TextLog:
             self._posed(lines, audit), scans, lambda entry: isinstance(entry, _Scan), audit
         ):
             if isinstance(entry, _Scan):
-                self._note_clock(number, audit)
+                _note_clock(number, entry.line, audit)
             yield number, entry
 
     def _posed(self, lines: Iterable[NumberedLine], audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
@@ -168,9 +207,10 @@ class TextLog:
                     pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
                     yield number, _Scan(line, beams, pose)
 
-    def _note_clock(self, number: int, audit: Audit) -> None:
-        if not self._dialect.timed:
-            audit.add(Fault.NO_STAMP, number)
+
+def _note_clock(number: int, line: ScanLine, audit: Audit) -> None:
+    if not line.is_timed:
+        audit.add(Fault.NO_STAMP, number)
 
 
 def _sound(lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, Line]]:

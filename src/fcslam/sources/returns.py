@@ -1,0 +1,152 @@
+"""Finds recordings in which the laser measures nothing, or in another unit, from a sample of their scans.
+
+- Nothing: nearly no beam has a return.
+- Another unit: the values are too large for a 2D LiDAR, and as varied as ranges. A driver that sends a large number for
+  no return sends few different ones.
+- A placeholder: one value repeats exactly in many beams at most places of a drive, and values near it are rare. Along a
+  wall they are not, as the beams beside the nearest one are a little longer, however coarse the ranges are.
+"""
+
+from collections.abc import Sequence
+from math import hypot, inf, remainder, tau
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fcslam.errors import SourceError
+from fcslam.records import FloatArray, Ranges
+from fcslam.sources.pose import Pose
+
+FEWEST_RETURNS = 0.02
+"""Share of the beams."""
+FEWEST_SCANS = 10
+"""A recording with fewer scans is not judged."""
+LONGEST_USUAL_M = 50.0
+"""Half of the returns of a 2D LiDAR are nearer."""
+_VARIED, _MOST_COMMON = 0.5, 8
+"""Share that the most common values have at most where values are varied, and their number."""
+_TOO_FAR = 0.6
+"""Share of varied values beyond the maximum that no laser has."""
+_MILLIMETRES = 900.0
+"""Values of which half are larger are millimetres and not centimetres."""
+_REPEATED, _PLACES = 0.1, 0.5
+"""Share of the beams that have a placeholder, and of the places at which as many have it."""
+_NEAR, _ABOVE_NEAR = 2, 5
+"""How many values to each side are near another, and how many times more frequent than these a placeholder is."""
+_FIRST, _KEPT = 20, 256
+"""Scans that are kept wherever they are from, and most that are kept."""
+_APART_M, _APART_RAD = 0.3, 0.3
+
+
+class _Sample(NamedTuple):
+    values: Ranges
+    range_min_m: float
+    range_max_m: float
+    is_elsewhere: bool
+    """Whether the robot has moved since the sample before."""
+
+
+class RangeSample:
+    """Samples of the scans of one laser, spread over its recording."""
+
+    def __init__(self) -> None:
+        self._samples: list[_Sample] = []
+        self._last: Pose | None = None
+        self._seen, self._step = 0, 1
+
+    def wants(self, T_odom_base: Pose) -> bool:
+        """Whether to add the next scan."""
+        if self._last is not None and self._seen >= _FIRST and not _is_apart(self._last, T_odom_base):
+            return False
+        self._seen += 1
+        return self._seen % self._step == 0
+
+    def add(self, T_odom_base: Pose, values: Ranges, range_min_m: float, range_max_m: float) -> None:
+        """Add a scan that is wanted, with its values as sent and the ranges that are returns."""
+        is_elsewhere = self._last is not None and _is_apart(self._last, T_odom_base)
+        if self._last is None or is_elsewhere:
+            self._last = T_odom_base
+        self._samples.append(_Sample(values, range_min_m, range_max_m, is_elsewhere))
+        if len(self._samples) > _KEPT:
+            self._samples, self._step = self._samples[::2], 2 * self._step
+
+    def placeholders(self) -> tuple[float, ...]:
+        """The values that are no ranges."""
+        places = [sample for sample in self._samples if sample.is_elsewhere]
+        beams = sum(len(sample.values) for sample in places)
+        if len(places) < FEWEST_SCANS:
+            return ()
+        values, counts = np.unique(np.concatenate([_returns(place) for place in places]), return_counts=True)
+        found = []
+        for value, count in zip(values[counts > _REPEATED * beams], counts[counts > _REPEATED * beams], strict=True):
+            at_index = int(np.searchsorted(values, value))
+            near = np.concatenate((counts[max(at_index - _NEAR, 0) : at_index], counts[at_index + 1 :][:_NEAR]))
+            at = sum(np.count_nonzero(place.values == value) > _REPEATED * len(place.values) for place in places)
+            if at > _PLACES * len(places) and count > _ABOVE_NEAR * near.max(initial=0):
+                found.append(float(value))
+        return tuple(found)
+
+    def check(self, path: Path, which: str) -> None:
+        """Refuse a recording that cannot be mapped; ``which`` names the laser, empty or with a blank before it.
+
+        Raises:
+            SourceError: the laser measures nothing or in another unit.
+        """
+        if len(self._samples) < FEWEST_SCANS:
+            return
+        returns = np.concatenate([_returns(one) for one in self._samples])
+        beyond = np.concatenate([one.values[_is_beyond(one)] for one in self._samples])
+        beams = sum(len(one.values) for one in self._samples)
+        nearest, farthest = self._samples[0].range_min_m, self._samples[0].range_max_m
+        limits = f"({nearest:g} m to {farthest:g} m)"
+        large = beyond if len(beyond) > _TOO_FAR * beams and _is_varied(beyond) else returns
+        middle = float(np.median(large)) if len(large) else 0.0
+        if large is beyond or (middle > LONGEST_USUAL_M and _is_varied(returns)):
+            unit, divisor = ("millimetres", 1000) if middle > _MILLIMETRES else ("centimetres", 100)
+            raise SourceError(
+                f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
+                f"be {unit}: divide them by {divisor} and give the recording again"
+            )
+        share = len(returns) / max(beams, 1)
+        if share < FEWEST_RETURNS:
+            raise SourceError(
+                f"{path}: only {share:.1%} of the beams{which} measure a range {limits} in {len(self._samples)} "
+                "sampled scans; check that the laser is not covered, its range_min and range_max, and record again"
+            )
+
+
+def without(values: Ranges, placeholders: Sequence[float]) -> Ranges:
+    """The ranges with placeholders made invalid, NaN."""
+    if not placeholders:
+        return values
+    ranges: Ranges = np.where(np.isin(values, np.array(placeholders, np.float32)), np.float32(np.nan), values)
+    ranges.setflags(write=False)
+    return ranges
+
+
+def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> list[str]:
+    """The notice about placeholders; empty without any."""
+    shown = ", ".join(f"{value:g}" for value in placeholders)
+    return [f"{path}: {shown} m repeats exactly in many beams{which} everywhere, so it is no range"] * bool(shown)
+
+
+def _is_apart(a: Pose, b: Pose) -> bool:
+    return hypot(b[0] - a[0], b[1] - a[1]) > _APART_M or abs(remainder(b[2] - a[2], tau)) > _APART_RAD
+
+
+def _returns(sample: _Sample) -> FloatArray:
+    values = sample.values.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        is_return = (values > max(sample.range_min_m, 0.0)) & (values < sample.range_max_m)
+    return values[is_return]
+
+
+def _is_beyond(sample: _Sample) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        return (sample.values >= sample.range_max_m) & (sample.values < inf)
+
+
+def _is_varied(values: FloatArray | Ranges) -> bool:
+    counts = np.sort(np.unique(values, return_counts=True)[1])
+    return bool(counts[-_MOST_COMMON:].sum() < _VARIED * len(values))

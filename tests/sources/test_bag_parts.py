@@ -1,0 +1,114 @@
+"""One recording in several files: parts joined by commas, or a folder without metadata."""
+
+import shutil
+
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.sources import open_source
+from tests.sources.bag_messages import drive, odom, pose_at, save, scan
+from tests.sources.carmen_text import scans_of
+from tests.sources.test_bag_faults import refusal
+
+
+def parts(folder, suffix, count=3, scans=60):
+    """A drive cut into files; tf_static is in the first one only."""
+    messages = sorted(drive(scans), key=lambda message: message.bag_time)
+    bounds = [len(messages) * k // count for k in range(count + 1)]
+    folder.mkdir(exist_ok=True)
+    return [save(folder / f"run_{k}{suffix}", messages[bounds[k] : bounds[k + 1]]) for k in range(count)]
+
+
+def joined(files):
+    return ",".join(map(str, files))
+
+
+def assert_same(one, other):
+    assert [scan.stamp for scan in one] == [scan.stamp for scan in other]
+    assert all((a.T_odom_base == b.T_odom_base).all() for a, b in zip(one, other, strict=True))
+    assert all((a.ranges_m == b.ranges_m).all() for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_parts_are_one_recording(tmp_path, suffix):
+    whole = scans_of(open_source(save(tmp_path / f"whole{suffix}", drive(60))))
+    files = parts(tmp_path / "run", suffix)
+    for path in (joined(files), joined(files[::-1]), tmp_path / "run"):
+        source = open_source(path)
+        assert source.name == "run"
+        assert source.survey().scan_count == 60
+        assert not source.survey().notes
+        assert_same(scans_of(source), whole)
+
+
+def test_a_folder_of_parts_with_metadata_is_read_by_it(tmp_path):
+    files = parts(tmp_path / "parts", ".mcap")
+    folder = save(tmp_path / "run", drive(60))
+    lines = (folder / "metadata.yaml").read_text()
+    for file in files:
+        shutil.copy(file, folder)
+    names = "".join(f"\n  - {file.name}" for file in files)
+    assert "\n  - run.mcap" in lines
+    (folder / "metadata.yaml").write_text(lines.replace("\n  - run.mcap", names))
+    (folder / "run.mcap").unlink()
+    assert len(scans_of(open_source(folder))) == 60
+
+
+@pytest.mark.parametrize("with_metadata", [True, False])
+def test_the_last_part_may_be_cut_off(tmp_path, with_metadata):
+    files = parts(tmp_path / "run", ".mcap")
+    files[-1].write_bytes(files[-1].read_bytes()[:-3000])
+    if with_metadata:
+        (tmp_path / "run" / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    source = open_source(tmp_path / "run")
+    assert 45 < len(scans_of(source)) <= 60
+    assert "run_2.mcap: read in the order of its records" in " ".join(source.survey().notes)
+
+
+def test_each_topic_in_a_file_of_its_own(tmp_path):
+    whole = scans_of(open_source(save(tmp_path / "whole.mcap", drive(60))))
+    for topic in ("/scan", "/odom", "/tf_static"):
+        save(tmp_path / f"{topic[1:]}.mcap", [message for message in drive(60) if message.topic == topic])
+    source = open_source(joined(tmp_path / f"{name}.mcap" for name in ("scan", "odom", "tf_static")), name="anna")
+    assert source.name == "anna"
+    assert_same(scans_of(source), whole)
+
+
+def test_recordings_of_one_time_are_no_parts(tmp_path):
+    files = [save(tmp_path / f"run_{k}.bag", drive(60, start=100.0 + 3.0 * k)) for k in range(2)]
+    assert "has scans in /scan of the same time as" in refusal_of_parts(files)
+
+
+def test_recordings_of_several_days_are_no_parts(tmp_path):
+    files = [save(tmp_path / f"run_{k}.bag", drive(60, start=100.0 + 90_000.0 * k)) for k in range(2)]
+    assert "run_1.bag: begins 89988 s after" in refusal_of_parts(files)
+    assert "give each as a recording of its own" in refusal_of_parts(files)
+    near = [save(tmp_path / f"near_{k}.bag", drive(60, start=100.0 + 50.0 * k)) for k in range(2)]
+    assert open_source(joined(near)).survey().scan_count == 120
+
+
+def refusal_of_parts(files):
+    with pytest.raises(SourceError) as caught:
+        open_source(joined(files)).survey()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_what_is_no_part(tmp_path):
+    bag = save(tmp_path / "run.bag", drive(20))
+    log = tmp_path / "run.log"
+    log.write_text("FLASER 2 1 1 0 0 0 0 0 0 1 host 1\n")
+    assert "a file is given twice" in refusal_of_parts([bag, tmp_path / "." / "run.bag"])
+    assert "bags of ROS 1 and of ROS 2" in refusal_of_parts([bag, save(tmp_path / "run.mcap", drive(20))])
+    assert "a CARMEN log is no part of several" in refusal_of_parts([bag, log])
+    assert "no such file" in refusal_of_parts([bag, tmp_path / "run_2.bag"])
+
+
+def test_a_name_with_a_comma_is_a_name(tmp_path):
+    bag = save(tmp_path / "run,1.bag", drive(20))
+    assert len(scans_of(open_source(bag))) == 20
+
+
+def test_parts_that_were_given_one_by_one_are_hinted_at(tmp_path):
+    later = save(tmp_path / "run_1.bag", [*drive(20)[1:], odom(104.1, pose_at(4.1)), scan(104.05)])
+    assert "if it is in another part of this recording, give both joined by a comma" in refusal(later)

@@ -1,0 +1,171 @@
+"""Lines of text logs that other programs write: csm, raw scans, no times, decimal commas, unstated angles."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.sources import Fault, open_source
+from tests.sources.carmen_text import drive, flaser, odom, pose_at, save, scans_of
+
+RANGES = tuple(round(1.0 + 0.1 * k, 3) for k in range(8))
+
+
+def csm(step, **fields):
+    content = {
+        "nrays": 8,
+        "min_theta": -1.4,
+        "max_theta": 1.4,
+        "readings": [*RANGES[:3], None, *RANGES[4:]],
+        "valid": [1, 1, 1, 0, 1, 1, 1, 1],
+        "odometry": pose_at(step),
+        "timestamp": [1000 + step, 250000],
+        "estimate": [None, None, None],
+        **fields,
+    }
+    return json.dumps({key: value for key, value in content.items() if value != "none"})
+
+
+def assert_like(scans, count, first=-1.4, last=1.4):
+    assert len(scans) == count
+    np.testing.assert_array_equal([scan.T_odom_base for scan in scans], [pose_at(k) for k in range(count)])
+    angles = scans[0].laser.angles_rad()
+    assert (angles[0], angles[-1]) == pytest.approx((first, last))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"nrays": "none", "valid": "none"},
+        {"theta": [-1.4 + 0.4 * k for k in range(8)], "min_theta": "none", "max_theta": "none"},
+        {"readings": [*RANGES[:3], math.nan, *RANGES[4:]], "valid": [True] * 8},
+    ],
+)
+def test_logs_of_csm(tmp_path, fields):
+    source = open_source(save(tmp_path / "run.log", [csm(k, **fields) for k in range(12)]))
+    scans = scans_of(source)
+    assert_like(scans, 12)
+    np.testing.assert_allclose(scans[0].ranges_m, [*RANGES[:3], 0.0, *RANGES[4:]], rtol=1e-6)
+    assert [scan.stamp for scan in scans] == pytest.approx([1000.25 + k for k in range(12)])
+    assert not source.survey().faults
+
+
+def test_csm_angles_may_run_clockwise_and_times_may_lack(tmp_path):
+    turned = {"min_theta": 1.4, "max_theta": -1.4, "timestamp": "none", "valid": "none", "readings": list(RANGES)}
+    scans = scans_of(open_source(save(tmp_path / "run.json", [csm(k, **turned) for k in range(12)])))
+    assert_like(scans, 12)
+    np.testing.assert_allclose(scans[0].ranges_m, RANGES[::-1], rtol=1e-6)
+    assert [scan.stamp for scan in scans] == list(range(12))
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (csm(0, readings=[1.0] * 7), "no laser scan in this csm log; broken lines skipped: 12"),
+        (csm(0, readings=["x"] * 8), "no laser scan in this csm log"),
+        ('{"readings": ' + "[" * 5000, "no laser scan in this csm log"),
+        (csm(0, min_theta=0.0, max_theta=0.0), "no laser scan in this csm log"),
+    ],
+)
+def test_csm_lines_that_are_no_scans(tmp_path, line, words):
+    with pytest.raises(SourceError) as caught:
+        open_source(save(tmp_path / "run.log", [line] * 12)).survey()
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("odometry", [None, [None] * 3])
+def test_csm_lines_without_odometry(tmp_path, odometry):
+    source = open_source(save(tmp_path / "run.log", [csm(k, odometry=odometry) for k in range(12)]))
+    assert "the odometry never changes in 12 poses" in source.survey().notes[0]
+    assert all(np.isnan(scan.T_odom_base).all() for scan in scans_of(source))
+
+
+def untimed(lines):
+    """Without the three words of the time at the end of a line."""
+    return [line.rsplit(None, 3)[0] for line in lines]
+
+
+def test_lines_without_times(tmp_path):
+    timed = scans_of(open_source(save(tmp_path / "timed.log", drive(12))))
+    source = open_source(save(tmp_path / "run.log", untimed(drive(12))))
+    scans = scans_of(source)
+    assert [scan.stamp for scan in scans] == list(range(12))
+    for one, other in zip(scans, timed, strict=True):
+        np.testing.assert_array_equal(one.T_odom_base, other.T_odom_base)
+        np.testing.assert_array_equal(one.ranges_m, other.ranges_m)
+    assert source.faults[Fault.NO_STAMP].count == 12
+    assert not source.faults[Fault.BROKEN_LINE].count
+
+
+def test_decimal_commas(tmp_path):
+    wanted = scans_of(open_source(save(tmp_path / "points.log", drive(12))))
+    scans = scans_of(open_source(save(tmp_path / "run.log", [line.replace(".", ",") for line in drive(12)])))
+    for one, other in zip(scans, wanted, strict=True):
+        assert one.stamp == other.stamp
+        np.testing.assert_array_equal(one.T_odom_base, other.T_odom_base)
+        np.testing.assert_array_equal(one.ranges_m, other.ranges_m)
+    lines = [f"L {k},0 0,0 0,0 {k},0 0,0 0,0 100,5 200,5 {k},5" for k in range(3)]
+    assert scans_of(open_source(save(tmp_path / "cmu.log", lines)))[0].ranges_m == pytest.approx([1.005, 2.005])
+    lines = [line for k in range(3) for line in (f"Odometry {k},0 0,0 0,0", "Laser 3 1,5 2,5 3,5")]
+    assert scans_of(open_source(save(tmp_path / "duke.log", lines)))[0].ranges_m == pytest.approx([1.5, 2.5, 3.5])
+
+
+def raw(stamp, remissions=()):
+    words = [0, -1.4, 2.8, 0.4, 30.0, 0.01, 0, 8, *RANGES, len(remissions), *remissions, stamp, "robot", 0.0]
+    return "RAWLASER1 " + " ".join(map(str, words))
+
+
+def test_raw_scans_have_the_pose_of_the_odometry_before_them(tmp_path):
+    lines = [line for k in range(12) for line in (odom(100 + k, pose_at(k)), raw(100.1 + k, (1,) * (k % 2)))]
+    scans = scans_of(open_source(save(tmp_path / "run.log", [raw(99.0), *lines])))
+    assert_like(scans, 12)
+    np.testing.assert_allclose(scans[0].ranges_m, RANGES, rtol=1e-6)
+    assert scans[0].stamp == 100.1
+    assert scans[0].laser.max_range_m == 30.0
+
+
+def test_raw_scans_beside_others_are_passed_over(tmp_path):
+    lines = [line for k, line in enumerate(drive(12)) for line in (raw(100.0 + k), line)]
+    assert len(scans_of(open_source(save(tmp_path / "run.log", lines)))) == 12
+
+
+def test_lines_that_are_no_scans_are_named(tmp_path):
+    lines = [line for k in range(5) for line in (odom(k, pose_at(k)), "RLASER 1 2 3", "TRUEPOS 1 2 3")]
+    with pytest.raises(SourceError, match=r"its lines are 5 ODOM, 5 RLASER, 5 TRUEPOS; give a log with scans"):
+        open_source(save(tmp_path / "run.log", lines)).survey()
+
+
+def room(heading, span_deg, beams=180):
+    """Ranges in a room of 4 m x 7 m with a pillar, from its middle."""
+    increment = math.radians(span_deg / beams)
+    angles = heading + (np.arange(beams) - beams // 2) * increment
+    with np.errstate(divide="ignore"):
+        walls = np.minimum(2.0 / np.abs(np.cos(angles)), 3.5 / np.abs(np.sin(angles)))
+    walls[np.abs(np.remainder(angles - 0.7 + np.pi, 2 * np.pi) - np.pi) < 0.15] = 1.0
+    return tuple(np.round(walls, 2))
+
+
+@pytest.mark.parametrize(
+    ("span_deg", "parameter", "said", "taken_deg"),
+    [
+        (180, "", None, 180),
+        (360, "", 360, 180),
+        (270, "", 270, 180),
+        (360, "PARAM laser_front_laser_fov 360 h 0", None, 360),
+        (360, "PARAM laser_front_laser_fov 6.283185 h 0", None, 360),
+        (180, "PARAM laser_front_laser_fov 360 h 0", 180, 360),
+    ],
+)
+def test_assumed_angles_that_contradict_the_turns_are_said(tmp_path, span_deg, parameter, said, taken_deg):
+    poses = [(0.001 * k, 0.0, round(0.12 * k, 3)) for k in range(40)]
+    lines = [flaser(k, pose, ranges=room(pose[2], span_deg)) for k, pose in enumerate(poses)]
+    survey = open_source(save(tmp_path / "run.log", [*filter(None, [parameter]), *lines])).survey()
+    assert math.degrees(survey.lasers[0].angle_increment_rad) * 180 == pytest.approx(taken_deg)
+    assert len(survey.notes) == (said is not None)
+    if said is not None:
+        begin, span = survey.notes[0].split(" degrees, but by the turns of the odometry they span about ")
+        assert begin.endswith(f"180 beams are taken as {taken_deg}")
+        assert float(span.split(";")[0]) == pytest.approx(said, rel=0.12)

@@ -1,0 +1,127 @@
+"""Recordings that measure nothing, or not in metres, and values that are no ranges; honest scans pass."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.sources import open_source
+from tests.sources.bag_messages import mounted, odom, save, scan
+from tests.sources.carmen_text import flaser, scans_of
+from tests.sources.carmen_text import save as save_log
+
+BEAMS = 120
+
+
+def pose(step):
+    return (round(-1.5 + 0.08 * step, 3), round(0.5 * math.sin(0.2 * step), 3), round(0.1 * step, 3))
+
+
+def ranges(step, quantum=0.001):
+    """Ranges in a room of 4.4 m x 7.4 m."""
+    x, y, heading = pose(step)
+    angles = heading + np.linspace(-np.pi / 2, np.pi / 2, BEAMS)
+    c, s = np.cos(angles), np.sin(angles)
+    with np.errstate(divide="ignore"):
+        walls = np.minimum(np.where(c > 0, 2.2 - x, -2.2 - x) / c, np.where(s > 0, 3.7 - y, -3.7 - y) / s)
+    return np.round(walls / quantum) * quantum
+
+
+def bag(path, change=lambda _, values: values, pose=pose, scans=40, **limits):
+    said = [mounted(99.0)]
+    for step in range(scans):
+        values = tuple(change(step, ranges(step)))
+        fields = {"angle_min": -math.pi / 2, "angle_increment": math.pi / (BEAMS - 1), "range_max": 12.0, **limits}
+        said += [odom(100.0 + step, pose(step)), scan(100.0 + step, values, **fields)]
+    return save(path, said)
+
+
+def refusal(path):
+    with pytest.raises(SourceError) as caught:
+        open_source(path).survey()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("value", [0.0, math.inf, math.nan, 12.0, 65.535, 0.05, -1.0])
+def test_a_covered_laser_is_refused(tmp_path, value):
+    message = refusal(bag(tmp_path / "run.bag", lambda _, values: np.full(len(values), value)))
+    assert "only 0.0% of the beams of /scan measure a range (0.1 m to 12 m) in" in message
+
+
+def test_a_laser_that_is_nearly_covered_is_refused(tmp_path):
+    def covered(_, values):
+        return np.where(np.arange(len(values)) == 7, values, math.inf)
+
+    assert "only 0.8% of the beams" in refusal(bag(tmp_path / "run.bag", covered))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres")])
+@pytest.mark.parametrize("scaled_limits", [True, False])
+def test_other_units_are_refused(tmp_path, factor, unit, scaled_limits):
+    limits = {"range_max": 12.0 * factor, "range_min": 0.1 * factor} if scaled_limits else {}
+    message = refusal(bag(tmp_path / "run.mcap", lambda _, values: values * factor, **limits))
+    assert f"they seem to be {unit}: divide them by {factor:g}" in message
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres")])
+def test_other_units_in_a_log_are_refused(tmp_path, factor, unit):
+    lines = [flaser(k, pose(k), ranges=tuple(np.round(ranges(k) * factor))) for k in range(40)]
+    assert f"they seem to be {unit}" in refusal(save_log(tmp_path / "run.log", lines))
+    nothing = [flaser(k, pose(k), ranges=(81.91,) * BEAMS) for k in range(40)]
+    assert "only 0.0% of the beams measure a range (0 m to 50 m)" in refusal(save_log(tmp_path / "no.log", nothing))
+
+
+def missing(step, values, value, share=0.4):
+    """``value`` in a part of the beams that differs from scan to scan."""
+    return np.where(np.random.default_rng(step).random(len(values)) < share, value, values)
+
+
+@pytest.mark.parametrize("value", [10.0, 0.15, 1.0, 5.6])
+def test_a_placeholder_is_no_range(tmp_path, value):
+    source = open_source(bag(tmp_path / "run.bag", lambda step, values: missing(step, values, value)))
+    assert f"{value:g} m repeats exactly in many beams of /scan everywhere, so it is no range" in " ".join(
+        source.survey().notes
+    )
+    for step, one in enumerate(scans_of(source)):
+        real = ~(missing(step, ranges(step), value) == value)
+        np.testing.assert_array_equal(np.isnan(one.ranges_m), ~real)
+        np.testing.assert_allclose(one.ranges_m[real], ranges(step)[real], atol=1e-5)
+
+
+def test_a_placeholder_in_a_log_is_no_range(tmp_path):
+    lines = [flaser(k, pose(k), ranges=tuple(missing(k, ranges(k), 10.0))) for k in range(40)]
+    source = open_source(save_log(tmp_path / "run.log", lines))
+    assert "10 m repeats exactly in many beams everywhere" in " ".join(source.survey().notes)
+    assert np.isnan(scans_of(source)[0].ranges_m).sum() == (missing(0, ranges(0), 10.0) == 10.0).sum()
+
+
+def assert_whole(path):
+    source = open_source(path)
+    assert not source.survey().notes
+    assert not any(np.isnan(one.ranges_m).any() for one in scans_of(source))
+
+
+@pytest.mark.parametrize("quantum", [0.001, 0.01, 0.05, 0.1])
+def test_coarse_ranges_are_ranges(tmp_path, quantum):
+    assert_whole(bag(tmp_path / "run.bag", lambda step, _: ranges(step, quantum)))
+
+
+def test_a_robot_that_stands_still_sees_the_same(tmp_path):
+    assert_whole(bag(tmp_path / "run.bag", lambda *_: ranges(0, 0.01), pose=lambda _: pose(0)))
+
+
+def test_a_robot_along_a_wall_sees_it_at_the_same_distance(tmp_path):
+    """A corridor of 1.6 m: from its middle all scans are the same, to 5 cm."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, BEAMS)
+    with np.errstate(divide="ignore"):
+        corridor = np.minimum(np.round(0.8 / np.abs(np.sin(angles)) / 0.05) * 0.05, 9.0 + 0.05 * np.arange(BEAMS))
+    assert_whole(bag(tmp_path / "run.bag", lambda *_: corridor, pose=lambda step: (0.4 * step, 0.0, 0.0)))
+
+
+def test_a_hall_that_is_wider_than_the_laser_sees_is_no_fault(tmp_path):
+    """Nine of ten beams have no return."""
+    assert open_source(
+        bag(tmp_path / "run.bag", lambda step, values: missing(step, values, math.inf, 0.9))
+    ).survey().scan_count == 40  # fmt: skip
