@@ -12,6 +12,7 @@ Three logs of the SLAM benchmark are mapped as other scanners would have measure
   interpolated.
 - dropped: each beam returns nothing with a probability of 10 %.
 - jittering: the number of beams of each scan is up to 3 % off, over the same field of view, interpolated as above.
+- no odometry: the full log without its odometry.
 
 Errors follow Kuemmerle et al. 2009 over all relations; one robot. The ratio is to the mean error of the full log.
 
@@ -150,6 +151,7 @@ SCANNERS: dict[str, Scanner] = {
     "every second beam": every_second,
     "dropped": dropped,
     "jittering": jittering,
+    "no odometry": lambda scan, _, __: replace(scan, T_odom_base=frozen(np.full(3, np.nan))),
 }
 RANDOM = ("dropped", "jittering")
 

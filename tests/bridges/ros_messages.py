@@ -15,12 +15,12 @@ def header(stamp, frame):
     return CODEC.header(round(stamp * 1e9), frame)
 
 
-def scan(stamp, ranges, frame="laser", angle_min=-math.pi / 2, increment=math.pi / 180, range_max=20.0):
+def scan(stamp, ranges, frame="laser", angle_min=-math.pi / 2, increment=math.pi / 180, range_max=20.0, beam_s=0.0):
     ranges = np.asarray(ranges, np.float32)
     return CODEC.make(
         SCAN, header=header(stamp, frame), angle_min=angle_min, angle_max=angle_min + increment * (len(ranges) - 1),
-        angle_increment=increment, time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=range_max, ranges=ranges,
-        intensities=np.zeros(0, np.float32),
+        angle_increment=increment, time_increment=beam_s, scan_time=max(0.1, beam_s * len(ranges)), range_min=0.1,
+        range_max=range_max, ranges=ranges, intensities=np.zeros(0, np.float32),
     )  # fmt: skip
 
 

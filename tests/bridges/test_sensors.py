@@ -84,6 +84,48 @@ def test_a_scan_waits_for_its_odometry(robot):
     assert robot.records[-1].T_odom_base[0] == pytest.approx(6.5)
 
 
+def test_a_scan_of_a_spinning_scanner_waits_for_the_odometry_of_its_last_beam(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
+    robot.hears("/scan", scan(6.9, RANGES, beam_s=0.2 / 179))
+    assert robot.stamps[-1] == 6.0
+    robot.hears("/odom", odometry(7.2, (7.2, 0.0, 0.0)))
+    assert robot.stamps[-1] == 6.9
+    sweep = robot.records[-1].sweep
+    assert (sweep.first_s, sweep.last_s) == pytest.approx((0.0, 0.2))
+    assert sweep.displacement(0.2) == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
+
+
+def test_odometry_that_stops_holds_no_spinning_scan_for_longer_than_the_next_one(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
+    robot.hears("/scan", scan(6.9, RANGES, beam_s=0.2 / 179))
+    robot.hears("/scan", scan(7.1, RANGES, beam_s=0.2 / 179))
+    assert robot.stamps[-1] == 6.9
+    assert robot.records[-1].sweep.displacement(0.2) == pytest.approx([0.2, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_robot_without_odometry_is_mapped_after_some_seconds():
+    robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/scan", scan(1.0, RANGES))
+    robot.waits(0.0)
+    assert robot.records == []
+    robot.waits(PATIENCE_S + 1.0)
+    assert "no odometry" in robot.said[0]
+    robot.hears("/scan", scan(2.0, RANGES))
+    assert robot.stamps == [1.0, 2.0]
+    assert all(np.isnan(record.T_odom_base).all() for record in robot.records)
+    assert robot.sensors.base_frame == "base_link"
+
+
+def test_odometry_may_be_left_out():
+    robot = Robot(odom_topic="none").hears("/tf_static", transform(0.0, "base_link", "laser"))
+    for stamp in range(SCANS_FOR_RIG):
+        robot.hears("/scan", scan(float(stamp + 1), RANGES))
+    assert len(robot.records) == SCANS_FOR_RIG
+    assert np.isnan(robot.records[0].T_odom_base).all()
+
+
 def test_a_scan_whose_odometry_does_not_come_gets_the_nearest(robot):
     robot.drives(np.arange(1.0, 7.0))
     robot.hears("/scan", scan(6.5, RANGES))
