@@ -29,11 +29,19 @@ def test_the_text_says_what_is_in_it_and_that_it_can_be_mapped(bag, capsys):
 
 
 def test_what_cannot_be_mapped_ends_with_the_reason(tmp_path, capsys):
-    said = [message for message in drive(40) if message.topic != "/odom"]
+    said = [message for message in drive(40) if message.topic != "/scan"]
     assert main(["info", str(save(tmp_path / "run1.bag", said))]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("cannot be mapped: ")
-    assert "no odometry" in last
+    assert "no laser scans" in last
+
+
+def test_a_recording_without_odometry_is_said_to_have_none(tmp_path, capsys):
+    said = [message for message in drive(40) if message.topic != "/odom"]
+    assert main(["info", str(save(tmp_path / "run1.bag", said))]) == 0
+    *_, note, last = capsys.readouterr().out.splitlines()
+    assert "no odometry, so scan matching alone gives the motion" in note
+    assert last == "can be mapped"
 
 
 def test_a_dense_scanner_of_any_range_can_be_mapped_as_the_text_says(tmp_path, capsys):

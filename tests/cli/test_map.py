@@ -238,7 +238,6 @@ BAD_LOGS = {
     ),
     "binary": (lambda at: written(at / "b.clf", np.random.default_rng(0).bytes(5000)), "of a known format"),
     "no laser": (lambda at: save(at / "o.log", [odom(k, pose_at(k)) for k in range(30)]), "no laser scan"),
-    "no odometry": (lambda at: save(at / "s.log", [flaser(k, (0, 0, 0)) for k in range(30)]), "no odometry"),
     "time backwards": (lambda at: save(at / "r.log", drive(50)[::-1]), "time runs backwards"),
     "two in one": (lambda at: save(at / "w.log", drive(300) + drive(300)), "time jumps back"),
     "a change of beams": (

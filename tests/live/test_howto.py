@@ -44,7 +44,7 @@ def test_the_programs_of_the_page_run(my_robot, tmp_path, monkeypatch, capsys):
         my_robot.server = cloud.url
         for scan in my_robot.scans():
             my_robot.robot.add_scan(*scan)
-        assert len(programs()) == 6
+        assert len(programs()) == 7
         for number, program in enumerate(programs()):
             exec(compile(program, f"program {number}", "exec"), {"__name__": "__main__"})
         assert cloud.cloud.stored

@@ -7,7 +7,7 @@ import numpy as np
 
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.lost import is_lost
-from fcslam.records import LaserModel, LaserScan, frozen
+from fcslam.records import LaserModel, LaserScan, Sweep, frozen
 from fcslam.robot.frontend import RobotConfig
 from fcslam.wire.quantisation import dequantise, quantise
 
@@ -40,7 +40,7 @@ def _scans(room: tuple[float, float], began_s: float) -> Iterator[LaserScan]:
     for number, x in enumerate(0.8 * room[0] * to_and_fro):
         pose = np.array([x, 0.0, 0.1 * np.sin(0.3 * number)])
         ranges = dequantise(quantise(frozen(_ranges(room, pose), np.float32)))
-        yield LaserScan(began_s + 0.1 * (number + 1), ranges, _LASER, frozen(pose))
+        yield LaserScan(began_s + 0.1 * (number + 1), ranges, _LASER, frozen(pose), Sweep(0.0, 0.1))
 
 
 def _ranges(room: tuple[float, float], pose: np.ndarray) -> np.ndarray:

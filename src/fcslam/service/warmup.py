@@ -40,6 +40,7 @@ from fcslam.records import (
     LaserModel,
     LaserScan,
     Place,
+    Sweep,
     frozen,
 )
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -69,7 +70,7 @@ _CLOSURE_AFTER = 15
 def warm_up_scanning() -> None:
     """Compile what the first scan of a robot needs: points, normals and the field."""
     scan = next(_scans(1))
-    field_of([(point_scan(scan.ranges_m, scan.laser), np.zeros(3))])
+    field_of([(point_scan(scan.ranges_m, scan.laser, Sweep(0.0, 0.1)), np.zeros(3))])
 
 
 def warm_up_matching() -> None:
