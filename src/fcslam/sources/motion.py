@@ -20,6 +20,8 @@ LARGEST_ACCELERATION: Final = 50.0
 
 FEWEST_REPEATS: Final = 2
 """Repeats between two updates of odometry that is updated too rarely."""
+FEWEST_STEPS: Final = 4
+"""Steps of a moving robot that show it."""
 LONGEST_UPDATE_S: Final = 0.35
 """A robot whose odometry does not change for longer stands still."""
 LEAST_STEP_M, LEAST_STEP_RAD = 0.005, 0.005
@@ -46,11 +48,19 @@ class OdometryUpdates:
     """
 
     def __init__(self) -> None:
-        self.period_s = 0.0
-        """Longest time between two updates of a moving robot; 0 if every reading is an update."""
+        self._longest_s = 0.0
+        """Longest time between two updates of a moving robot with repeats between them."""
+        self._moves = self._steps = 0
+        """Updates of a moving robot, and those after repeats."""
         self._update: tuple[float, Pose] | None = None
         """Stamp and pose of the newest reading that differs from the one before."""
         self._repeats = 0
+
+    @property
+    def period_s(self) -> float:
+        """Longest time between two updates of a moving robot; 0 if every reading is an update."""
+        is_rare = self._steps >= FEWEST_STEPS and 2 * self._steps > self._moves
+        return self._longest_s if is_rare else 0.0
 
     def is_fresh(self, stamp: float, T_odom_base: Pose) -> bool:
         """Whether the next reading says where the robot is at its stamp."""
@@ -61,9 +71,11 @@ class OdometryUpdates:
                 self._repeats += 1
                 return not 0.0 <= held_s <= self.period_s
             x, y, theta = relative_pose(pose, T_odom_base)
-            is_step = hypot(x, y) > LEAST_STEP_M or abs(theta) > LEAST_STEP_RAD
-            if self._repeats >= FEWEST_REPEATS and 0.0 < held_s <= LONGEST_UPDATE_S and is_step:
-                self.period_s = max(self.period_s, held_s)
+            if hypot(x, y) > LEAST_STEP_M or abs(theta) > LEAST_STEP_RAD:
+                self._moves += 1
+                if self._repeats >= FEWEST_REPEATS and 0.0 < held_s <= LONGEST_UPDATE_S:
+                    self._steps += 1
+                    self._longest_s = max(self._longest_s, held_s)
         self._update, self._repeats = (stamp, T_odom_base), 0
         return True
 
