@@ -2,8 +2,8 @@
 
     python rclpy_player.py SCANS.npz NAMESPACE SPEED
 
-The file holds stamps (N,), ranges (N, B), odometry (N, 3) and laser (angle_min, angle_increment, range_max). At the end
-it prints one line of JSON: what it played and what it saw.
+The file holds stamps (N,), ranges (N, B), odometry (N, 3), laser (angle_min, angle_increment, range_max), and beam_s,
+the time between two beams. At the end it prints one line of JSON: what it played and what it saw.
 """
 
 import json
@@ -53,28 +53,34 @@ class Driver:
             rclpy.spin_once(self.node, timeout_sec=0.02)
 
     def play(self, recording, speed):
-        """Publish all scans, each with its odometry, when they are due."""
+        """Publish the odometry at the stamp of each scan, and the scan once all its beams are measured."""
         self.spin_while(
             lambda: not (self.scans.get_subscription_count() and self.odometry.get_subscription_count()), LONGEST_WAIT_S
         )
         time.sleep(0.5)
         stamps, began = recording["stamps"], time.monotonic()
+        laser, beam_s = recording["laser"].tolist(), float(recording["beam_s"])
         for stamp, ranges, pose in zip(stamps, recording["ranges"], recording["odometry"], strict=True):
-            due = began + (stamp - stamps[0]) / speed
+            due, duration_s = began + (stamp - stamps[0]) / speed, beam_s * (len(ranges) - 1) / speed
             self.spin_while(lambda due=due: time.monotonic() < due, LONGEST_WAIT_S)
-            self.publish(stamp, ranges, pose, recording["laser"].tolist())
+            self.publish_odometry(stamp, pose)
+            self.spin_while(lambda due=due + duration_s: time.monotonic() < due, LONGEST_WAIT_S)
+            self.publish_scan(stamp, ranges, laser, beam_s)
         self.spin_while(lambda: self.sent, 2.0)
 
-    def publish(self, stamp, ranges, pose, laser):
+    def publish_odometry(self, stamp, pose):
         reading = stamped(Odometry(), stamp, "odom")
         reading.child_frame_id = "base_link"
         reading.pose.pose.position.x, reading.pose.pose.position.y = float(pose[0]), float(pose[1])
         reading.pose.pose.orientation.z = float(np.sin(pose[2] / 2))
         reading.pose.pose.orientation.w = float(np.cos(pose[2] / 2))
         self.odometry.publish(reading)
+
+    def publish_scan(self, stamp, ranges, laser, beam_s):
         scan = stamped(LaserScan(), stamp, "laser")
         scan.angle_min, scan.angle_increment, scan.range_max = laser
         scan.angle_max = scan.angle_min + scan.angle_increment * (len(ranges) - 1)
+        scan.time_increment = beam_s
         scan.ranges = ranges.tolist()
         self.sent[round(stamp * 1e9)] = time.monotonic()
         self.scans.publish(scan)

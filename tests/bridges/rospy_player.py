@@ -41,7 +41,7 @@ class Driver:
         self.listener = tf2_ros.TransformListener(self.buffer)
 
     def play(self, recording, speed):
-        """Publish all scans, each with its odometry, when they are due."""
+        """Publish the odometry at the stamp of each scan, and the scan once all its beams are measured."""
         mounting = stamped(TransformStamped(), 1.0, "base_link")
         mounting.child_frame_id, mounting.transform.rotation.w = "laser", 1.0
         mounting.transform.translation.x = float(recording["mounting_x"])
@@ -51,23 +51,30 @@ class Driver:
             time.sleep(0.1)
         time.sleep(0.5)
         stamps, began = recording["stamps"], time.monotonic()
+        laser, beam_s = recording["laser"].tolist(), float(recording["beam_s"])
         for stamp, ranges, pose in zip(stamps, recording["ranges"], recording["odometry"], strict=True):
-            time.sleep(max(0.0, began + (stamp - stamps[0]) / speed - time.monotonic()))
-            self.publish(stamp, ranges, pose, recording["laser"].tolist())
+            due, duration_s = began + (stamp - stamps[0]) / speed, beam_s * (len(ranges) - 1) / speed
+            time.sleep(max(0.0, due - time.monotonic()))
+            self.publish_odometry(stamp, pose)
+            time.sleep(max(0.0, due + duration_s - time.monotonic()))
+            self.publish_scan(stamp, ranges, laser, beam_s)
         end = time.monotonic() + 3.0
         while len(self.poses) < len(stamps) and time.monotonic() < end:
             time.sleep(0.05)
 
-    def publish(self, stamp, ranges, pose, laser):
+    def publish_odometry(self, stamp, pose):
         reading = stamped(Odometry(), stamp, "odom")
         reading.child_frame_id = "base_link"
         reading.pose.pose.position.x, reading.pose.pose.position.y = float(pose[0]), float(pose[1])
         reading.pose.pose.orientation.z = float(np.sin(pose[2] / 2))
         reading.pose.pose.orientation.w = float(np.cos(pose[2] / 2))
         self.odometry.publish(reading)
+
+    def publish_scan(self, stamp, ranges, laser, beam_s):
         scan = stamped(LaserScan(), stamp, "laser")
         scan.angle_min, scan.angle_increment, scan.range_max = laser
         scan.angle_max = scan.angle_min + scan.angle_increment * (len(ranges) - 1)
+        scan.time_increment = beam_s
         scan.ranges = ranges.tolist()
         self.scans.publish(scan)
 

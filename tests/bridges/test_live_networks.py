@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -22,6 +23,7 @@ from fcslam.bridges.ros1 import DEBIAN
 from fcslam.runs.map_files import Occupancy, parse_map
 from fcslam.sources import write_bag
 from tests import small_fleet
+from tests.robot import spinning
 
 ROOT = Path(__file__).parents[2]
 RCLPY = Path(os.environ.get("FCSLAM_RCLPY", ROOT / ".venv-ros" / "bin" / "python"))
@@ -46,8 +48,22 @@ def scans():
 
 @pytest.fixture(scope="module")
 def folder(scans, tmp_path_factory):
-    """The scans as a file for the players, and the run of the same scans as a bag."""
-    folder = tmp_path_factory.mktemp("live")
+    return mapped(scans, tmp_path_factory.mktemp("live"))
+
+
+@pytest.fixture(scope="module")
+def spinning_scans():
+    scans = spinning.drive(15.0, odometry=lambda stamp: spinning.pose_at(stamp) * (1.03, 1.03, 0.97))
+    return [replace(scan, stamp=scan.stamp + 100.0) for scan in scans]  # ROS takes 0 for no stamp
+
+
+@pytest.fixture(scope="module")
+def spinning_folder(spinning_scans, tmp_path_factory):
+    return mapped(spinning_scans, tmp_path_factory.mktemp("spinning"))
+
+
+def mapped(scans, folder):
+    """The folder with the scans as a file for the players, and the run of the same scans as a bag."""
     for_player(folder / "scans.npz", scans)
     write_bag(folder / "bag.mcap", scans)
     ended(fcslam("map", f"robot1={folder / 'bag.mcap'}", "-o", folder / "expected", "-q"))
@@ -55,13 +71,14 @@ def folder(scans, tmp_path_factory):
 
 
 def for_player(path, scans):
-    laser = scans[0].laser
+    laser, sweep = scans[0].laser, scans[0].sweep
     np.savez(
         path,
         stamps=[scan.stamp for scan in scans],
         ranges=[np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans],
         odometry=[scan.T_odom_base for scan in scans],
         laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
+        beam_s=0.0 if sweep is None else sweep.duration_s / (laser.beam_count - 1),
         mounting_x=laser.T_base_laser[0],
     )
 
@@ -149,6 +166,15 @@ def test_a_robot_of_ros_2(folder, scans, tmp_path):
     played = play(RCLPY, "rclpy_player.py", folder, **environment)
     ended(robot)
     check_drive(played, scans, tmp_path / "run", folder)
+
+
+@needs_rclpy
+def test_a_robot_of_ros_2_with_a_scanner_that_spins(spinning_folder, spinning_scans, tmp_path):
+    environment = ros2(45)
+    robot = fcslam("robot", "ros2:/robot1", mounting(spinning_scans), "-o", tmp_path / "run", **environment)
+    played = play(RCLPY, "rclpy_player.py", spinning_folder, **environment)
+    ended(robot)
+    check_drive(played, spinning_scans, tmp_path / "run", spinning_folder)
 
 
 @needs_rclpy

@@ -223,6 +223,20 @@ def test_without_odometry_scan_matching_alone_gives_the_motion(scans):
     assert not [event for event in events if event.kind is not fcslam.EventKind.CORRECTED]
 
 
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [((0.0, 0.0, 0.0), "the odometry never changes"), ((1.0, 1.0, 0.0), "its heading is never set")],
+    ids=["always zero", "heading never set"],
+)
+def test_odometry_that_says_nothing_is_told_and_not_used(scans, told, words):
+    events = []
+    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=events.append) as robot:
+        for scan in scans:
+            pose = robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base * told)
+    assert [words in event.text for event in events if event.kind is fcslam.EventKind.FAILED] == [True]
+    assert np.allclose(se2.compose(pose.T_map_odom, pose.T_odom_base), pose.T_map_base)
+
+
 def test_odometry_that_stops_is_refused(robot, scans):
     drive(robot, scans[:2])
     with pytest.raises(InputError, match="some scans have odometry and some have not"):

@@ -70,6 +70,12 @@ def test_odometry_that_never_changes_is_not_used():
     assert spinning.error_m(frontend.tracks[1]) < 0.1  # it begins in motion, at an unknown velocity
 
 
+def test_odometry_whose_heading_is_never_set_is_not_used():
+    frontend, _ = mapped(spinning.drive(odometry=lambda stamp: spinning.pose_at(stamp) * (1.0, 1.0, 0.0)))
+    assert frontend.prediction is not None
+    assert spinning.error_m(frontend.tracks[-1]) < 0.1
+
+
 def test_a_robot_at_rest_keeps_its_odometry():
     scan = next(iter(spinning.drive(odometry=spinning.pose_at)))
     frontend, _ = mapped([scan] * 40)

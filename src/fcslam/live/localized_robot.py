@@ -190,13 +190,13 @@ class LocalizedRobot(LiveTracker):
     def _take(self, packets: list[Packet]) -> None:
         """Nothing leaves a robot that makes no map."""
 
-    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
+    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
         known = None if newest.is_deferred else self._estimate()
         self._drive.add(newest.pose.stamp, self._frontend.travel_m, T_smooth_base, known)
         estimate = known or _NOWHERE
         return RobotPose(
             newest.pose.stamp, frozen(se2.compose(estimate.T_map_odom, T_smooth_base)),
-            None if self._is_without_odometry else T_odom_base, estimate.quality, known is not None, 0,
+            T_odom_base, estimate.quality, known is not None, 0,
             newest.pose.T_keyscan_base, newest.tracked, self._frontend.lidar_config.tracker.odometry,
             estimate.covariance,
         )  # fmt: skip

@@ -214,7 +214,7 @@ class Robot(LiveTracker):
             raise InputError(f"{self.name}: the robot has no camera; give camera=fcslam.CameraModel(...)")
         with self._lock:
             stamp = checked_stamp(stamp, self._newest_s)
-            T_odom_base = None if odometry is None or self._is_without_odometry else checked_pose("odometry", odometry)
+            T_odom_base = None if odometry is None else checked_pose("odometry", odometry)
             self.add(checked_image(image, stamp, T_odom_base, self._camera))
 
     def change_floor(self, floor: str) -> None:
@@ -512,13 +512,13 @@ class Robot(LiveTracker):
         own, by_server = self._localizers
         return by_server.get(part) or own.setdefault(part, Localizer(self._clock))
 
-    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
+    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
         localizer = self._localizer(self._part)
         corrected = localizer.T_map_base(T_smooth_base)
         is_found = self._part in self._floors or localizer.quality > 0.0
         return RobotPose(
             newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
-            None if self._is_without_odometry else T_odom_base, newest.quality,
+            T_odom_base, newest.quality,
             is_found and not newest.is_deferred, localizer.map_index, newest.pose.T_keyscan_base, newest.tracked,
             self._frontend.lidar_config.tracker.odometry, np.zeros((3, 3)),
         )  # fmt: skip

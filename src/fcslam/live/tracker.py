@@ -62,7 +62,7 @@ class LiveTracker(ABC):
         """Pass the next packets of the front end on."""
 
     @abstractmethod
-    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
+    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
         """The pose of the newest scan, given that in the tracker's frame and by odometry, each of shape (3,)."""
 
     @abstractmethod
@@ -148,15 +148,11 @@ class LiveTracker(ABC):
 
     def _odometry(self, given: ArrayLike | None) -> FloatArray:
         """The given odometry, or NaN without; the first scan decides whether there is any."""
-        if self._scans and (given is None) is not self._is_without_odometry:
+        if self._pose is not None and (given is None) is not (self._pose.T_odom_base is None):
             raise InputError(
                 f"{self.name}: some scans have odometry and some have not; give it with every scan or with none"
             )
         return frozen(np.full(3, np.nan)) if given is None else checked_pose("odometry", given)
-
-    @property
-    def _is_without_odometry(self) -> bool:
-        return self._frontend.prediction is not None
 
     def _process(self, scan: LaserScan) -> RobotPose:
         """Localize a scan, and tell what happened."""
@@ -165,9 +161,12 @@ class LiveTracker(ABC):
         self._scans += 1
         newest = self._newest()
         T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
-        pose = self._pose = self._pose_of(newest, T_smooth_base, scan.T_odom_base)
-        if self._is_without_odometry:
+        T_odom_base = None if np.isnan(scan.T_odom_base).any() else scan.T_odom_base
+        pose = self._pose = self._pose_of(newest, T_smooth_base, T_odom_base)
+        if self._frontend.prediction is not None:
             self._tell_undetermined(pose)
+        if self._frontend.odometry_fault is not None:
+            self._tell_failure(f"the odometry {self._frontend.odometry_fault}; scan matching alone gives the motion")
         self._tell()
         return pose
 

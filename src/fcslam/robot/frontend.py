@@ -41,10 +41,12 @@ from fcslam.robot.motion_prediction import LONGEST_S, MotionPrediction, without_
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.sources.contradictions import CHANGED, changed_share
+from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.pose import pose_of
 from fcslam.wire.messages import Body, Hello, Packet
 
 SCANS_THAT_CHANGED = 10
-"""So many scans in a row that changed while the odometry never did show that it measures nothing."""
+"""So many scans in a row that changed while the odometry said nothing show that it measures nothing."""
 
 
 class RobotConfig(SessionConfig):
@@ -103,6 +105,8 @@ class RobotFrontend:
         """Jumps of the odometry so far."""
         self.prediction: MotionPrediction | None = None
         """Stands in for the odometry; None if there is odometry."""
+        self.odometry_fault: str | None = None
+        """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
         self.lidar_config = config.lidar
         """Settings of the LiDAR front end; those for a robot without odometry once that is known."""
         self._config = config
@@ -127,8 +131,8 @@ class RobotFrontend:
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
         self._at_rest: LaserScan | None = None
         """The first scan."""
-        self._has_moved = False
-        """Whether the odometry has changed since."""
+        self._odometry = PathSummary()
+        """Odometry until it says something."""
         self._changed = 0
         """Newest scans in a row that measure something else than the first."""
         self._begin()
@@ -159,7 +163,7 @@ class RobotFrontend:
             case LaserScan():
                 self._process_scan(self._mapped.of(self._with_motion(record)))
             case CameraImage() if Channel.CAMERA in self._config.channels:
-                image = self.odometry.image(record)
+                image = self.odometry.image(record) if self.prediction is None else replace(record, T_odom_base=None)
                 if self._deferred:
                     self._deferred.append(image)
                 else:
@@ -224,17 +228,19 @@ class RobotFrontend:
         return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
 
     def _is_without_odometry(self, scan: LaserScan) -> bool:
-        """Whether the first scan has no odometry, or the odometry never changed while the scans did."""
+        """Whether the first scan has no odometry, or the odometry says nothing while the scans change."""
         if self._at_rest is None:
             self._at_rest = scan
             return bool(np.isnan(scan.T_odom_base).any())
-        if self._has_moved or not np.array_equal(scan.T_odom_base, self._at_rest.T_odom_base):
-            self._has_moved = True
+        if self._odometry.says_something:
             return False
+        self._odometry.add(scan.stamp, pose_of(scan.T_odom_base))
         if scan.laser == self._at_rest.laser:
             changed = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m) > CHANGED
             self._changed = self._changed + 1 if changed else 0
-        return self._changed >= SCANS_THAT_CHANGED
+        if self._changed >= SCANS_THAT_CHANGED:
+            self.odometry_fault = self._odometry.fault
+        return self.odometry_fault is not None
 
     def _observe(self, scan: LaserScan) -> None:
         """Predict the next scan from where this one was found."""
