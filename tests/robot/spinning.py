@@ -3,12 +3,15 @@
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.metrics.trajectory import align
 from fcslam.records import LaserModel, LaserScan, Sweep, frozen
 
 LASER = LaserModel(180, -np.pi, 2.0 * np.pi / 180, 12.0, (0.1, 0.0, 0.0))
 SCAN_S = 1.0 / 7.0
 SWEEP_S = SCAN_S * 179 / 180
 """From the first beam to the last."""
+BEGIN_S = 100.0
+"""Stamp at which the drive begins in a bag, as ROS takes 0 for no stamp."""
 
 
 def _box(x, y, width, depth):
@@ -63,7 +66,8 @@ def drive(seconds=20.0, states_sweep=True, odometry=None):
 
 
 def error_m(track):
-    """Largest distance of a robot's poses from the truth, once both are laid on each other at the first scan."""
-    estimated, true = track.T_odom_base(), pose_at(track.stamps)
-    aligned = se2.between(true[0], true)
-    return float(np.hypot(*(se2.between(estimated[0], estimated)[:, :2] - aligned[:, :2]).T).max())
+    """Absolute trajectory error of a robot's poses: root mean square of the distances after the best alignment."""
+    stamps = np.asarray(track.stamps)
+    estimated, true = track.T_odom_base(), pose_at(np.where(stamps < BEGIN_S, stamps, stamps - BEGIN_S))
+    aligned = se2.compose(align(true, estimated), estimated)
+    return float(np.sqrt(np.mean(np.sum((aligned - true)[:, :2] ** 2, axis=1))))

@@ -1,12 +1,16 @@
 """Robots with a scanner that spins: with odometry, without, and with odometry that is wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig
-from fcslam.records import Keyscan
+from fcslam.records import Keyscan, Odometry, frozen
+from fcslam.robot.calibrating import calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.sources import open_source, write_bag
 from tests.robot import spinning
 
 
@@ -30,25 +34,51 @@ def mapped(scans, config=None):
     return frontend, packets + frontend.finish()
 
 
+def held(odometry):
+    """Odometry that is updated at 5 Hz and published more often."""
+    return lambda stamp: odometry(np.floor(5.0 * stamp + 1e-6) / 5.0)
+
+
+def reset(odometry, at=(6.0, 11.0)):
+    """Odometry that starts at zero again at each of these times."""
+    return lambda stamp: se2.between(
+        odometry(max((time for time in at if time <= stamp), default=0.0)), odometry(stamp)
+    )
+
+
+READINGS = np.arange(0.0, 20.5, 0.02)
+
+
 @pytest.mark.parametrize(
-    ("odometry", "limit_m"),
+    ("odometry", "delay_s"),
     [
-        (spinning.pose_at, 0.02),
-        (integrated(scale=1.15), 0.02),
-        (integrated(turn=1.1), 0.03),
-        (integrated(slip=slice(300, 450)), 0.03),
-        (None, 0.03),
+        (integrated(), 0.0),
+        (integrated(scale=1.15), 0.0),
+        (integrated(scale=0.87, turn=0.9), 0.0),
+        (integrated(turn=1.1), 0.0),
+        (integrated(slip=slice(300, 450)), 0.0),
+        (held(integrated()), 0.0),
+        (reset(integrated()), 0.0),
+        (integrated(), 0.2),
+        (lambda stamp: integrated()(stamp) * (1.0, 1.0, 0.0), 0.0),
+        (lambda _: np.zeros(3), 0.0),
+        (None, 0.0),
     ],
-    ids=["right", "15 % too long", "turns 10 % too far", "slips on a carpet", "none"],
-)
-def test_a_scanner_that_spins_maps_a_room(odometry, limit_m):
-    frontend, packets = mapped(spinning.drive(odometry=odometry))
+    ids=[
+        "right", "15 % too long", "short and turns too little", "turns 10 % too far", "slips on a carpet",
+        "steps at 5 Hz", "starts at zero again", "stamps are 0.2 s late", "heading never set", "always zero", "none",
+    ],
+)  # fmt: skip
+def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
+    readings = () if odometry is None else [Odometry(t + delay_s, frozen(odometry(t))) for t in READINGS.tolist()]
+    items = sorted([*readings, *spinning.drive()], key=lambda item: item.stamp)
+    write_bag(tmp_path / "r.mcap", [replace(item, stamp=item.stamp + spinning.BEGIN_S) for item in items])
+    config = RobotConfig()
+    frontend, packets = mapped(calibrated(open_source(tmp_path / "r.mcap"), config.lidar).records(), config)
     assert len(frontend.tracks) == 1
-    assert spinning.error_m(frontend.tracks[0]) < limit_m
+    assert spinning.error_m(frontend.tracks[0]) < 0.02
     keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
-    assert all(keyscan.sweep is not None for keyscan in keyscans)
-    turns = [abs(keyscan.sweep.velocity[2]) for keyscan in keyscans]
-    assert max(turns) > 1.0
+    assert max(abs(keyscan.sweep.velocity[2]) for keyscan in keyscans) > 1.0
 
 
 def test_beam_times_that_are_ignored_bend_the_track():

@@ -20,21 +20,25 @@ SICK = LaserModel(181, -90 * math.radians(1.0), math.radians(1.0), 50.0, (0.25, 
 ROUND = LaserModel(12, -math.pi, math.tau / 12, 12.5, (-0.1, 0.05, 0.4))
 
 coordinates = st.floats(-1000, 1000).map(lambda value: round(value, 6))
-poses = st.tuples(coordinates, coordinates, st.floats(-3.1, 3.1).map(lambda value: round(value, 6)))
+poses = st.tuples(coordinates, coordinates, st.floats(-2.8, 2.8).map(lambda value: round(value, 6)))
+steps = st.tuples(*[st.floats(-0.1, 0.1)] * 3)
+"""Odometry without jumps."""
 ranges = st.one_of(st.floats(0, 60, width=32), st.just(math.nan), st.just(math.inf))
 
 
 @st.composite
 def recordings(draw):
     """Records at stamps of microseconds, whose clock steps back now and then."""
+    start = draw(poses)
+    near = steps.map(lambda step: frozen(np.round(np.add(start, step), 6)))
     laser = draw(st.sampled_from([SICK, ROUND]))
     records, stamp = [], draw(st.sampled_from([0.2, 1e6, 1.3e9]))
     for _ in range(draw(st.integers(3, 10))):
         stamp = round(stamp + draw(st.sampled_from([-0.3, 0.0, 0.1, 0.7, 0.9])), 6)
-        pose, stamp = frozen(draw(poses)), max(stamp, 1e-6)
+        pose, stamp = draw(near), max(stamp, 1e-6)
         if draw(st.booleans()):
             records.append(Odometry(stamp, pose))
-            pose = frozen(draw(poses))
+            pose = draw(near)
         values = draw(st.lists(ranges, min_size=4, max_size=4))
         filled = np.resize(np.array(values, dtype=np.float32), laser.beam_count)
         records.append(LaserScan(stamp, frozen(filled, np.float32), laser, pose))

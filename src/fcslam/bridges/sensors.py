@@ -26,6 +26,7 @@ from fcslam.sources.bags.codec import (
 from fcslam.sources.bags.merging import ScanMerger
 from fcslam.sources.bags.messages import (
     BeamsError,
+    OdometryReading,
     ScanMessage,
     is_odometry,
     odometry_in,
@@ -383,6 +384,8 @@ class LiveSensors:
     def _recorded(self, number: int, entry: Entry) -> Iterator[SensorRecord]:
         rig = self._rig
         assert rig is not None  # nothing is read before
+        if isinstance(entry, OdometryReading) and entry.is_after_jump:
+            self.audit.add(Fault.ODOMETRY_JUMP, number)
         if isinstance(entry, PosedScan):
             if not self._gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
                 return

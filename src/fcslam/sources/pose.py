@@ -18,6 +18,13 @@ def relative_pose(T_a_b: Pose, T_a_c: Pose) -> Pose:
     return c * dx + s * dy, c * dy - s * dx, remainder(T_a_c[2] - T_a_b[2], tau)
 
 
+def composed_pose(T_a_b: Pose, T_b_c: Pose) -> Pose:
+    """``T_a_c``, like ``se2.compose``."""
+    c, s = cos(T_a_b[2]), sin(T_a_b[2])
+    x, y, theta = T_b_c
+    return T_a_b[0] + c * x - s * y, T_a_b[1] + s * x + c * y, remainder(T_a_b[2] + theta, tau)
+
+
 def interpolated_pose(T_a_b: Pose, T_a_c: Pose, share: float) -> Pose:
     """Interpolate from b to c by ``share`` in [0, 1]: linear in position and along the shorter arc in heading."""
     x, y = (before + share * (after - before) for before, after in zip(T_a_b[:2], T_a_c[:2], strict=True))

@@ -7,6 +7,8 @@ nearest in the recording, not in time, so that a step back of the clock does not
 An image whose clock is ahead would hold the scans behind it. So once such a scan has its pose, the image waits no
 longer and gets the nearest pose.
 
+Odometry that jumps goes on as before the jump.
+
 Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
 nearest reading within 1 s, or none.
 """
@@ -20,7 +22,7 @@ from typing import NamedTuple
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
-from fcslam.sources.motion import OdometryUpdates, moving_sweep
+from fcslam.sources.motion import OdometryBridge, OdometryUpdates, moving_sweep
 from fcslam.sources.pose import UNKNOWN_POSE, Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
@@ -74,7 +76,7 @@ class OdometryPairing:
     def __init__(self) -> None:
         self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
         self._queue: deque[_QueuedItem] = deque()
-        self._updates = OdometryUpdates()
+        self._bridge, self._updates = OdometryBridge(), OdometryUpdates()
         self.images_ahead_s = 0.0
         """By how much the newest image that held a scan was ahead of the odometry; 0 without one."""
 
@@ -87,6 +89,8 @@ class OdometryPairing:
         """Add the next item; yields those that wait no longer, in their order."""
         readings, queue = self._readings, self._queue
         if isinstance(item, OdometryReading):
+            T_odom_base, is_after_jump = self._bridge.bridged(item.stamp, item.T_odom_base)
+            item = item._replace(T_odom_base=T_odom_base, is_after_jump=is_after_jump)
             if self._updates.is_fresh(item.stamp, item.T_odom_base):
                 _assign_poses(queue, readings[-1] if readings else None, item)
                 readings.append(item)

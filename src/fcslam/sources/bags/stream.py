@@ -160,6 +160,8 @@ class BagStream:
         items = merge_scans(self._items(audit, tree, with_images), len(gates))
         for number, entry in (without_odometry if self.odometry is None else pair_with_odometry)(items):
             if not isinstance(entry, PosedScan):
+                if isinstance(entry, OdometryReading) and entry.is_after_jump:
+                    audit.add(Fault.ODOMETRY_JUMP, number)
                 yield number, entry
             elif gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
                 if entry.fault is not None:
