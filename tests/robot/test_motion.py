@@ -81,6 +81,14 @@ def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
     assert max(abs(keyscan.sweep.velocity[2]) for keyscan in keyscans) > 1.0
 
 
+@pytest.mark.parametrize("at", [2.0, 3.0, 6.0, 8.0, 12.0])
+def test_odometry_of_scans_that_starts_at_zero_again_bends_nothing(at):
+    """The jump is 0.5 to 2.4 m and 0.7 to 2.9 rad, so a robot might have made it."""
+    frontend, _ = mapped(spinning.drive(odometry=reset(integrated(), (at,))))
+    assert len(frontend.tracks) == 1
+    assert spinning.error_m(frontend.tracks[0]) < 0.005
+
+
 def test_beam_times_that_are_ignored_bend_the_track():
     frontend, _ = mapped(spinning.drive(odometry=spinning.pose_at, states_sweep=False))
     assert max(map(spinning.error_m, frontend.tracks)) > 0.03

@@ -26,6 +26,10 @@ SEARCH_SIGMA_M = 0.02
 """Limit in metres, for a match that explains the known area: its points must fix the position so well in every
 direction. Along a bare wall the points hardly distinguish poses, and the pattern of the beams favours some.
 """
+JUMP_M, JUMP_RAD, JUMP_SHARE, JUMP_GAIN = 0.3, 0.35, 0.85, 20.0
+"""Odometry may jump, as when its driver restarts at zero. After a step so long that the scan contradicts, the robot is
+also looked for where it was. There the scan must show what it did before: so large a share of the points on surfaces,
+and a log-likelihood higher by this."""
 USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 LARGEST_VELOCITY = 30.0
@@ -169,11 +173,18 @@ class ScanTracker:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
-        # 3. Scan matching; a doubtful match starts a correlative search.
+        # 3. Scan matching; a doubtful match starts a correlative search, and one after a jump where the robot was.
         error = odometry_error(moved_m, turned_rad, config.odometry)
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
         velocity = self._velocity_information(scan.sweep)
         match, innovation = self._match(points, thinned, T_local_guess, error, velocity)
+        has_jumped = False
+        if match.explained < config.doubtful and self._is_long_step(T_local_guess):
+            other, _ = self._match(points, thinned, self._T_local_base, error, velocity)
+            is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
+            is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
+            has_jumped = is_fixed and is_better and other.explained >= JUMP_SHARE
+            match = other if has_jumped else match
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
@@ -181,7 +192,7 @@ class ScanTracker:
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
         tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
-        trust = self._trust.learn(innovation, error) if _is_good(match) else self._trust
+        trust = self._trust.learn(innovation, error) if _is_good(match) and not has_jumped else self._trust
         usual = _learn_usual(self._usual, match.log_likelihood / max(1, len(thinned)))
         accepted = match.explained, match.known, scan.T_odom_base, 0.0, 0.0
         return TrackingResult(tracked, *accepted, matched_here, trust, usual)
@@ -219,6 +230,15 @@ class ScanTracker:
         moved_m = self._moved_m + math.hypot(motion[0], motion[1])
         return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
 
+    def _explains(self, match: ScanMatch) -> bool:
+        """Whether a match explains the points in known area."""
+        return match.explained >= self._config.doubtful * match.known
+
+    def _is_long_step(self, T_local_guess: FloatArray) -> bool:
+        """Whether odometry moved so far since the last scan that it may have jumped."""
+        x, y, theta = se2.between(self._T_local_base, T_local_guess).tolist()
+        return math.hypot(x, y) > JUMP_M or abs(theta) > JUMP_RAD
+
     def _velocity_information(self, sweep: Sweep | None) -> FloatArray:
         """Information of the velocity in a sweep, shape (3,), by odometry's error in the motion during the sweep."""
         if sweep is None:
@@ -246,9 +266,7 @@ class ScanTracker:
         match = match_scan(thinned, field, T_local_guess, error.information, config.matching, velocity)
         innovation = se2.between(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
-        is_doubtful = (
-            match.explained < config.doubtful * match.known or learned.mahalanobis2(innovation) >= config.surprise**2
-        )
+        is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= config.surprise**2
         is_unlikely = log_posterior < self._usual * len(thinned) - config.unlikely  # False before the first match
         if not is_doubtful and not is_unlikely:
             return match, innovation
