@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
+from fcslam.records import LaserModel
 from fcslam.sources.faults import Faults
 from fcslam.sources.gate import TOLERATED_SHARE, check_consistency
 from fcslam.sources.logs.dialect import Line, OdometryLine, ParameterLine, ScanLine
@@ -13,6 +14,10 @@ from fcslam.sources.source import Survey
 
 _MOUNTING_TOLERANCE = 0.01
 """Largest difference between the mountings of two scans, in metres or radians."""
+FULL_TURN_RAD = 6.0
+"""A scanner whose beams span more measures a full turn."""
+SPINNING_HZ = 3.0, 20.0
+"""Turns a second of scanners that spin, and log every turn."""
 
 
 class LogReading(NamedTuple):
@@ -90,14 +95,26 @@ class Overview:
         check_consistency(path, faults, self._scans.count, self._odometry.count)
         pose_from_odometry = not self._scans.moves and self._odometry.moves
         fault = (self._odometry if pose_from_odometry else self._scans).fault
-        notes = (
+        notes: tuple[str, ...] = (
             () if fault is None else (f"{path}: the odometry {fault}; it is not used", f"{path}: {WITHOUT_ODOMETRY}")
         )
         offset_m = parameter(self._parameters, "robot_frontlaser_offset") or 0.0
         laser = laser_model(self._scan, self._parameters, self._mounting.T_base_laser(offset_m))
         length_m = self._odometry.length_m if pose_from_odometry else self._scans.length_m
+        notes += _spinning(path, laser, self._scans)
         survey = Survey(self._scans.count, self._scans.duration_s, length_m, (laser,), faults, notes)
         return LogReading(survey, interleaving, pose_from_odometry, fault is None)
+
+
+def _spinning(path: Path, laser: LaserModel, scans: PathSummary) -> tuple[str, ...]:
+    """A note about a scanner that probably spins, as a log does not say when each beam was measured."""
+    rate_hz = (scans.count - 1) / scans.duration_s if scans.duration_s > 0.0 else 0.0
+    if laser.beams.span_rad < FULL_TURN_RAD or not SPINNING_HZ[0] <= rate_hz <= SPINNING_HZ[1]:
+        return ()
+    return (
+        f"{path}: {rate_hz:.1f} scans a second of a full turn, and no times of beams; if the scanner spins, set "
+        f"robot.lidar.scan_duration_s: {1.0 / rate_hz:.3f}",
+    )
 
 
 def _tells_more(scan: ScanLine, than: ScanLine) -> bool:
