@@ -44,7 +44,7 @@ help:
 	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
 	@echo "make browser-test install a browser for the tests of the page, if permitted"
 	@echo "make scale-test   install what tests of a cluster and of several instances need, and run them"
-	@echo "make check        linter, formatting, types"
+	@echo "make check        linter, formatting, types, spelling"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
 	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim adds packages"
@@ -140,6 +140,7 @@ check: $(INSTALLED)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/codespell .
 
 bench: $(INSTALLED)
 	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done
