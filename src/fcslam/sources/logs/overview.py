@@ -16,7 +16,7 @@ _MOUNTING_TOLERANCE = 0.01
 """Largest difference between the mountings of two scans, in metres or radians."""
 FULL_TURN_RAD = 6.0
 """A scanner whose beams span more measures a full turn."""
-SPINNING_HZ = 3.0, 20.0
+SPINNING_HZ = 4.0, 20.0
 """Turns a second of scanners that spin, and log every turn."""
 
 
