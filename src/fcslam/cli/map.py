@@ -23,8 +23,10 @@ from fcslam.cli.options import (
 )
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
+    BaseFrame,
     CameraTopic,
     LaserPose,
+    OdomFrame,
     OdomTopic,
     ScanTopic,
     bag_options,
@@ -91,6 +93,8 @@ def map_recordings(
     preset: PresetName = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    odom_frame: OdomFrame = None,
+    base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     seed: MissionSeed = None,
@@ -120,7 +124,7 @@ def map_recordings(
         earlier = None if onto is None else read_mission(onto)
         settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier), preset)
         vetoes = read_vetoes(veto) if veto else ()
-        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
+        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):

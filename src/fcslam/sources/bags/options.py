@@ -33,4 +33,10 @@ class BagOptions:
     camera_topic: str | None = None
     laser_poses: tuple[Pose, ...] = ()
     """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf."""
+    odom_frame: str | None = None
+    """Frame in which the odometry is."""
+    base_frame: str | None = None
+    """Frame whose pose the odometry is."""
+    robot: str | None = None
+    """Name of one of several robots in the bag."""
     correction: BagCorrection = field(default_factory=BagCorrection)

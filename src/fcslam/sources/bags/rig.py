@@ -16,8 +16,6 @@ from fcslam.sources.pose import pose_array
 
 _LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
-USUAL_BASES = ("base_footprint", "base_link")
-"""Frames of the robot's body, where no message names it."""
 
 
 class TiltedLaserError(FcslamError):
