@@ -239,7 +239,7 @@ BAD_LOGS = {
     "binary": (lambda at: written(at / "b.clf", np.random.default_rng(0).bytes(5000)), "of a known format"),
     "no laser": (lambda at: save(at / "o.log", [odom(k, pose_at(k)) for k in range(30)]), "no laser scan"),
     "time backwards": (lambda at: save(at / "r.log", drive(50)[::-1]), "time runs backwards"),
-    "two in one": (lambda at: save(at / "w.log", drive(300) + drive(300)), "time jumps back"),
+    "three in one": (lambda at: save(at / "w.log", 3 * drive(300)), "time jumps back"),
     "a change of beams": (
         lambda at: save(at / "c.log", drive(30) + drive(40, start_stamp=200, beams=9)), "not of the laser of the first"
     ),

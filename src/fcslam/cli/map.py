@@ -259,10 +259,14 @@ def _report(
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )
+    ends: dict[str, float] = {}
     for session in run.trajectories.values():
         robot, epoch = robot_and_epoch(session.robot)
         if epoch > (0 if earlier is None else earlier.epochs(robot)):  # the first session of a recording began with it
-            print_line(console, f"{session.robot}: {robot} was lost; this session begins at {session.stamps[0]:.3f} s")
+            is_earlier = session.stamps[0] < ends.get(robot, session.stamps[0])
+            why = "its clock stepped back" if is_earlier else f"{robot} was lost"
+            print_line(console, f"{session.robot}: {why}; this session begins at {session.stamps[0]:.3f} s")
+        ends[robot] = session.stamps[-1]
     _print_jumps(console, run, settings)
     maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:

@@ -72,13 +72,13 @@ class _Member:
 
 
 def robots_of(bag: CountedBag, options: BagOptions) -> tuple[BagRobot, ...]:
-    """The robots of a bag, or those that have the topics that ``options`` name; one or more.
+    """The robots of a bag, or those that have the topics that ``options`` name; one or more, by name.
 
     Raises:
         SourceError: the bag cannot be read, or its frames do not say which robot the scans of a topic are of.
     """
     heard = tuple(topic for topic in bag.topics if topic.message_count)
-    members, spaces = _members(heard, bag.census, options)
+    members, spaces = _members(heard, bag.census)
     labels = {(_prefix(member.frame), member.space) for member in members}
     robots = [member for member in members if member.moves] or (members if len(labels) == len(members) else [])
     if len(robots) < 2:
@@ -100,9 +100,11 @@ def robots_of(bag: CountedBag, options: BagOptions) -> tuple[BagRobot, ...]:
         )
         for name, robot in zip(_names(robots), robots, strict=True)
     ]
-    wanted = {slashed(name) for name in (options.odom_topic, options.camera_topic) if name}
+    wanted = set(map(slashed, options.scan_topics or filter(None, (options.odom_topic, options.camera_topic))))
     having = [robot for robot in found if wanted & {slashed(topic.name) for topic in robot.topics}]
-    return tuple(having or found)
+    if options.scan_topics and not having:  # what is wrong with the topics is said where they are read
+        return (_only_robot(bag, members, options),)
+    return tuple(sorted(having or found, key=lambda robot: robot.name))
 
 
 def robot_of(bag: CountedBag, options: BagOptions) -> BagRobot:
@@ -144,11 +146,9 @@ def usual(counts: Mapping[str, int]) -> tuple[str, ...]:
     return tuple(name for name, count in counts.items() if count > TOLERATED_SHARE * sum(counts.values()))
 
 
-def _members(heard: Sequence[Topic], census: Census, options: BagOptions) -> tuple[list[_Member], set[str]]:
+def _members(heard: Sequence[Topic], census: Census) -> tuple[list[_Member], set[str]]:
     """The scans that belong together, with their odometry, and the namespaces of robots."""
-    wanted = {slashed(name) for name in options.scan_topics}
     scans = [topic for topic in heard if topic.type in SCANS]
-    scans = [topic for topic in scans if slashed(topic.name) in wanted] or scans
     odometry = [topic for topic in heard if topic.type == ODOMETRY and not is_truth(topic.name)]
     space_of = _spaces(scans, [*odometry, *filter(is_transforms, heard)])
     spaces = set(space_of.values())
@@ -208,8 +208,8 @@ def _only_robot(bag: CountedBag, members: Sequence[_Member], options: BagOptions
     if options.odom_topic or options.laser_poses or not (base_frames or member.tree.robot(member.frame)[0]):
         apart = []
     notes = tuple(
-        f"{bag.path}: {topic.name} is not used, as tf does not connect its frames with '{one_line(member.frame)}' of the "
-        "laser (--odom-topic chooses)"
+        f"{bag.path}: {topic.name} is not used, as tf does not connect its frames with '{one_line(member.frame)}' "
+        "of the laser (--odom-topic chooses)"
         for topic in apart
     )
     topics = tuple(topic for topic in bag.topics if topic not in apart)
