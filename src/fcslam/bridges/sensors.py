@@ -38,6 +38,7 @@ from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedIm
 from fcslam.sources.bags.rig import (
     Rig,
     TiltedLaserError,
+    given_mounting,
     level_mounting,
     mounted_camera,
     rig_of,
@@ -323,7 +324,7 @@ class LiveSensors:
 
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
         if self._options.laser_poses:
-            return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
+            return list(map(given_mounting, self._options.laser_poses))
         frames = [scan.frame for scan in first]
         if len(set(frames)) < len(frames):
             raise NetworkError(

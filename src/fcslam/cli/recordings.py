@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.sources import BagOptions, Source
+    from fcslam.sources.bags.options import GivenPose
     from fcslam.sources.faults import Faults
 
 _BAGS = "ROS bags"
@@ -57,7 +58,7 @@ LaserPose = Annotated[
     list[str] | None,
     typer.Option(
         "--laser-pose",
-        metavar="X,Y,THETA",
+        metavar="X,Y,THETA[,upside-down]",
         help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf. Give one for "
         "each --scan-topic, in the same order.",
         rich_help_panel=_BAGS,
@@ -90,11 +91,17 @@ def bag_options(
         tuple(scan_topics or ()),
         odom_topic,
         camera_topic,
-        tuple(pose("--laser-pose", text) for text in laser_poses or ()),
+        tuple(map(_laser_pose, laser_poses or ())),
         odom_frame,
         base_frame,
     )
     return None if options == BagOptions() else options
+
+
+def _laser_pose(text: str) -> "GivenPose":
+    upright = text.removesuffix(",upside-down")
+    x, y, theta = pose("--laser-pose", upright)
+    return (x, y, theta) if upright == text else (x, y, theta, True)
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":

@@ -21,6 +21,7 @@ from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
     Rig,
     TiltedLaserError,
+    given_mounting,
     level_mounting,
     mounted_camera,
     rig_of,
@@ -188,7 +189,7 @@ class RosBag:
             named = ", ".join(laser.name for laser in lasers)
             raise SourceError(f"{self.stream.path}: {len(poses)} --laser-pose for the lasers {named}; {_EACH_LASER}")
         if poses:
-            return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in poses]
+            return list(map(given_mounting, poses))
         topic_of: dict[str, str] = {}
         for laser in lasers:
             other = topic_of.setdefault(laser.first.frame, laser.topic.name)
@@ -205,10 +206,15 @@ class RosBag:
         """Whether the first laser is."""
         return self._reading.rig.upside_down[0]
 
+    @property
+    def has_given_pose(self) -> bool:
+        """Whether the user says how the laser is mounted, which is never corrected."""
+        return bool(self._options.laser_poses)
+
     def corrected(self, correction: BagCorrection, notes: tuple[str, ...]) -> "RosBag":
         """The same bag, read with a correction that ``notes`` explain."""
-        if self._options.laser_poses:
-            correction = replace(correction, mounting=(0.0, 0.0, 0.0))
+        if self.has_given_pose:
+            correction = replace(correction, mounting=(0.0, 0.0, 0.0), upside_down=False)
         options = replace(self._options, correction=correction)
         return RosBag(self.stream.path, self.name, options, (*self._notes, *notes), self.stream.robot)
 
@@ -278,6 +284,7 @@ def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]
 
 def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
     x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
+    mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
     return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
 
 
