@@ -141,7 +141,9 @@ def test_one_recording_given_twice_is_refused(tmp_path, kind):
     path = fleet_bag(tmp_path, kind)
     linked = tmp_path / "linked.mcap"
     linked.symlink_to(path)
-    for twice in ([path, path], [path, linked], [path, tmp_path / "fleet.mcap:/robot2"]):
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes(path.read_bytes())
+    for twice in ([path, path], [path, linked], [path, copy], [path, tmp_path / "fleet.mcap:/robot2"]):
         with pytest.raises(SourceError, match=r"is the recording of .* already; give each"):
             open_fleet([(each, f"name{number}") for number, each in enumerate(twice)])
 
@@ -239,8 +241,22 @@ def test_odometry_of_frames_that_are_not_the_robots_is_not_used(tmp_path):
     path = save(tmp_path / "run.mcap", [each for each in said if each.topic != "/none"])
     source = open_source(path)
     assert source.stream.odometry.name == "/odom"
-    assert "/camera/odom is not used, as tf does not connect its frames with 'laser'" in " ".join(source.survey().notes)
+    assert "/camera/odom is not used, as its namespace or frames are not those of" in " ".join(source.survey().notes)
     assert open_source(path, BagOptions(odom_topic="/camera/odom")).stream.odometry.name == "/camera/odom"
+
+
+def test_odometry_of_a_robot_without_scans_is_not_used(tmp_path):
+    own, other = robot(0, space="/robot1"), robot(1, space="/robot2", scans=40)
+    path = save(tmp_path / "run.mcap", [*own, *(each for each in other if "scan" not in each.topic)])
+    (found,) = open_fleet([(path, None)])
+    assert found.stream.odometry.name == "/robot1/odom"
+    assert same(found, open_source(save(tmp_path / "alone.mcap", own)))
+
+
+def test_robots_without_namespaces_and_prefixes_are_named_by_their_frames(tmp_path):
+    said = [robot(k, prefix=f"r{k}_", with_odom=False, with_tf=True) for k in (0, 1)]
+    robots = open_fleet([(save(tmp_path / "run.mcap", [message for each in said for message in each]), None)])
+    assert [each.name for each in robots] == ["r0", "r1"]
 
 
 def test_scans_and_odometry_of_a_camera_on_the_robot_are_no_robot(tmp_path):

@@ -56,8 +56,8 @@ def map_recordings(
         list[str] | None,
         typer.Argument(
             metavar="LOG...",
-            help="One recording per robot. The file names the robot; NAME=LOG gives it another name. With --onto, none "
-            "maps the mission again with its edits.",
+            help="One recording per robot. The file names the robot; NAME=LOG gives it another name. A bag of several "
+            "robots gives all of them, and BAG:/ROBOT one. With --onto, none maps the mission again with its edits.",
         ),
     ] = None,
     *,

@@ -7,6 +7,7 @@ are of a robot only if there is no other.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from os.path import commonprefix
 from typing import NamedTuple
 
 from fcslam.config import one_line
@@ -190,7 +191,7 @@ def _spaces(scans: Sequence[Topic], marks: Sequence[Topic]) -> dict[Topic, str]:
 
 
 def _only_robot(bag: CountedBag, members: Sequence[_Member], options: BagOptions) -> BagRobot:
-    """The robot that has all topics of a bag, but odometry of frames that tf does not connect, if there is other."""
+    """The robot that has all topics of a bag, but odometry of other frames or namespaces if it has its own."""
     heard = [topic for topic in bag.topics if topic.message_count]
     sensors = [topic for topic in heard if topic.type in (*SCANS, COMPRESSED_IMAGE, IMAGE)]
     transforms = {each for topic in sensors for each in _transforms_around(topic, heard, heard)}
@@ -198,18 +199,22 @@ def _only_robot(bag: CountedBag, members: Sequence[_Member], options: BagOptions
     scan_frames = {name: frames for name, frames in scan_frames.items() if len(frames) > 1}
     if not members:
         return BagRobot(bag, "/", bag.topics, tuple(sorted(transforms)), scan_frames, {})
-    member, base_frames, apart = members[0], {}, []
+    member, base_frames = members[0], {}
+    around = _namespaces(next(iter(member.scan_frames)))
+    fitting: list[Topic] = []
+    apart: list[Topic] = []
     for topic, frames in bag.census.base_frames.items():
         own = [frame for frame in usual(frames) if frame and member.holds(frame)]
         if len(own) == 1:
             base_frames[topic.name] = own[0]
-        elif not own and "" not in frames and not is_truth(topic.name):
-            apart.append(topic)
-    if options.odom_topic or options.laser_poses or not (base_frames or member.tree.robot(member.frame)[0]):
+        if not is_truth(topic.name):
+            is_near = _innermost(topic, {member.space}) == member.space or _namespaces(topic)[0] in around
+            (fitting if is_near and (own or "" in frames) else apart).append(topic)
+    if options.odom_topic or options.laser_poses or not (fitting or member.tree.robot(member.frame)[0]):
         apart = []
     notes = tuple(
-        f"{bag.path}: {topic.name} is not used, as tf does not connect its frames with '{one_line(member.frame)}' "
-        "of the laser (--odom-topic chooses)"
+        f"{bag.path}: {topic.name} is not used, as its namespace or frames are not those of the laser, "
+        f"'{one_line(member.frame)}' (--odom-topic chooses)"
         for topic in apart
     )
     topics = tuple(topic for topic in bag.topics if topic not in apart)
@@ -254,10 +259,12 @@ def _is_topic_of(topic: Topic, robot: _Member, robots: Sequence[_Member], spaces
 
 def _names(robots: Sequence[_Member]) -> list[str]:
     """Names that tell robots apart: namespaces, prefixes of frames, namespaces of scans, or frames."""
+    suffix = commonprefix([robot.frame[::-1] for robot in robots])[::-1]  # noqa: RUF071  of letters
     choices = (
         [robot.space for robot in robots],
         [_prefix(robot.frame) for robot in robots],
         [_namespaces(next(iter(robot.scan_frames)))[0] for robot in robots],
+        [robot.frame.removesuffix(suffix).strip("_-") for robot in robots],
         [f"{robot.frame}_{number}" for number, robot in enumerate(robots, 1)],
     )
     return list(map(slashed, next(names for names in choices if len(set(names)) == len(robots))))
