@@ -329,7 +329,7 @@ def test_odometry_without_an_orientation_is_read_from_tf(tmp_path):
     assert all((a.T_odom_base == b.T_odom_base).all() for a, b in zip(scans_of(source), wanted, strict=True))
     why = "/odom cannot be read (the orientation 0, 0, 0, 0 is no unit quaternion), so it is not used"
     assert why in " ".join(source.survey().notes)
-    fleet = open_fleet([(tmp_path / "run.bag", "a"), (save(tmp_path / "other.bag", broken), "b")])
+    fleet = open_fleet([(tmp_path / "run.bag", "a"), (save(tmp_path / "other.bag", [*broken, text(101.0)]), "b")])
     assert all(len(scans_of(each)) == 30 for each in fleet)
 
 

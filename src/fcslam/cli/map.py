@@ -263,9 +263,11 @@ def _report(
     for session in run.trajectories.values():
         robot, epoch = robot_and_epoch(session.robot)
         if epoch > (0 if earlier is None else earlier.epochs(robot)):  # the first session of a recording began with it
-            is_earlier = session.stamps[0] < ends.get(robot, session.stamps[0])
-            why = "its clock stepped back" if is_earlier else f"{robot} was lost"
-            print_line(console, f"{session.robot}: {why}; this session begins at {session.stamps[0]:.3f} s")
+            begin_s = session.stamps[0]
+            why = f"{robot} was lost; this session begins at {begin_s:.3f} s"
+            if begin_s < ends.get(robot, begin_s):
+                why = f"the clock stepped back; this session begins at {begin_s:.3f} s"
+            print_line(console, f"{session.robot}: {why}")
         ends[robot] = session.stamps[-1]
     _print_jumps(console, run, settings)
     maps, joined = int(values["maps"]), settings.fleet.join_maps

@@ -45,7 +45,7 @@ LEAST_AGREEMENT: Final = 0.6
 LEAST_GAIN: Final = 0.1
 """Least gain in agreement over the stated mounting."""
 LEAST_LEAD: Final = 0.05
-"""Least gain in agreement over another mounting that is told apart."""
+"""Least gain in agreement over any other mounting."""
 SIGMAS: Final = 5.0
 """Least ratio of the gain to its standard deviation."""
 
@@ -102,7 +102,7 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
         best = best._replace(turned_deg=square_deg)
     upright = best._replace(upside_down=False)
     if best.upside_down and not trial.leads(trial.agreements(best), trial.agreements(upright), LEAST_LEAD):
-        best = upright  # without turns, both look alike
+        best = upright  # moves alone do not tell
     found = trial.agreements(best)
     far = [each for each in scores if abs(math.remainder(each.turned_deg - best.turned_deg, 360)) > coarse]
     if best.distance == 1.0:

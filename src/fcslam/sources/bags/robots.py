@@ -47,7 +47,7 @@ class BagRobot(NamedTuple):
 
 @dataclass(slots=True)
 class _Member:
-    """What may be a robot."""
+    """A possible robot."""
 
     space: str
     """Namespace."""
