@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+import fcslam
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan
 from fcslam.sources import BagOptions, open_fleet, open_source
@@ -265,3 +266,18 @@ def test_scans_and_odometry_of_a_camera_on_the_robot_are_no_robot(tmp_path):
     said += [scan(100.05 + 0.2 * k, (1.0,) * 5, "/camera/scan", frame="camera") for k in range(39)]
     (source,) = open_fleet([(save(tmp_path / "run.mcap", said), None)])
     assert [laser.name for laser in source.stream.lasers] == ["/scan"]
+
+
+def test_all_robots_of_a_bag_are_mapped(tmp_path):
+    path = fleet_bag(tmp_path)
+    alone = open_source(save(tmp_path / "run.mcap", drive(20)))
+    run = fcslam.map_recordings([path, alone], config={"fleet": {"join_maps": False}})
+    assert sorted(run.trajectories) == ["robot1", "robot2", "run"]
+    assert [*fcslam.map_recordings(f"{path}:/robot2").trajectories] == ["robot2"]
+
+
+def test_one_robot_is_localized_by_its_name(tmp_path):
+    path = fleet_bag(tmp_path)
+    fcslam.map_recordings(f"{path}:/robot1", output=tmp_path / "run")
+    with pytest.raises(SourceError, match="has the robots /robot1, /robot2; choose one"):
+        fcslam.localize(path, tmp_path / "run")

@@ -50,17 +50,23 @@ FORMATS: tuple[Format, ...] = (
 """Tried in this order. To add a format, add an entry."""
 
 
-def open_fleet(recordings: Iterable[tuple[Path, str | None]], options: BagOptions | None = None) -> list[Source]:
+def open_fleet(
+    recordings: Iterable[tuple[Path | Source, str | None]], options: BagOptions | None = None
+) -> list[Source]:
     """Open the recordings of one fleet, each with its robot's name, as ``open_source`` does.
 
     A bag of several robots gives each of them. Where ``options`` leave a choice of topics, all bags of one robot are
-    read from the same ones if all have them.
+    read from the same ones if all have them. Sources that are open already stay as they are.
 
     Raises:
         SourceError: as ``open_source``, a bag cannot be read, or a recording is given twice.
     """
+    sources: list[Source] = []
     given: list[tuple[Path, str, Source]] = []
     for path, name in recordings:
+        if not isinstance(path, Path):
+            sources.append(path)
+            continue
         source = open_source(path, options, name)
         for each in source.robots(name) if isinstance(source, RosBag) else [source]:
             file, which = robot_in(path)[0], each.stream.robot.name if isinstance(each, RosBag) else ""
@@ -68,12 +74,12 @@ def open_fleet(recordings: Iterable[tuple[Path, str | None]], options: BagOption
                 if which == other_which and _is_same(file, other_file):
                     raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")
             given.append((file, which, each))
-    sources = [source for _, _, source in given]
-    bags = [source for source in sources if isinstance(source, RosBag)]
+            sources.append(each)
+    bags = [source for _, _, source in given if isinstance(source, RosBag)]
     if len(bags) < 2 or len({file for file, _, _ in given}) < len(given):  # robots of one bag differ in their topics
         return sources
-    agreed = iter(as_fleet(bags, options))
-    return [next(agreed) if isinstance(source, RosBag) else source for source in sources]
+    agreed = dict(zip(map(id, bags), as_fleet(bags, options), strict=True))
+    return [agreed.get(id(source), source) for source in sources]
 
 
 def _is_same(a: Path, b: Path) -> bool:
