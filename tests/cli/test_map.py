@@ -243,7 +243,7 @@ BAD_LOGS = {
     "a change of beams": (
         lambda at: save(at / "c.log", drive(30) + drive(40, start_stamp=200, beams=9)), "not of the laser of the first"
     ),
-    "a name too long": (lambda at: save(at / f"{'x' * 80}.log", drive(40)), "rename"),
+    "a name too long": (lambda at: save(at / f"{'x' * 80}.log", drive(41)), "rename"),
 }  # fmt: skip
 
 
@@ -374,7 +374,7 @@ def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log
 
 
 def test_splits_that_cannot_be_are_refused(tmp_path, log, capsys):
-    other = save(tmp_path / "other.log", drive(40))
+    other = save(tmp_path / "other.log", drive(41))
     run = tmp_path / "run"
     assert "--split cuts one recording" in refused(capsys, tmp_path, log, other, "--split", 2, "--output", run)
     assert "cannot be cut into 41 parts" in refused(capsys, tmp_path, log, "--split", 41, "--output", run)

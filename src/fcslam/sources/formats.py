@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from filecmp import cmp
 from pathlib import Path
 
 from fcslam.errors import SourceError
@@ -83,12 +82,8 @@ def open_fleet(
 
 
 def _is_same(a: Path, b: Path) -> bool:
-    """Whether two recordings have the same files, or copies of them."""
-    pairs = list(zip(parts_of(a), parts_of(b), strict=False))
-    return len(parts_of(a)) == len(parts_of(b)) and all(
-        one.resolve() == other.resolve() or (one.is_file() and other.is_file() and cmp(one, other, shallow=False))
-        for one, other in pairs
-    )
+    """Whether two recordings have the same files."""
+    return [part.resolve() for part in parts_of(a)] == [part.resolve() for part in parts_of(b)]
 
 
 def robot_in(path: Path) -> tuple[Path, str | None]:
