@@ -170,7 +170,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_th
         ({"recordings": "none.clf"}, fcslam.SourceError, "none.clf: no such file"),
         ({"recordings": []}, fcslam.SourceError, "no recording"),
         ({"recordings": ["LOG", "LOG"]}, fcslam.SourceError, "robot_1"),
-        ({"recordings": ["LOG", "LOG"], "split": 2}, fcslam.SourceError, "cuts one recording"),
+        ({"recordings": ["LOG", "TWIN"], "split": 2}, fcslam.SourceError, "cuts one recording"),
         ({"split": 0}, fcslam.SourceError, "0 parts"),
         ({"seed": -1}, fcslam.ConfigError, "seed"),
         ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
@@ -182,7 +182,8 @@ def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_th
 )
 def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, kind, said, logs):
     def filled(value):
-        return [filled(item) for item in value] if isinstance(value, list) else logs[0] if value == "LOG" else value
+        known = {"LOG": logs[0], "TWIN": logs[1]}
+        return [filled(item) for item in value] if isinstance(value, list) else known.get(str(value), value)
 
     given = {"recordings": "LOG", **arguments}
     with pytest.raises(fcslam.InputError, match=re.escape(said)) as raised:

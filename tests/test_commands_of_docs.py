@@ -28,6 +28,7 @@ from fcslam import open_run
 from fcslam.cli import main
 from fcslam.geometry import se2
 from fcslam.sources import open_source, write_carmen
+from tests.sources.test_bag_robots import fleet_bag
 from tests.test_docs import COMMAND_LINE, PAGES, ROOT
 
 LISTED: dict[str, Any] = yaml.safe_load((ROOT / "tests" / "commands_of_docs.yaml").read_text(encoding="utf-8"))
@@ -119,6 +120,7 @@ MADE = {
     "intel.relations.gz": make_relations("intel"),
     "wednesday.clf.gz": make_another_day,
     "office.yaml": make_map_of_another_program,
+    "fleet.bag": lambda path: fleet_bag(path.parent, name="fleet.bag"),
 }
 """Other inputs of commands. Each is made when a command names it for the first time."""
 

@@ -54,7 +54,8 @@ def map_recordings(
 
     Args:
         recordings: one path, several, or a mapping of robot names to paths, in any known format. Without a mapping,
-            each robot is named after its file. Objects of your own that implement ``Source`` can stand for paths.
+            each robot is named after its file. A bag of several robots gives all of them, and one of them is named as
+            in ``fleet.bag:/robot1``. Objects of your own that implement ``Source`` can stand for paths.
         config: a ``MissionConfig``, a mapping with some of its keys, or the path of a YAML file; missing keys have
             their default values.
         output: run folder to write; by default nothing is written.
@@ -136,9 +137,10 @@ def localize(
         prepare_output(Path(output), force)
     settings = settings_of(config, None, None)
     occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
-    (source,) = _opened([recording], bag_options)
+    if isinstance(recording, str | os.PathLike):
+        recording = _checked(sources.open_source(Path(recording), bag_options))
     initial: FloatArray | None = None if initial_pose is None else frozen(initial_pose)
-    run = run_localization(source, occupancy, settings, initial, progress)
+    run = run_localization(recording, occupancy, settings, initial, progress)
     if output is not None:
         run.save(output, force)
     return run
@@ -193,13 +195,8 @@ def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
     return sources.split(recordings[0], parts)
 
 
-def _opened(
-    recordings: Recordings, options: BagOptions | None, config: LidarConfig | None = None, at_least: int = 1
-) -> list[Source]:
-    """The recordings as sources, each checked as far as can be without reading the ranges.
-
-    With the settings of the LiDAR, bags are calibrated.
-    """
+def _opened(recordings: Recordings, options: BagOptions | None, config: LidarConfig, at_least: int) -> list[Source]:
+    """The recordings as sources, bags calibrated, each checked as far as can be without reading the ranges."""
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
     named: list[tuple[StrPath | Source, str | None]] = (
@@ -209,14 +206,13 @@ def _opened(
     )
     if len(named) < at_least:
         raise SourceError("no recording is given; give one for each robot")
-    opened = iter(
-        sources.open_fleet([(Path(item), name) for item, name in named if isinstance(item, str | os.PathLike)], options)
-    )
-    return [_checked(next(opened), config) if isinstance(item, str | os.PathLike) else item for item, _ in named]
+    own = {id(item) for item, _ in named}
+    given = [(Path(item) if isinstance(item, str | os.PathLike) else item, name) for item, name in named]
+    opened = sources.open_fleet(given, options)
+    return [source if id(source) in own else _checked(calibrated(source, config)) for source in opened]
 
 
-def _checked(source: Source, config: LidarConfig | None) -> Source:
-    source = source if config is None else calibrated(source, config)
+def _checked(source: Source) -> Source:
     survey = source.survey()
     for note in survey.notes:
         _log.info("%s: %s", source.name, note)

@@ -149,6 +149,33 @@ def test_odometry_from_tf():
     assert robot.sensors.odom_frame == "robot/odom"
 
 
+def test_the_odometry_in_tf_is_that_of_the_laser():
+    robot = Robot(odometry=None)
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/tf", transform(stamp, "camera_odom_frame", "camera_pose_frame", (9.0, 9.0, 0.0)))
+        robot.hears("/tf", transform(stamp, "odom", "base_link", (stamp, 0.0, 0.0)))
+        robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+        robot.hears("/scan", scan(stamp, RANGES))
+    assert [record.T_odom_base[0] for record in robot.records] == list(np.arange(1.0, 9.0))
+    assert (robot.sensors.odom_frame, robot.sensors.base_frame) == ("odom", "base_link")
+
+
+def test_the_odometry_in_tf_may_be_named():
+    robot = Robot(odometry=None, odom_frame="world").hears("/tf_static", transform(0.0, "base_link", "laser"))
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/tf", transform(stamp, "world", "base_link", (stamp, 0.0, 0.0)))
+        robot.hears("/scan", scan(stamp, RANGES))
+    assert robot.records[3].T_odom_base[0] == 4.0
+
+
+def test_scans_of_another_frame_on_the_topic_are_left_out_and_said(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", scan(6.5, RANGES, frame="rear"))
+    robot.drives(np.arange(7.0, 9.0))
+    assert 6.5 not in robot.stamps
+    assert "/scan has scans of the frames 'laser' and 'rear'" in robot.said[0]
+
+
 def test_a_bag_that_is_played_again_goes_on(robot):
     robot.drives(np.arange(100.0, 110.0))
     robot.drives(np.arange(10.0, 20.0))

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source
 from tests.sources.bag_messages import (
     Said,
@@ -153,10 +154,23 @@ def test_clocks_that_differ(tmp_path):
 # Time
 
 
-def test_two_recordings_put_together(tmp_path):
-    again = [message._replace(bag_time=message.bag_time + 100) for message in drive(60)]
+def test_three_recordings_put_together(tmp_path):
+    again = [each._replace(bag_time=each.bag_time + later) for later in (100, 200) for each in drive(60)]
     message = refusal(save(tmp_path / "run.bag", drive(60) + again))
     assert "message 61: time jumps back by up to 11.8 s" in message
+
+
+def test_a_clock_that_steps_back_once_is_kept_from_there(tmp_path):
+    again = [each._replace(bag_time=each.bag_time + 100) for each in drive(60)]
+    source = open_source(save(tmp_path / "run.bag", drive(60) + again))
+    scans = scans_of(source)
+    assert source.survey().scan_count == len(scans) == 111
+    assert source.faults[Fault.CLOCK_STEP].first_line == 61
+    assert source.faults[Fault.MISPLACED_SCAN].count == 9
+    frontend = RobotFrontend("robot", RobotConfig())
+    for record in scans:
+        frontend.process(record)
+    assert [len(track.stamps) for track in frontend.tracks] == [60, 51]
 
 
 def test_time_that_runs_backwards(tmp_path):
@@ -315,7 +329,7 @@ def test_odometry_without_an_orientation_is_read_from_tf(tmp_path):
     assert all((a.T_odom_base == b.T_odom_base).all() for a, b in zip(scans_of(source), wanted, strict=True))
     why = "/odom cannot be read (the orientation 0, 0, 0, 0 is no unit quaternion), so it is not used"
     assert why in " ".join(source.survey().notes)
-    fleet = open_fleet([(tmp_path / "run.bag", "a"), (save(tmp_path / "other.bag", broken), "b")])
+    fleet = open_fleet([(tmp_path / "run.bag", "a"), (save(tmp_path / "other.bag", [*broken, text(101.0)]), "b")])
     assert all(len(scans_of(each)) == 30 for each in fleet)
 
 

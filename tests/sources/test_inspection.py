@@ -26,7 +26,7 @@ def test_a_bag_names_its_topics_rates_and_frames(tmp_path, suffix):
     assert topics["/scan"].rate_hz == pytest.approx(5.0)
     assert topics["/odom"].rate_hz == pytest.approx(10.0, rel=0.02)
     assert found.bag.transforms == (("base_link", "laser"),)
-    assert found.bag.laser_frames == {"/scan": "laser"}
+    assert found.bag.laser_frames == {"/scan": ("laser",)}
     (laser,) = found.lasers
     assert (laser.scans, laser.model.beam_count) == (40, BEAMS)
     assert laser.model.T_base_laser == pytest.approx(LASER_POSE)

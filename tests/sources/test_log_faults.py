@@ -118,8 +118,8 @@ def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):
     assert "line 62: 31 scans are not of the laser of the first ones" in message
 
 
-def test_two_recordings_put_together_are_refused_with_the_line(tmp_path):
-    message = refusal(save(tmp_path / "run.log", drive(300) + drive(300)))
+def test_three_recordings_put_together_are_refused_with_the_line(tmp_path):
+    message = refusal(save(tmp_path / "run.log", 3 * drive(300)))
     assert "line 602" in message
     assert "59.8 s" in message
 

@@ -28,7 +28,6 @@ from fcslam.sources.bags.messages import (
     BeamsError,
     OdometryReading,
     ScanMessage,
-    is_odometry,
     odometry_in,
     odometry_of,
     scan_of,
@@ -37,15 +36,15 @@ from fcslam.sources.bags.messages import (
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan, without_odometry
 from fcslam.sources.bags.rig import (
-    USUAL_BASES,
     Rig,
     TiltedLaserError,
+    given_mounting,
     level_mounting,
     mounted_camera,
     rig_of,
     tilt_note,
 )
-from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransformError, TransformTree
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY
@@ -96,10 +95,12 @@ class LiveSensors:
         self._codec = MessageCodec(ros1)
         self._tree = TransformTree()
         self._has_odometry = self._is_camera_ahead = False
-        self._edge: tuple[str, str] | None = None
-        """Frames of the odometry in tf."""
+        self._edge: Link | None = None
+        """Frames of the odometry in tf, once the laser's are known."""
         self._calibration: Calibration | None = None
         self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]
+        self._frames: dict[str, str] = {}
+        """Of the scans on each topic."""
         self._rig: Rig | None = None
         self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()
@@ -213,12 +214,20 @@ class LiveSensors:
         if kind in SCANS:
             laser = self._topics.scans.index(topic)
             scan = scan_of(content, received_ns)._replace(laser=laser)
+            if scan.frame != self._frames.setdefault(topic, scan.frame):
+                self._notify(
+                    f"{topic} has scans of the frames '{self._frames[topic]}' and '{scan.frame}', the last are left "
+                    "out; publish the scans of each laser on a topic of its own"
+                )
+                self.audit.add(Fault.OTHER_BEAMS, self._counts[topic])
+                return []
             if self._rig is None:
                 self._first[laser].append(scan)
             return [scan]
         if kind == ODOMETRY:
             reading = odometry_of(content, received_ns)
-            self.odom_frame, self.base_frame = reading.odom_frame or USUAL_ODOM, reading.base_frame
+            self.odom_frame = reading.odom_frame or USUAL_ODOM
+            self.base_frame = self._options.base_frame or reading.base_frame
             self._has_odometry = True
             return [reading]
         if kind in (COMPRESSED_IMAGE, IMAGE):
@@ -229,19 +238,13 @@ class LiveSensors:
         return self._transforms(content, received_ns)
 
     def _transforms(self, content: object, received_ns: int) -> list[Message]:
-        readings: list[Message] = []
-        for transform in transforms_of(content, received_ns):
-            if self._rig is None:
+        transforms = list(transforms_of(content, received_ns))
+        for transform in transforms if self._rig is None else ():
+            if self._is_own(transform.child):
                 self._tree.add(transform.parent, transform.child, transform.T_parent_child)
-            if self._topics.odometry is not None:
-                continue
-            frames = transform.parent, transform.child
-            if self._edge is None and is_odometry(transform) and self._is_own(transform.parent):
-                self._edge, (self.odom_frame, self.base_frame) = frames, frames
-                self._has_odometry = True
-            if frames == self._edge:
-                readings.append(odometry_in(transform))
-        return readings
+        if self._topics.odometry is not None or self.is_without_odometry:
+            return []
+        return [odometry_in(each) for each in transforms if self._edge in (None, (each.parent, each.child))]
 
     def _is_own(self, frame: str) -> bool:
         """Whether a frame is not that of another robot on the same tf."""
@@ -251,6 +254,7 @@ class LiveSensors:
     def _rig_now(self, now_s: float) -> Rig | None:
         """The rig if enough is known; None to wait for more."""
         is_late = self._began is not None and now_s > self._began + PATIENCE_S
+        self._find_odometry(is_late)
         if not self._is_heard(is_late):
             return None
         known = (frame for frame in USUAL_BASES if frame in self._tree)
@@ -279,6 +283,17 @@ class LiveSensors:
         for scans in self._first:
             scans.clear()
         return rig_of(first, mountings, camera)
+
+    def _find_odometry(self, is_late: bool) -> None:
+        """Find the odometry in tf, on the way up from the laser; only without a way, elsewhere."""
+        if self._topics.odometry is not None or self._edge is not None or not self._first[0]:
+            return
+        names = self._first[0][-1].frame, self._options.odom_frame, self._options.base_frame
+        if self._tree.robot(*names)[0] or is_late or self._options.laser_poses:
+            self._edge = self._tree.odometry_link(*names)
+        if self._edge is not None:
+            self.odom_frame, self.base_frame = self._edge
+            self._has_odometry = True
 
     def _is_heard(self, is_late: bool) -> bool:
         """Whether there are scans of every laser, and odometry."""
@@ -309,7 +324,7 @@ class LiveSensors:
 
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
         if self._options.laser_poses:
-            return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
+            return list(map(given_mounting, self._options.laser_poses))
         frames = [scan.frame for scan in first]
         if len(set(frames)) < len(frames):
             raise NetworkError(
@@ -328,6 +343,8 @@ class LiveSensors:
         return mountings
 
     def _read(self, number: int, item: Message) -> Iterator[SensorRecord]:
+        if isinstance(item, OdometryReading) and self._edge not in (None, (item.odom_frame, item.base_frame)):
+            return
         self._watch_clock(item)
         for merged, message in self._merger.add(number, item):
             yield from self._paired(merged, message)

@@ -17,7 +17,7 @@ from fcslam.sources.bags.codec import (
     TRANSFORMS,
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.topics import is_truth
+from fcslam.sources.bags.robots import is_truth
 
 TF, TF_STATIC = "tf", "tf_static"
 

@@ -13,8 +13,10 @@ import typer
 from fcslam.cli.options import Force, Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
+    BaseFrame,
     CameraTopic,
     LaserPose,
+    OdomFrame,
     OdomTopic,
     ScanTopic,
     bag_options,
@@ -48,6 +50,8 @@ def convert(
     *,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    odom_frame: OdomFrame = None,
+    base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     force: Force = False,
@@ -55,7 +59,9 @@ def convert(
 ) -> None:
     """Write the scans, odometry and images of a recording in another format."""
     console = notices(quiet)
-    source = open_recording(recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
+    source = open_recording(
+        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+    )
     _prepare(output, force)
     survey = source.survey()
     print_notes(console, survey.notes)

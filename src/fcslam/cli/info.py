@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.recordings import CameraTopic, LaserPose, OdomTopic, ScanTopic, bag_options
+from fcslam.cli.recordings import BaseFrame, CameraTopic, LaserPose, OdomFrame, OdomTopic, ScanTopic, bag_options
 from fcslam.errors import printable
 
 if TYPE_CHECKING:
@@ -36,21 +36,25 @@ def info(
     ] = False,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    odom_frame: OdomFrame = None,
+    base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
 ) -> None:
     """Say what is in a recording, and whether it can be mapped; if not, why."""
     from fcslam.sources.inspection import inspect
 
-    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
+    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
     found = inspect(recording, options)
     console = answers()
     if as_json:
         print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
         return
-    calibration = _calibration(recording, options) if calibrate and found.problem is None else ()
-    for line in (*_lines(found), *calibration):
+    for line in _lines(found):
         print_line(console, printable(line))
+    for each in found.robots or [found]:
+        for line in _calibration(each.path, options) if calibrate and each.problem is None else ():
+            print_line(console, printable(line))
 
 
 def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":
@@ -89,15 +93,22 @@ def _lines(found: "Inspection") -> "Iterator[str]":
         yield "topics:"
         for topic in found.bag.topics:
             rate = "" if topic.rate_hz is None else f", {topic.rate_hz:.1f} Hz"
-            frame = found.bag.laser_frames.get(topic.name)
-            seen_from = "" if frame is None else f", frame {frame}"
+            frames = found.bag.laser_frames.get(topic.name, ())
+            seen_from = f", frame{'s' * (len(frames) > 1)} {', '.join(frames)}" * bool(frames)
             yield f"  {topic.name}: {topic.type}, {topic.messages} messages{rate}{seen_from}"
         if found.bag.transforms:
             yield f"transforms: {', '.join(f'{parent} -> {child}' for parent, child in found.bag.transforms)}"
+    if found.robots:
+        yield f"robots: {len(found.robots)}"
+        for robot in found.robots:
+            yield from _lines(robot)
+        return
     if found.problem is not None:
         yield f"cannot be mapped: {found.problem}"
         return
     yield f"{found.scans} scans in {found.duration_s:.1f} s, path of {found.path_length_m:.1f} m by odometry"
+    if found.odometry_from is not None:
+        yield f"odometry: {found.odometry} readings of {found.odometry_from}"
     for number, laser in enumerate(found.lasers):
         yield f"laser {number}: {_laser(laser)}"
     if found.camera is not None:

@@ -10,9 +10,11 @@ from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
+    BaseFrame,
     CameraTopic,
     InitialPose,
     LaserPose,
+    OdomFrame,
     OdomTopic,
     ScanTopic,
     bag_options,
@@ -54,6 +56,8 @@ def localize(
     config: ConfigFile = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    odom_frame: OdomFrame = None,
+    base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     force: Force = False,
@@ -71,7 +75,9 @@ def localize(
     prepare_output(output, force)
     settings = mission_config(config)
     initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
-    source = open_recording(recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
+    source = open_recording(
+        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+    )
     survey = source.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)

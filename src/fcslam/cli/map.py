@@ -23,8 +23,10 @@ from fcslam.cli.options import (
 )
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
+    BaseFrame,
     CameraTopic,
     LaserPose,
+    OdomFrame,
     OdomTopic,
     ScanTopic,
     bag_options,
@@ -54,8 +56,8 @@ def map_recordings(
         list[str] | None,
         typer.Argument(
             metavar="LOG...",
-            help="One recording per robot. The file names the robot; NAME=LOG gives it another name. With --onto, none "
-            "maps the mission again with its edits.",
+            help="One recording per robot. The file names the robot; NAME=LOG gives it another name. A bag of several "
+            "robots gives all of them, and BAG:/ROBOT one. With --onto, none maps the mission again with its edits.",
         ),
     ] = None,
     *,
@@ -91,6 +93,8 @@ def map_recordings(
     preset: PresetName = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    odom_frame: OdomFrame = None,
+    base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     seed: MissionSeed = None,
@@ -120,7 +124,7 @@ def map_recordings(
         earlier = None if onto is None else read_mission(onto)
         settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier), preset)
         vetoes = read_vetoes(veto) if veto else ()
-        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
+        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
@@ -255,10 +259,16 @@ def _report(
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )
+    ends: dict[str, float] = {}
     for session in run.trajectories.values():
         robot, epoch = robot_and_epoch(session.robot)
         if epoch > (0 if earlier is None else earlier.epochs(robot)):  # the first session of a recording began with it
-            print_line(console, f"{session.robot}: {robot} was lost; this session begins at {session.stamps[0]:.3f} s")
+            begin_s = session.stamps[0]
+            why = f"{robot} was lost; this session begins at {begin_s:.3f} s"
+            if begin_s < ends.get(robot, begin_s):
+                why = f"the clock stepped back; this session begins at {begin_s:.3f} s"
+            print_line(console, f"{session.robot}: {why}")
+        ends[robot] = session.stamps[-1]
     _print_jumps(console, run, settings)
     maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.sources import BagOptions, Source
+    from fcslam.sources.bags.options import GivenPose
     from fcslam.sources.faults import Faults
 
 _BAGS = "ROS bags"
@@ -35,6 +36,20 @@ OdomTopic = Annotated[
         rich_help_panel=_BAGS,
     ),
 ]
+OdomFrame = Annotated[
+    str | None,
+    typer.Option(
+        "--odom-frame", metavar="FRAME", rich_help_panel=_BAGS,
+        help="Read the odometry from tf, where its parent frame has this name.",
+    ),
+]  # fmt: skip
+BaseFrame = Annotated[
+    str | None,
+    typer.Option(
+        "--base-frame", metavar="FRAME", rich_help_panel=_BAGS,
+        help="Frame of the robot whose pose the odometry is.",
+    ),
+]  # fmt: skip
 CameraTopic = Annotated[
     str | None,
     typer.Option("--camera-topic", metavar="TOPIC", help="Topic of the camera images.", rich_help_panel=_BAGS),
@@ -43,7 +58,7 @@ LaserPose = Annotated[
     list[str] | None,
     typer.Option(
         "--laser-pose",
-        metavar="X,Y,THETA",
+        metavar="X,Y,THETA[,upside-down]",
         help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf. Give one for "
         "each --scan-topic, in the same order.",
         rich_help_panel=_BAGS,
@@ -62,8 +77,9 @@ InitialPose = Annotated[
 
 
 def bag_options(
-    scan_topics: list[str] | None, odom_topic: str | None, camera_topic: str | None, laser_poses: list[str] | None
-) -> "BagOptions | None":
+    scan_topics: list[str] | None, odom_topic: str | None, camera_topic: str | None, laser_poses: list[str] | None,
+    odom_frame: str | None = None, base_frame: str | None = None,
+) -> "BagOptions | None":  # fmt: skip
     """The options of bags; None if none is given.
 
     Raises:
@@ -71,14 +87,21 @@ def bag_options(
     """
     from fcslam.sources import BagOptions
 
-    if not scan_topics and odom_topic is None and camera_topic is None and not laser_poses:
-        return None
-    return BagOptions(
+    options = BagOptions(
         tuple(scan_topics or ()),
         odom_topic,
         camera_topic,
-        tuple(pose("--laser-pose", text) for text in laser_poses or ()),
+        tuple(map(_laser_pose, laser_poses or ())),
+        odom_frame,
+        base_frame,
     )
+    return None if options == BagOptions() else options
+
+
+def _laser_pose(text: str) -> "GivenPose":
+    upright = text.removesuffix(",upside-down")
+    x, y, theta = pose("--laser-pose", upright)
+    return (x, y, theta) if upright == text else (x, y, theta, True)
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":
@@ -97,7 +120,7 @@ def open_recordings(arguments: Iterable[str], options: "BagOptions | None") -> "
     """Open the recordings of a fleet, each as ``open_recording`` does, with topics chosen once for all bags.
 
     Raises:
-        SourceError: one is no recording.
+        SourceError: one is no recording, or is given twice.
     """
     from fcslam.sources import open_fleet
 

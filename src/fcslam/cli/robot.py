@@ -15,9 +15,11 @@ from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices, print_line
 from fcslam.cli.recordings import (
+    BaseFrame,
     CameraTopic,
     InitialPose,
     LaserPose,
+    OdomFrame,
     OdomTopic,
     ScanTopic,
     bag_options,
@@ -162,6 +164,8 @@ def robot(
     outbox_mb: OutboxMb = 256.0,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    odom_frame: OdomFrame = None,
+    base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     domain: DomainId = None,
@@ -219,7 +223,7 @@ def robot(
                 _fetch(localize, server, token, ca, own, notices(quiet))
             initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
             start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings, floor=floor)
-        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
+        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame) or BagOptions()
         parameters = node_parameters(ros_parameters, use_sim_time)
         plan = learning.plan(name or parse_address(source).robot, settings.robot, server, state)
         map_live(source, name, start, options, domain, parameters, output, notices(quiet), plan)
@@ -229,7 +233,9 @@ def robot(
     server, state = _required(server, state)
     pace = _speed(speed)
     argument = source if name is None else f"{name}={source}"
-    recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
+    recording = open_recording(
+        argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+    )
     _check_name(recording.name)
     survey = recording.survey()
     console = notices(quiet)

@@ -7,9 +7,12 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.geometry import se2
+from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
+from fcslam.lidar.facing import Contradiction, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.records import FloatArray, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.records import FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.sources.bags.options import BagCorrection
@@ -56,6 +59,57 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     Raises:
         SourceError: the bag cannot be mapped.
     """
+    contradictions = [_contradiction_of(bag, laser) for laser in bag.survey().lasers]
+    if len(contradictions) > 1:
+        named = zip(bag.stream.lasers, contradictions, strict=True)
+        lines = (f"{laser.name}: {_facing_line(found)}; not corrected" for laser, found in named if found)
+        return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
+    found = contradictions[0]
+    if found is None:
+        return _calibrate_finely(bag, config)
+    turned_deg, upside_down, distance = found.facing
+    if distance != 1.0:
+        fine = _calibrate_finely(bag, config)
+        lines_before = () if fine.calibration.distance_scale else (_facing_line(found),)
+        return replace(fine, lines=(*lines_before, *fine.lines))
+    T_base_laser = np.array(bag.survey().lasers[0].T_base_laser)
+    turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
+    x, y, theta = se2.compose(turned, se2.inverse(T_base_laser)).tolist()
+    coarse = BagCorrection(mounting=(x, y, theta), upside_down=upside_down)
+    fine = _calibrate_finely(bag.corrected(coarse, ()), config)
+    x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
+    done = "--laser-pose is kept" if bag.has_given_pose else "corrected"
+    correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
+    return Calibrated(fine.calibration, correction, (f"{_facing_line(found)}; {done}", *fine.lines))
+
+
+def _contradiction_of(bag: RosBag, laser: LaserModel) -> Contradiction | None:
+    scans = (record for record in bag.records() if isinstance(record, LaserScan))
+    return contradicted_facing(scan for scan in scans if is_same_laser(scan.laser, laser))
+
+
+def _facing_line(found: Contradiction) -> str:
+    """Why the mounting or the odometry cannot be right, and what to do."""
+    (turned_deg, upside_down, distance), claims = found.facing, []
+    if upside_down:
+        claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")
+    if turned_deg:
+        side = "left" if turned_deg > 0.0 else "right"
+        claims.append(f"the laser is turned by about {abs(turned_deg):.0f} deg to the {side} of what is stated")
+    if distance != 1.0:
+        claims.append(f"the robot's distance is {distance:.2f} of what odometry says")
+    remedy = (
+        "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the odometry"
+        if distance == 1.0
+        else "correct the radius of the wheels in its driver"
+    )
+    return (
+        f"the scans contradict the odometry: {', and '.join(claims)} (then {100 * found.agreement:.0f} % of the points "
+        f"agree, and {100 * found.stated_agreement:.0f} % as stated); {remedy}"
+    )
+
+
+def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
     survey = bag.survey()
     assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
     if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:

@@ -41,6 +41,7 @@ from fcslam.robot.motion_prediction import LONGEST_S, MotionPrediction, without_
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.sources.contradictions import CHANGED, changed_share
+from fcslam.sources.gate import is_clock_step
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_of
 from fcslam.wire.messages import Body, Hello, Packet
@@ -123,6 +124,8 @@ class RobotFrontend:
         """The newest scan of the present session that was processed."""
         self._previous: LaserScan | None = None
         """The newest scan, processed or not."""
+        self._before_s = (float("-inf"), float("-inf"))
+        """Stamps of the two newest scans."""
         self._scans: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
@@ -161,6 +164,10 @@ class RobotFrontend:
         """Process the next record of the recording; returns the packets that are ready."""
         match record:
             case LaserScan():
+                if is_clock_step(self._before_s, record.stamp):
+                    self.begin_session()
+                    self.prediction = MotionPrediction() if self.prediction else None
+                self._before_s = self._before_s[1], record.stamp
                 self._process_scan(self._mapped.of(self._with_motion(record)))
             case CameraImage() if Channel.CAMERA in self._config.channels:
                 image = self.odometry.image(record) if self.prediction is None else replace(record, T_odom_base=None)

@@ -22,6 +22,7 @@ class Fault(StrEnum):
     ODOMETRY_JUMP = "jumps of the odometry bridged by scan matching"
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
     MISPLACED_SCAN = "scans recorded far back in time skipped"
+    CLOCK_STEP = "steps back of the clock, where a new session begins"
     TIME_REVERSAL = "steps back in time kept"
     NO_STAMP = "scans without a stamp taken as 1 s apart"
     REPEATED_STAMP = "scans with the stamp of the scan before kept"

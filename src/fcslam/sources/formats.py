@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fcslam.errors import SourceError
@@ -49,20 +49,49 @@ FORMATS: tuple[Format, ...] = (
 """Tried in this order. To add a format, add an entry."""
 
 
-def open_fleet(recordings: Iterable[tuple[Path, str | None]], options: BagOptions | None = None) -> list[Source]:
+def open_fleet(
+    recordings: Iterable[tuple[Path | Source, str | None]], options: BagOptions | None = None
+) -> list[Source]:
     """Open the recordings of one fleet, each with its robot's name, as ``open_source`` does.
 
-    Where ``options`` leave a choice of topics, all bags are read from the same ones if all have them.
+    A bag of several robots gives each of them. Where ``options`` leave a choice of topics, all bags of one robot are
+    read from the same ones if all have them. Sources that are open already stay as they are.
 
     Raises:
-        SourceError: as ``open_source``, or a bag cannot be read.
+        SourceError: as ``open_source``, a bag cannot be read, or a recording is given twice.
     """
-    sources = [open_source(path, options, name) for path, name in recordings]
-    bags = [source for source in sources if isinstance(source, RosBag)]
-    if len(bags) < 2:
+    sources: list[Source] = []
+    given: list[tuple[Path, str, Source]] = []
+    for path, name in recordings:
+        if not isinstance(path, Path):
+            sources.append(path)
+            continue
+        source = open_source(path, options, name)
+        for each in source.robots(name) if isinstance(source, RosBag) else [source]:
+            file, which = robot_in(path)[0], each.stream.robot.name if isinstance(each, RosBag) else ""
+            for other_file, other_which, other in given:
+                if which == other_which and _is_same(file, other_file):
+                    raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")
+            given.append((file, which, each))
+            sources.append(each)
+    bags = [source for _, _, source in given if isinstance(source, RosBag)]
+    if len(bags) < 2 or len({file for file, _, _ in given}) < len(given):  # robots of one bag differ in their topics
         return sources
-    agreed = iter(as_fleet(bags, options))
-    return [next(agreed) if isinstance(source, RosBag) else source for source in sources]
+    agreed = dict(zip(map(id, bags), as_fleet(bags, options), strict=True))
+    return [agreed.get(id(source), source) for source in sources]
+
+
+def _is_same(a: Path, b: Path) -> bool:
+    """Whether two recordings have the same files."""
+    return [part.resolve() for part in parts_of(a)] == [part.resolve() for part in parts_of(b)]
+
+
+def robot_in(path: Path) -> tuple[Path, str | None]:
+    """The file of a recording, and which robot of it ``path`` names, as in ``fleet.bag:/robot1``."""
+    file, colon, robot = str(path).rpartition(":")
+    if not colon or os.path.lexists(path) or not all(map(os.path.lexists, parts_of(Path(file)))):
+        return path, None
+    return Path(file), f"/{robot.strip('/')}"
 
 
 def open_source(path: Path, options: BagOptions | None = None, name: str | None = None) -> Source:
@@ -71,21 +100,25 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
     Only the beginning is read; ``Source.survey`` checks the rest.
 
     Args:
-        path: file or folder; several files of one bag, joined by commas.
+        path: file or folder; several files of one bag, joined by commas. A robot of a bag that has several is named
+            after a colon, as in ``fleet.bag:/robot1``.
         options: options of a bag.
-        name: the robot's name; None takes the name of the file.
+        name: the robot's name; None takes the name of the robot in the bag, or of the file.
 
     Raises:
         SourceError: the file is missing, empty, unreadable, a damaged archive or of an unknown format; or ``options``
             are given for a recording that is not a bag.
     """
-    path = Path(path)
+    path, robot = robot_in(Path(path))
     kind = format_of(path)
-    if options is not None and not kind.takes_options:
+    if (options is not None or robot is not None) and not kind.takes_options:
         raise SourceError(
             f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
-            "--camera-topic, --laser-pose) go with ROS bags only, leave them out"
+            "--camera-topic, --laser-pose, a robot after a colon) go with ROS bags only, leave them out"
         )
+    if robot is not None:
+        options = replace(options or BagOptions(), robot=robot)
+        name = name or robot.strip("/").replace("/", "_")
     return kind.open(path, name or _robot_name(path), options)
 
 

@@ -4,6 +4,8 @@
   0.9 s). Scans stay in file order, in which the odometry is consistent. A scan more than 2 s before both preceding
   scans is misplaced and skipped (both, because one of them may have a damaged stamp far ahead). A recording with more
   than 1 % misplaced scans, or with more than half of its steps back in time, is rejected.
+- A clock that steps back once, and stays there for ten scans, is kept from the tenth on: a robot begins a new session
+  there (``is_clock_step``). A second such step makes the scans after it misplaced.
 - Beams. The beams of one laser may vary from scan to scan; ``geometry.beams.misfit`` decides whether a scan can be of
   the laser. One that cannot is skipped. A recording in which these are the majority is rejected.
 - Equal stamps are kept. Some logs were printed with too few digits or without a clock.
@@ -24,6 +26,8 @@ MAX_STEP_BACK_S = 2.0
 """Largest tolerated step back in time."""
 TOLERATED_SHARE = 0.01
 """Largest share of inconsistent scans in a recording."""
+SCANS_OF_NEW_CLOCK = 10
+"""Number of misplaced scans in a row, in their order, after which the clock has stepped back."""
 SCANS_THAT_VOTE = 20
 """Number of first scans that decide which beams the laser has."""
 
@@ -35,13 +39,23 @@ def usual_beams(scans: Sequence[Beams]) -> Beams:
     return max(scans, key=lambda declared: sum(misfit(beams, declared) is None for beams in scans))
 
 
+def is_clock_step(before_s: Sequence[float], stamp: float) -> bool:
+    """Whether a scan is more than 2 s before both preceding ones; one of them may have a wrong stamp."""
+    return min(before_s) - stamp > MAX_STEP_BACK_S
+
+
 class ScanGate:
     """Filters inconsistent scans of one laser out and counts them."""
 
     def __init__(self, beams: Beams, audit: Audit) -> None:
         self._beams = beams
         self._audit = audit
-        self._previous = self._before_previous = -inf
+        self._before_s = (-inf, -inf)
+        """Stamps of the two preceding scans."""
+        self._misplaced: list[tuple[int, float]] = []
+        """Numbers and stamps of the newest misplaced scans in a row."""
+        self._has_stepped = False
+        """Whether the clock has stepped back."""
 
     def admits(self, number: int, stamp: float, beams: Beams | None) -> bool:
         """Whether the scan on line (or in message) ``number`` is consistent; counts its faults.
@@ -51,15 +65,22 @@ class ScanGate:
         if beams is None or misfit(beams, self._beams) is not None:
             self._audit.add(Fault.OTHER_BEAMS, number)
             return False
-        step_back_s = self._previous - stamp
-        if min(self._previous, self._before_previous) - stamp > MAX_STEP_BACK_S:
-            self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
-            return False
-        if step_back_s > 0.0:
+        step_back_s = self._before_s[1] - stamp
+        if is_clock_step(self._before_s, stamp):
+            if self._misplaced and not 0.0 <= stamp - self._misplaced[-1][1] <= MAX_STEP_BACK_S:
+                self._misplaced.clear()
+            self._misplaced.append((number, stamp))
+            if self._has_stepped or len(self._misplaced) < SCANS_OF_NEW_CLOCK:
+                self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
+                return False
+            self._has_stepped = True
+            self._audit.add(Fault.CLOCK_STEP, self._misplaced[0][0], step_s=step_back_s)
+        elif step_back_s > 0.0:
             self._audit.add(Fault.TIME_REVERSAL, number, step_s=step_back_s)
         elif step_back_s == 0.0:
             self._audit.add(Fault.REPEATED_STAMP, number)
-        self._before_previous, self._previous = self._previous, stamp
+        self._misplaced.clear()
+        self._before_s = self._before_s[1], stamp
         return True
 
 
@@ -110,7 +131,8 @@ def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_coun
             f"{path}: {faults.unit} {other.first_line}: {other.count} scans are not of the laser of the first ones "
             f"({scan_count} scans are): other beams; give one recording for each laser"
         )
-    if misplaced.count > TOLERATED_SHARE * scan_count:
+    skipped_at_step = (SCANS_OF_NEW_CLOCK - 1) * faults[Fault.CLOCK_STEP].count
+    if misplaced.count - skipped_at_step > TOLERATED_SHARE * scan_count:
         raise SourceError(
             f"{path}: {faults.unit} {misplaced.first_line}: time jumps back by up to {misplaced.largest_s:.6g} s, as "
             "if two recordings had been put together; cut it there and give both parts"

@@ -11,7 +11,7 @@ from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odom
 from fcslam.sources.bags.contents import BagContents, bag_contents
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
-from fcslam.sources.formats import format_of, open_source
+from fcslam.sources.formats import format_of, open_source, robot_in
 from fcslam.sources.source import Source
 
 GAP_S, GAP_INTERVALS = 1.0, 5.0
@@ -52,6 +52,8 @@ class Inspection:
     lasers: tuple[LaserContents, ...] = ()
     odometry: int = 0
     """Readings of the odometry besides those that the scans carry."""
+    odometry_from: str | None = None
+    """Topic of a bag, or frames in tf; None: no odometry, or no bag."""
     camera: CameraModel | None = None
     images: int = 0
     gaps: tuple[Gap, ...] = ()
@@ -64,6 +66,8 @@ class Inspection:
     """Choices that were made, such as topics."""
     problem: str | None = None
     """Why it cannot be mapped, one line; None if it can."""
+    robots: "tuple[Inspection, ...]" = ()
+    """Each robot of a bag that has several, by the path that chooses it; the numbers above are then 0."""
 
 
 def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
@@ -73,12 +77,22 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
         SourceError: it is no recording of a known format, or cannot be read at all.
     """
     source = open_source(path, options)
-    name = format_of(path).name
-    bag = bag_contents(path) if isinstance(source, RosBag) else None
+    name = format_of(robot_in(path)[0]).name
+    bag = bag_contents(source.stream.bag) if isinstance(source, RosBag) else None
     try:
-        return _inspected(source, path, name, bag)
+        robots = source.robots() if isinstance(source, RosBag) else []
+        if len(robots) < 2:
+            return _inspected(source, path, name, bag)
     except SourceError as error:
         return Inspection(path, name, bag, problem=str(error))
+    found = []
+    for robot in robots:
+        place = Path(f"{path}:{robot.stream.robot.name}")
+        try:
+            found.append(_inspected(robot, place, name, None))
+        except SourceError as error:
+            found.append(Inspection(place, name, None, problem=str(error)))
+    return Inspection(path, name, bag, robots=tuple(found))
 
 
 def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -> Inspection:
@@ -98,13 +112,14 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
                 odometry += 1
             case CameraImage():
                 images += 1
+    origin = source.stream.odometry if isinstance(source, RosBag) else None
     steps_s = np.diff(np.array(stamps))
     back_s = -steps_s[steps_s < 0.0]
     return Inspection(
         path, name, bag, len(stamps), survey.duration_s, survey.path_length_m,
         tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in by_laser),
-        odometry, survey.camera, images, _gaps(stamps), len(back_s), float(back_s.max(initial=0.0)),
-        str(source.faults) if source.faults else "", survey.notes,
+        odometry, origin.name if origin else None, survey.camera, images, _gaps(stamps), len(back_s),
+        float(back_s.max(initial=0.0)), str(source.faults) if source.faults else "", survey.notes,
     )  # fmt: skip
 
 

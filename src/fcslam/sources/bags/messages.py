@@ -164,11 +164,6 @@ def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
         yield StampedTransform(stamp, parent, _frame(entry.child_frame_id), transform)
 
 
-def is_odometry(transform: StampedTransform) -> bool:
-    """Whether a transform of tf is the odometry: its parent frame has "odom" in its name."""
-    return "odom" in transform.parent.rsplit("/", 1)[-1]
-
-
 def odometry_in(transform: StampedTransform) -> OdometryReading:
     """The reading that a transform from odom to base is."""
     return OdometryReading(transform.stamp, planar(transform.T_parent_child), transform.child, transform.parent)

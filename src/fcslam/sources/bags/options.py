@@ -9,6 +9,10 @@ NO_ODOMETRY: Final = "none"
 """In place of a topic of odometry: none is read."""
 
 
+GivenPose = Pose | tuple[float, float, float, bool]
+"""Pose of a laser on the floor plan of its robot, and whether it is upside down."""
+
+
 @dataclass(frozen=True, slots=True)
 class BagCorrection:
     """Corrections of the messages of a bag, from the motion in it."""
@@ -20,6 +24,8 @@ class BagCorrection:
     measured at once. None: as the messages say."""
     mounting: Pose = (0.0, 0.0, 0.0)
     """``C`` of the true ``T_base_laser = C T_base_laser``."""
+    upside_down: bool = False
+    """Whether the laser is upside down where the bag says that it is upright, or the other way round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +37,12 @@ class BagOptions:
     odom_topic: str | None = None
     """A topic of odometry, or one of tf that carries odom -> base, or ``NO_ODOMETRY``."""
     camera_topic: str | None = None
-    laser_poses: tuple[Pose, ...] = ()
-    """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf."""
+    laser_poses: tuple[GivenPose, ...] = ()
+    """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf; with True: upside down."""
+    odom_frame: str | None = None
+    """Frame in which the odometry is."""
+    base_frame: str | None = None
+    """Frame whose pose the odometry is."""
+    robot: str | None = None
+    """Name of one of several robots in the bag."""
     correction: BagCorrection = field(default_factory=BagCorrection)

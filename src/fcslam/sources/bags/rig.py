@@ -9,6 +9,7 @@ from fcslam.errors import FcslamError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
+from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.images import check_image
@@ -16,8 +17,6 @@ from fcslam.sources.pose import pose_array
 
 _LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
-USUAL_BASES = ("base_footprint", "base_link")
-"""Frames of the robot's body, where no message names it."""
 
 
 class TiltedLaserError(FcslamError):
@@ -67,6 +66,12 @@ def level_mounting(tree: TransformTree, base_frame: str, laser_frame: str) -> Mo
     if mounted.tilt_rad > _STEEPEST_RAD:
         raise TiltedLaserError(f"tilted by {degrees(mounted.tilt_rad):.0f} degrees")
     return mounted
+
+
+def given_mounting(pose: GivenPose) -> Mounting:
+    """The mounting that the user gives."""
+    x, y, theta, *upside_down = pose
+    return Mounting((x, y, theta), upside_down=any(upside_down), tilt_rad=0.0)
 
 
 def tilt_note(mounted: Mounting) -> str:

@@ -15,22 +15,22 @@ from typing import NamedTuple
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Odometry, SensorRecord
-from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
-    USUAL_BASES,
     Rig,
     TiltedLaserError,
+    given_mounting,
     level_mounting,
     mounted_camera,
     rig_of,
     tilt_note,
 )
+from fcslam.sources.bags.robots import BagRobot, robots_of, slashed
 from fcslam.sources.bags.stream import BagStream
 from fcslam.sources.bags.topics import agree_on_topics
-from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError, TransformTree
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -38,6 +38,8 @@ from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
+
+_EACH_LASER = "give one for each laser, in the same order"
 
 
 class _Reading(NamedTuple):
@@ -52,14 +54,17 @@ class _Reading(NamedTuple):
 class RosBag:
     """A bag of one robot."""
 
-    def __init__(self, path: Path, name: str, options: BagOptions | None = None, notes: tuple[str, ...] = ()) -> None:
-        """``notes`` say what was chosen for this bag before."""
+    def __init__(
+        self, path: Path, name: str, options: BagOptions | None = None, notes: tuple[str, ...] = (),
+        robot: BagRobot | None = None,
+    ) -> None:  # fmt: skip
+        """``notes`` say what was chosen for this bag before; ``robot`` is one of several in it."""
         self.name = name
         self._notes = notes
         self._options = options or BagOptions()
         """The options by which it is read."""
         self._check_options(path)
-        self.stream = BagStream(path, self._options)
+        self.stream = BagStream(path, self._options, robot)
         self._audit = _audit()
 
     @property
@@ -107,11 +112,12 @@ class RosBag:
     @cached_property
     def _reading(self) -> _Reading:
         """Summary from one pass over the whole bag; rejects a bag that cannot be mapped."""
-        audit, tree = _audit(), TransformTree()
+        audit, tree = _audit(), self.stream.tree
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in self.stream.lasers]
-        base_frame = ""
-        for _, entry in self.stream.entries(audit, tree):
+        base_frame = self._options.base_frame or ""
+        self.stream.count_broken_transforms(audit)
+        for _, entry in self.stream.entries(audit):
             if isinstance(entry, PosedScan):
                 if (sample := samples[entry.scan.laser]).wants(entry.T_odom_base):
                     scan = entry.scan
@@ -121,7 +127,7 @@ class RosBag:
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
-        which = [f" of {laser.topic.name}" for laser in self.stream.lasers]
+        which = [f" of {laser.name}" for laser in self.stream.lasers]
         for sample, its in zip(samples, which, strict=True):
             sample.check(self.stream.path, its)
         placeholders = tuple(sample.placeholders() for sample in samples)
@@ -129,10 +135,10 @@ class RosBag:
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
         camera, camera_notes = self._camera(tree, base_frame)
         tilts = (
-            self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
+            self._tilt_note(laser.name, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
         unlimited = (
-            f"{self.stream.path}: {laser.topic.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
+            f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
             for laser in self.stream.lasers
             if laser.first.range_max_m == UNKNOWN_RANGE_M
         )
@@ -143,6 +149,7 @@ class RosBag:
             *chain.from_iterable(
                 placeholder_note(self.stream.path, values, its) for values, its in zip(placeholders, which, strict=True)
             ),
+            *self.stream.robot.notes,
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
             *filter(None, tilts),
@@ -157,11 +164,8 @@ class RosBag:
         for topic in topics:
             if topics.count(topic) > 1:
                 raise SourceError(f"{path}: --scan-topic {topic} is given twice; give each laser's topic once")
-        if poses and len(poses) != max(1, len(topics)):
-            raise SourceError(
-                f"{path}: {len(poses)} --laser-pose for {max(1, len(topics))} --scan-topic; give one for each laser, "
-                "in the same order"
-            )
+        if poses and topics and len(poses) < len(topics):
+            raise SourceError(f"{path}: {len(poses)} --laser-pose for {len(topics)} --scan-topic; {_EACH_LASER}")
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
@@ -180,9 +184,12 @@ class RosBag:
         return f" ({'; '.join(errors)})" * bool(errors)
 
     def _mountings(self, tree: TransformTree, base_frame: str) -> list[Mounting]:
-        lasers = self.stream.lasers
-        if self._options.laser_poses:
-            return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
+        lasers, poses = self.stream.lasers, self._options.laser_poses
+        if poses and len(poses) != len(lasers):
+            named = ", ".join(laser.name for laser in lasers)
+            raise SourceError(f"{self.stream.path}: {len(poses)} --laser-pose for the lasers {named}; {_EACH_LASER}")
+        if poses:
+            return list(map(given_mounting, poses))
         topic_of: dict[str, str] = {}
         for laser in lasers:
             other = topic_of.setdefault(laser.first.frame, laser.topic.name)
@@ -192,19 +199,46 @@ class RosBag:
                     f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --laser-pose X,Y,THETA "
                     "for each"
                 )
-        return [self._mounting(laser.topic.name, laser.first.frame, tree, base_frame) for laser in lasers]
+        return [self._mounting(laser.name, laser.first.frame, tree, base_frame) for laser in lasers]
 
     @property
     def is_upside_down(self) -> bool:
         """Whether the first laser is."""
         return self._reading.rig.upside_down[0]
 
+    @property
+    def has_given_pose(self) -> bool:
+        """Whether the user says how the laser is mounted, which is never corrected."""
+        return bool(self._options.laser_poses)
+
     def corrected(self, correction: BagCorrection, notes: tuple[str, ...]) -> "RosBag":
         """The same bag, read with a correction that ``notes`` explain."""
-        if self._options.laser_poses:
-            correction = replace(correction, mounting=(0.0, 0.0, 0.0))
+        if self.has_given_pose:
+            correction = replace(correction, mounting=(0.0, 0.0, 0.0), upside_down=False)
         options = replace(self._options, correction=correction)
-        return RosBag(self.stream.path, self.name, options, (*self._notes, *notes))
+        return RosBag(self.stream.path, self.name, options, (*self._notes, *notes), self.stream.robot)
+
+    def robots(self, name: str | None = None) -> "list[RosBag]":
+        """The robots of the bag, or the one that is chosen, named as in it; ``name`` stands for the bag.
+
+        Raises:
+            SourceError: the bag cannot be read, or does not say which robot some topic is of.
+        """
+        robots = robots_of(self.stream.bag, self._options)
+        if self._options.robot is not None or len(robots) == 1:
+            return [self]
+        return [self._of(robot, name) for robot in robots]
+
+    def _of(self, robot: BagRobot, name: str | None) -> "RosBag":
+        """One of several robots, with its part of the options."""
+        options, own = self._options, {slashed(topic.name) for topic in robot.topics}
+        lasers = [k for k, topic in enumerate(options.scan_topics) if slashed(topic) in own]
+        if options.scan_topics:
+            poses = tuple(options.laser_poses[k] for k in lasers if options.laser_poses)
+            topics = tuple(options.scan_topics[k] for k in lasers)
+            options = replace(options, scan_topics=topics, laser_poses=poses)
+        called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
+        return RosBag(self.stream.path, called, options, self._notes, robot)
 
     def _mounting(self, topic: str, laser_frame: str, tree: TransformTree, base_frame: str) -> Mounting:
         try:
@@ -230,9 +264,9 @@ class RosBag:
         camera, note = mounted_camera(self.stream.calibration, tree, base_frame)
         return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
 
-    def _tilt_note(self, topic: Topic, mounted: Mounting) -> str:
+    def _tilt_note(self, name: str, mounted: Mounting) -> str:
         tilt = tilt_note(mounted)
-        which = f" of {topic.name}" * (len(self.stream.lasers) > 1)
+        which = f" of {name}" * (len(self.stream.lasers) > 1)
         return f"{self.stream.path}: the laser{which} is {tilt}" * bool(tilt)
 
 
@@ -243,11 +277,14 @@ def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]
         SourceError: a bag cannot be read.
     """
     agreed, notes = agree_on_topics([bag.stream.candidates for bag in bags], options or BagOptions())
-    return [RosBag(bag.stream.path, bag.name, agreed, () if k else notes) for k, bag in enumerate(bags)]
+    return [
+        RosBag(bag.stream.path, bag.name, agreed, () if k else notes, bag.stream.robot) for k, bag in enumerate(bags)
+    ]
 
 
 def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
     x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
+    mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
     return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
 
 

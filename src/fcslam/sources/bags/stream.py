@@ -1,12 +1,13 @@
 """The scans of a bag with their odometry, in the order of recording."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Sweep
 from fcslam.sources.bags.camera import (
@@ -15,15 +16,15 @@ from fcslam.sources.bags.camera import (
     calibration_of,
     image_of,
 )
+from fcslam.sources.bags.census import CountedBag
 from fcslam.sources.bags.codec import ODOMETRY
-from fcslam.sources.bags.container import BagFile, RawMessage, Topic
+from fcslam.sources.bags.container import RawMessage, Topic
 from fcslam.sources.bags.merging import merge_scans
 from fcslam.sources.bags.messages import (
     BeamsError,
     OdometryReading,
     ScanMessage,
     StampedTransform,
-    is_odometry,
     odometry_in,
     odometry_of,
     scan_of,
@@ -31,6 +32,7 @@ from fcslam.sources.bags.messages import (
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry, without_odometry
+from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
 from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
@@ -51,6 +53,13 @@ class RecordedLaser(NamedTuple):
     topic: Topic
     first: ScanMessage
     """The first scan with its usual beams."""
+    frame: str | None = None
+    """Frame of its scans, on a topic with several; None: any."""
+
+    @property
+    def name(self) -> str:
+        """The topic, and the frame if it has several."""
+        return self.topic.name if self.frame is None else f"{self.topic.name} in '{self.frame}'"
 
 
 class OdometryInput(NamedTuple):
@@ -59,24 +68,27 @@ class OdometryInput(NamedTuple):
     topics: tuple[Topic, ...]
     edge: tuple[str, str] | None
     """Parent and child frame in tf; None: the topic holds messages of odometry."""
+    base_frame: str | None = None
+    """Frame of the base, on a topic with several; None: any."""
 
     @property
     def name(self) -> str:
         """The name of the topic, or the frames in tf."""
         return self.topics[0].name if self.edge is None else f"tf from {self.edge[0]} to {self.edge[1]}"
 
-    def readings_in(self, topic: Topic, transforms: Sequence[StampedTransform]) -> Iterator[OdometryReading]:
-        """The readings among the transforms of a message of ``topic``."""
-        if self.edge is not None and topic in self.topics:
-            yield from (odometry_in(each) for each in transforms if (each.parent, each.child) == self.edge)
+    def readings_in(self, transforms: Iterable[StampedTransform]) -> Iterator[OdometryReading]:
+        """The readings among the transforms of a message."""
+        yield from (odometry_in(each) for each in transforms if (each.parent, each.child) == self.edge)
 
 
 class BagStream:
     """Decodes and combines the chosen topics of a bag."""
 
-    def __init__(self, path: Path, options: BagOptions) -> None:
+    def __init__(self, path: Path, options: BagOptions, robot: BagRobot | None = None) -> None:
+        """``robot`` is one of several in the bag; None: the one that ``options`` name, or the only one."""
         self.path = path
-        self._bag = BagFile(path)
+        self.bag = CountedBag(path) if robot is None else robot.bag
+        self._robot = robot
         self._options = options
         self.odometry_notes: list[str] = []
         """Why an odometry is not used."""
@@ -86,7 +98,21 @@ class BagStream:
     @property
     def reading_notes(self) -> tuple[str, ...]:
         """How the bag was read, if it is not whole; complete after a pass over all messages."""
-        return self._bag.notes
+        return self.bag.notes
+
+    @cached_property
+    def robot(self) -> BagRobot:
+        """The robot whose topics are read.
+
+        Raises:
+            SourceError: the bag cannot be read, or has several robots.
+        """
+        return self._robot or robot_of(self.bag, self._options)
+
+    @cached_property
+    def tree(self) -> TransformTree:
+        """The frames and transforms of the robot."""
+        return self.robot.tree
 
     @cached_property
     def candidates(self) -> Candidates:
@@ -95,7 +121,7 @@ class BagStream:
         Raises:
             SourceError: the bag cannot be read.
         """
-        found = find_candidates(self._bag, self._field_of_view_rad, self._has_images)
+        found = find_candidates(self.robot, self._field_of_view_rad, self._has_images)
         return found._replace(measured=[topic for topic in found.measured if not self._odometry_error(topic)])
 
     @cached_property
@@ -105,14 +131,14 @@ class BagStream:
         Raises:
             SourceError: the bag cannot be read, or a topic is missing.
         """
-        return choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
+        return choose_topics(self.robot, self._options, self._field_of_view_rad, self._has_images)
 
     def _odometry_error(self, topic: Topic) -> str:
         """The fault of the first message of a topic of odometry; empty if one of the first ones is valid."""
         errors = []
-        for message in islice(self._bag.messages([topic]), _READINGS_TRIED if topic.type == ODOMETRY else 0):
+        for message in islice(self.bag.messages([topic]), _READINGS_TRIED if topic.type == ODOMETRY else 0):
             try:
-                odometry_of(self._bag.decode(message), message.bag_time_ns)
+                odometry_of(self.bag.decode(message), message.bag_time_ns)
             except ValueError as error:
                 errors.append(str(error))
             else:
@@ -126,38 +152,38 @@ class BagStream:
         Raises:
             SourceError: none of a laser's scans can be read.
         """
-        return [self._laser(topic) for topic in self.topics.scans]
+        return [
+            self._laser(topic, frame)
+            for topic in self.topics.scans
+            for frame in self.robot.scan_frames.get(topic.name, (None,))
+        ]
 
-    def _laser(self, topic: Topic) -> RecordedLaser:
-        scans = list(islice(self._scans_of(topic), SCANS_THAT_VOTE))
+    def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
+        own = (scan for scan in self._scans_of(topic) if frame in (None, scan.frame))
+        scans = list(islice(own, SCANS_THAT_VOTE))
         if not scans:
             raise SourceError(
                 f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read"
                 f"{self._reason(topic)}; correct the laser's driver, or copy the bag again"
             )
         usual = usual_beams([scan.beams for scan in scans])
-        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual))
+        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual), frame)
 
     @cached_property
     def calibration(self) -> Calibration | None:
         """Calibration of the camera; None without a camera or a readable calibration."""
         topic = self.topics.camera_info
-        for message in () if topic is None else self._bag.messages([topic]):
+        for message in () if topic is None else self.bag.messages([topic]):
             try:
-                return calibration_of(self._bag.decode(message))
+                return calibration_of(self.bag.decode(message))
             except ValueError:
                 continue
         return None
 
-    def entries(
-        self, audit: Audit, tree: TransformTree | None = None, with_images: bool = False
-    ) -> Iterator[tuple[int, Entry]]:
-        """Odometry, consistent scans with odometry, and images if asked, each with its message's number.
-
-        ``tree`` collects all transforms, if it is given.
-        """
+    def entries(self, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
+        """Odometry, consistent scans with odometry, and images if asked, each with its message's number."""
         gates = [ScanGate(laser.first.beams, audit) for laser in self.lasers]
-        items = merge_scans(self._items(audit, tree, with_images), len(gates))
+        items = merge_scans(self._items(audit, with_images), len(gates))
         for number, entry in (without_odometry if self.odometry is None else pair_with_odometry)(items):
             if not isinstance(entry, PosedScan):
                 if isinstance(entry, OdometryReading) and entry.is_after_jump:
@@ -169,13 +195,20 @@ class BagStream:
                 if entry.fault is not Fault.NO_ODOMETRY:
                     yield number, entry
 
-    def _items(self, audit: Audit, tree: TransformTree | None, with_images: bool) -> Iterator[tuple[int, Message]]:
+    def count_broken_transforms(self, audit: Audit) -> None:
+        """Count the transforms that no pass over the scans reads."""
+        read = () if self.odometry is None else self.odometry.topics
+        for topic, broken in self.bag.census.broken.items():
+            if topic in self.topics.transforms and topic not in read:
+                self.first_errors.setdefault(topic.name, f"message {broken.first} of it: {broken.error}")
+                audit.add(Fault.BROKEN_MESSAGE, broken.first, broken.count)
+
+    def _items(self, audit: Audit, with_images: bool) -> Iterator[tuple[int, Message]]:
         topics, odometry = self.topics, () if self.odometry is None else self.odometry.topics
-        heard = () if tree is None else topics.transforms
         seen = (topics.camera,) if with_images and topics.camera is not None else ()
-        for message in self._bag.messages(list(dict.fromkeys((*odometry, *heard, *topics.scans, *seen)))):
+        for message in self.bag.messages(list(dict.fromkeys((*odometry, *topics.scans, *seen)))):
             try:
-                items = self._items_in(message, tree)
+                items = self._items_in(message)
             except BeamsError:
                 audit.add(Fault.BAD_BEAMS, message.number)
             except ValueError as error:
@@ -186,21 +219,26 @@ class BagStream:
                 for item in items:
                     yield message.number, item
 
-    def _items_in(self, message: RawMessage, tree: TransformTree | None) -> list[Message]:
+    def _items_in(self, message: RawMessage) -> list[Message]:
         """Decode one message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
-            scan = scan_of(self._bag.decode(message), message.bag_time_ns)
-            return [self._corrected(scan)._replace(laser=self.topics.scans.index(message.topic))]
+            scan = scan_of(self.bag.decode(message), message.bag_time_ns)
+            return [self._corrected(scan)._replace(laser=laser) for laser in self._lasers_of(message.topic, scan.frame)]
         if message.topic == self.topics.camera:
             return [self._image_in(message)]
-        if message.topic.type == ODOMETRY:
-            return [self._in_time(odometry_of(self._bag.decode(message), message.bag_time_ns))]
-        transforms = self._transforms_in(message)
-        if tree is not None:
-            for transform in transforms:
-                tree.add(transform.parent, transform.child, transform.T_parent_child)
-        readings = () if self.odometry is None else self.odometry.readings_in(message.topic, transforms)
-        return [self._in_time(reading) for reading in readings]
+        odometry = self.odometry
+        if odometry is None:
+            return []
+        if odometry.edge is None:
+            reading = odometry_of(self.bag.decode(message), message.bag_time_ns)
+            return [self._in_time(reading)] if odometry.base_frame in (None, reading.base_frame) else []
+        return [self._in_time(reading) for reading in odometry.readings_in(self._transforms_in(message))]
+
+    def _lasers_of(self, topic: Topic, frame: str) -> list[int]:
+        """The number of the laser whose scans in ``frame`` are on ``topic``; none if it is of another robot."""
+        return [
+            number for number, laser in enumerate(self.lasers) if laser.topic == topic and laser.frame in (None, frame)
+        ]
 
     def _in_time(self, reading: OdometryReading) -> OdometryReading:
         """The reading with its stamp by the clock of the scans."""
@@ -241,61 +279,82 @@ class BagStream:
         )
 
     def _odometry_candidates(self) -> Iterator["OdometryInput"]:
-        measured = [topic for topic in self.topics.odometry if topic.type == ODOMETRY]
-        for topic in measured:
-            yield OdometryInput((topic,), None)
-        if measured and self._options.odom_topic is not None:
-            return
-        edge = self._odometry_edge
-        if edge is not None:
-            yield OdometryInput(self.topics.transforms, edge)
+        """The chosen topic of odometry, then tf.
 
-    @cached_property
-    def _odometry_edge(self) -> tuple[str, str] | None:
-        """Frames of the odometry in tf: the first transform whose parent frame contains "odom"; None without one."""
-        transforms = self._transforms_of(self.topics.transforms)
-        return next(((each.parent, each.child) for each in transforms if is_odometry(each)), None)
+        Raises:
+            SourceError: there is no odometry of the frames that the user names, or it is not clear which is the base.
+        """
+        options, frame = self._options, self.lasers[0].first.frame
+        link = self.tree.odometry_link(frame, options.odom_frame, options.base_frame)
+        measured = [topic for topic in self.topics.odometry if topic.type == ODOMETRY]
+        if options.odom_topic is None and options.odom_frame is not None:
+            measured = []
+        for topic in measured:
+            yield OdometryInput((topic,), None, self._base_frame(topic))
+        if measured and options.odom_topic is not None:
+            return
+        if link is not None:
+            named = tuple(topic for topic in self.topics.odometry if topic.type != ODOMETRY)
+            yield OdometryInput(named or self.topics.transforms, link)
+        elif options.odom_frame or (options.base_frame and not measured):
+            known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in self.tree.links)
+            raise SourceError(
+                f"{self.path}: tf has no transform from {options.odom_frame or 'a frame'} to "
+                f"{options.base_frame or 'a frame above the laser'}; give others by --odom-frame and --base-frame; "
+                f"tf has {known or 'no transforms'}"
+            )
+
+    def _base_frame(self, topic: Topic) -> str | None:
+        """The frame of the base on a topic of odometry that has several.
+
+        Raises:
+            SourceError: tf does not say which of them is of the robot.
+        """
+        frames = [frame for frame in usual(self.bag.census.base_frames.get(topic, {})) if frame]
+        chosen = self._options.base_frame or self.robot.base_frames.get(topic.name)
+        if len(frames) < 2:
+            return None
+        if chosen in frames:
+            return chosen
+        raise SourceError(
+            f"{self.path}: {topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one the "
+            "laser is on; choose one by --base-frame"
+        )
 
     def _poses_of(self, odometry: "OdometryInput") -> Iterator[Pose]:
-        if odometry.edge is not None:
-            for transform in self._transforms_of(odometry.topics):
-                yield from (each.T_odom_base for each in odometry.readings_in(odometry.topics[0], [transform]))
-            return
-        for message in self._bag.messages(odometry.topics):
+        for message in self.bag.messages(odometry.topics):
             with suppress(ValueError):
-                yield odometry_of(self._bag.decode(message), message.bag_time_ns).T_odom_base
-
-    def _transforms_of(self, topics: Sequence[Topic]) -> Iterator[StampedTransform]:
-        for message in self._bag.messages(topics):
-            with suppress(ValueError):
-                yield from self._transforms_in(message)
+                if odometry.edge is not None:
+                    yield from (each.T_odom_base for each in odometry.readings_in(self._transforms_in(message)))
+                else:
+                    yield odometry_of(self.bag.decode(message), message.bag_time_ns).T_odom_base
 
     def _transforms_in(self, message: RawMessage) -> list[StampedTransform]:
-        return list(transforms_of(self._bag.decode(message), message.bag_time_ns))
+        return list(transforms_of(self.bag.decode(message), message.bag_time_ns))
 
     def _scans_of(self, topic: Topic) -> Iterator[ScanMessage]:
-        for message in self._bag.messages([topic]):
+        for message in self.bag.messages([topic]):
             try:
-                scan = scan_of(self._bag.decode(message), message.bag_time_ns)
+                scan = scan_of(self.bag.decode(message), message.bag_time_ns)
             except ValueError:
                 continue
             yield scan
 
     def _reason(self, topic: Topic) -> str:
         """The fault of the first scan, in brackets."""
-        for message in islice(self._bag.messages([topic]), 1):
+        for message in islice(self.bag.messages([topic]), 1):
             try:
-                scan_of(self._bag.decode(message), message.bag_time_ns)
+                scan_of(self.bag.decode(message), message.bag_time_ns)
             except ValueError as error:
                 return f" ({error})"
         return ""
 
     def _image_in(self, message: RawMessage) -> ImageMessage:
-        return image_of(self._bag.decode(message), message.topic.type, message.bag_time_ns)
+        return image_of(self.bag.decode(message), message.topic.type, message.bag_time_ns)
 
     def _has_images(self, topic: Topic) -> bool:
         """Whether one of the first messages is a readable image; depth images are not."""
-        for message in islice(self._bag.messages([topic]), _IMAGES_TRIED):
+        for message in islice(self.bag.messages([topic]), _IMAGES_TRIED):
             try:
                 self._image_in(message)
             except ValueError:

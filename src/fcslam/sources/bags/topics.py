@@ -9,8 +9,10 @@ from typing import NamedTuple
 from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, SCANS
-from fcslam.sources.bags.container import BagFile, Topic, is_transforms
+from fcslam.sources.bags.container import Topic, is_transforms
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
+from fcslam.sources.bags.robots import BagRobot, is_truth, slashed
+from fcslam.sources.bags.transforms import last_part
 
 _NAMED_AT_MOST = 15
 _NEEDED = {
@@ -20,8 +22,6 @@ _NEEDED = {
 }
 _SAME_VIEW_RAD = 0.1
 """Fields of view that differ by less are equally wide."""
-_TRUTHS = ("ground_truth", "groundtruth")
-"""Parts of the name of an odometry topic that holds the ground truth."""
 
 
 class Topics(NamedTuple):
@@ -30,9 +30,9 @@ class Topics(NamedTuple):
     scans: tuple[Topic, ...]
     """One for each laser."""
     odometry: tuple[Topic, ...]
-    """One topic of odometry, or all tf topics; empty without either."""
+    """One topic of odometry, or those of tf; empty without either."""
     transforms: tuple[Topic, ...]
-    """All tf topics."""
+    """Those of tf."""
     camera: Topic | None
     """Images; None without readable or calibrated images."""
     camera_info: Topic | None
@@ -53,12 +53,12 @@ class Candidates(NamedTuple):
 
 
 def choose_topics(
-    bag: BagFile,
+    robot: BagRobot,
     options: BagOptions,
     field_of_view_rad: Callable[[Topic], float],
     has_images: Callable[[Topic], bool],
 ) -> Topics:
-    """Choose the topics to read, by these rules in order:
+    """Choose the topics of a robot to read, by these rules in order:
 
     - laser: the widest field of view (to 0.1 rad), one echo a beam, the name ``scan``, most messages, first by name;
     - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
@@ -67,39 +67,40 @@ def choose_topics(
     Raises:
         SourceError: a required topic is missing, or a named topic is missing or of another type.
     """
-    heard, scans = _heard(bag), _scans(bag)
+    heard, scans = _heard(robot), _scans(robot)
     if not scans:
-        raise SourceError(f"{bag.path}: no laser scans ({SCAN}); record them; {_known(bag.topics)}")
-    lasers = [topic for name in options.scan_topics for topic in _candidates(bag, scans, name, "--scan-topic")] or [
+        raise SourceError(f"{robot.bag.path}: no laser scans ({SCAN}); record them; {_known(robot.topics)}")
+    lasers = [topic for name in options.scan_topics for topic in _candidates(robot, scans, name, "--scan-topic")] or [
         _best_scan(scans, [_views_rad(scans, field_of_view_rad)])
     ]
-    transforms = tuple(topic for topic in heard if is_transforms(topic))
-    measured = _measured(bag) if options.odom_topic is None else [topic for topic in heard if topic.type == ODOMETRY]
-    wanted = options.odom_topic
-    odometries = [] if wanted == NO_ODOMETRY else _candidates(bag, [*measured, *transforms], wanted, "--odom-topic")
-    camera, camera_info, camera_notes = _choose_camera(bag, options.camera_topic, has_images)
+    transforms, wanted = robot.transforms, options.odom_topic
+    able = [*_measured(robot), *transforms]
+    if wanted is not None:
+        able = [topic for topic in heard if topic.type == ODOMETRY or is_transforms(topic)]
+    odometries = [] if wanted == NO_ODOMETRY else _candidates(robot, able, wanted, "--odom-topic")
+    camera, camera_info, camera_notes = _choose_camera(robot, options.camera_topic, has_images)
     notes = [*camera_notes]
     if not options.scan_topics:
-        notes = [*_note(bag, "laser scans", "--scan-topic", lasers[0], scans), *camera_notes]
+        notes = [*_note(robot, "laser scans", "--scan-topic", lasers[0], scans), *camera_notes]
     measured = [topic for topic in odometries if topic.type == ODOMETRY]
     if not measured:
         return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
     odometry = _best_odometry(measured)
-    notes += _note(bag, "odometry", "--odom-topic", odometry, measured)
+    notes += _note(robot, "odometry", "--odom-topic", odometry, measured)
     return Topics(tuple(lasers), (odometry,), transforms, camera, camera_info, tuple(notes))
 
 
 def find_candidates(
-    bag: BagFile, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
+    robot: BagRobot, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
 ) -> Candidates:
-    """The topics of ``bag`` from which ``choose_topics`` would choose.
+    """The topics of ``robot`` from which ``choose_topics`` would choose.
 
     Raises:
         SourceError: the bag cannot be read.
     """
-    scans, images = _scans(bag), _images(bag)
-    calibrated = [topic for topic in images if _calibration_of(topic, bag) and has_images(topic)]
-    return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(bag), calibrated)
+    scans, images = _scans(robot), _images(robot)
+    calibrated = [topic for topic in images if _calibration_of(topic, robot) and has_images(topic)]
+    return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(robot), calibrated)
 
 
 def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[BagOptions, tuple[str, ...]]:
@@ -130,16 +131,16 @@ def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[Ba
     return options, tuple(notes)
 
 
-def _heard(bag: BagFile) -> list[Topic]:
-    return [topic for topic in bag.topics if topic.message_count]
+def _heard(robot: BagRobot) -> list[Topic]:
+    return [topic for topic in robot.topics if topic.message_count]
 
 
-def _scans(bag: BagFile) -> list[Topic]:
-    return [topic for topic in _heard(bag) if topic.type in SCANS]
+def _scans(robot: BagRobot) -> list[Topic]:
+    return [topic for topic in _heard(robot) if topic.type in SCANS]
 
 
-def _measured(bag: BagFile) -> list[Topic]:
-    return [topic for topic in _heard(bag) if topic.type == ODOMETRY and not is_truth(topic.name)]
+def _measured(robot: BagRobot) -> list[Topic]:
+    return [topic for topic in _heard(robot) if topic.type == ODOMETRY and not is_truth(topic.name)]
 
 
 def _common(candidates: Sequence[Sequence[Topic]]) -> list[Topic]:
@@ -161,12 +162,12 @@ def _best_scan(scans: Sequence[Topic], views_rad: Sequence[Mapping[str, float]])
     view_rad = {topic: min(views[topic.name] for views in views_rad) for topic in scans}
     wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - _SAME_VIEW_RAD]
     return min(
-        wide, key=lambda topic: (topic.type != SCAN, _basename(topic) != "scan", -topic.message_count, topic.name)
+        wide, key=lambda topic: (topic.type != SCAN, last_part(topic.name) != "scan", -topic.message_count, topic.name)
     )
 
 
 def _best_odometry(measured: Sequence[Topic]) -> Topic:
-    return min(measured, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
+    return min(measured, key=lambda topic: (last_part(topic.name) != "odom", -topic.message_count, topic.name))
 
 
 def _fleet_note(what: str, option: str, chosen: Topic, candidates: Sequence[Sequence[Topic]]) -> list[str]:
@@ -177,52 +178,64 @@ def _fleet_note(what: str, option: str, chosen: Topic, candidates: Sequence[Sequ
 
 
 def _choose_camera(
-    bag: BagFile, wanted: str | None, has_images: Callable[[Topic], bool]
+    robot: BagRobot, wanted: str | None, has_images: Callable[[Topic], bool]
 ) -> tuple[Topic | None, Topic | None, list[str]]:
     """Topics of images and of their calibration, and notes about the choice."""
-    images = _images(bag)
-    cameras = [topic for topic in _candidates(bag, images, wanted, "--camera-topic") if has_images(topic)]
+    images = _images(robot)
+    cameras = [topic for topic in _candidates(robot, images, wanted, "--camera-topic") if has_images(topic)]
     if not cameras:
         names = ", ".join(topic.name for topic in images)
-        return None, None, [f"{bag.path}: no images of {names} can be read, the camera is left out"] if images else []
-    info_of = {camera: _calibration_of(camera, bag) for camera in cameras}
+        return (
+            None,
+            None,
+            [f"{robot.bag.path}: no images of {names} can be read, the camera is left out"] if images else [],
+        )
+    info_of = {camera: _calibration_of(camera, robot) for camera in cameras}
     chosen = min(cameras, key=lambda topic: (info_of[topic] is None, *_camera_rank(topic)))
     if info_of[chosen] is None:
-        return None, None, [f"{bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"]
-    return chosen, info_of[chosen], _note(bag, "images", "--camera-topic", chosen, cameras)
+        return (
+            None,
+            None,
+            [f"{robot.bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"],
+        )
+    return chosen, info_of[chosen], _note(robot, "images", "--camera-topic", chosen, cameras)
 
 
-def _images(bag: BagFile) -> list[Topic]:
-    return [topic for topic in _heard(bag) if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+def _images(robot: BagRobot) -> list[Topic]:
+    return [topic for topic in _heard(robot) if topic.type in (COMPRESSED_IMAGE, IMAGE)]
 
 
 def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
     return -topic.message_count, topic.type != COMPRESSED_IMAGE, topic.name
 
 
-def _calibration_of(camera: Topic, bag: BagFile) -> Topic | None:
+def _calibration_of(camera: Topic, robot: BagRobot) -> Topic | None:
     """The calibration topic beside the images, or the only one if there is only one camera."""
-    infos = [topic for topic in _heard(bag) if topic.type == CAMERA_INFO]
+    infos = [topic for topic in _heard(robot) if topic.type == CAMERA_INFO]
     name = camera.name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    beside = [info for info in infos if _slashed(info.name) == _slashed(name)]
-    return next(iter(beside or (infos if len(infos) == len(_images(bag)) == 1 else [])), None)
+    beside = [info for info in infos if slashed(info.name) == slashed(name)]
+    return next(iter(beside or (infos if len(infos) == len(_images(robot)) == 1 else [])), None)
 
 
-def _candidates(bag: BagFile, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:
+def _candidates(robot: BagRobot, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:
     """All candidates, or the one that the user names."""
     if wanted is None:
         return list(candidates)
-    chosen = [topic for topic in candidates if _slashed(topic.name) == _slashed(wanted)]
+    chosen = [topic for topic in candidates if slashed(topic.name) == slashed(wanted)]
     if not chosen:
-        there = [topic for topic in bag.topics if _slashed(topic.name) == _slashed(wanted)]
+        there = [topic for topic in robot.topics if slashed(topic.name) == slashed(wanted)]
         what = f"has {there[0].message_count} messages of type {there[0].type}" if there else "is not there"
-        raise SourceError(f"{bag.path}: topic {wanted} {what}; {option} needs {_NEEDED[option]}; {_known(bag.topics)}")
+        raise SourceError(
+            f"{robot.bag.path}: topic {wanted} {what}; {option} needs {_NEEDED[option]}; {_known(robot.topics)}"
+        )
     return chosen[:1]
 
 
-def _note(bag: BagFile, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
+def _note(robot: BagRobot, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
     others = ", ".join(topic.name for topic in candidates if topic != chosen)
-    return [f"{bag.path}: reads {what} from {chosen.name}, not from {others} ({option} chooses)"] if others else []
+    return (
+        [f"{robot.bag.path}: reads {what} from {chosen.name}, not from {others} ({option} chooses)"] if others else []
+    )
 
 
 def _known(topics: Sequence[Topic]) -> str:
@@ -233,16 +246,3 @@ def _known(topics: Sequence[Topic]) -> str:
     )
     more = f" and {len(topics) - _NAMED_AT_MOST} more" if len(topics) > _NAMED_AT_MOST else ""
     return f"the topics are {named}{more}"
-
-
-def _slashed(name: str) -> str:
-    return "/" + name.strip("/")
-
-
-def is_truth(name: str) -> bool:
-    """Whether a topic of this name holds the ground truth."""
-    return any(truth in name.lower() for truth in _TRUTHS)
-
-
-def _basename(topic: Topic) -> str:
-    return topic.name.rsplit("/", 1)[-1]

@@ -31,6 +31,12 @@ class Mounting(NamedTuple):
     """Angle between the laser's plane and the floor, 0 to pi / 2."""
 
 
+Link = tuple[str, str]
+"""Names of the parent and the child of a transform."""
+USUAL_BASES = ("base_footprint", "base_link")
+"""Frames of the robot's body, where no message names it."""
+_NO_ODOMETRY = ("map", *USUAL_BASES)
+"""Frames in which a robot jumps, or in which its joints move."""
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -73,11 +79,13 @@ class TransformTree:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Transform]] = {}
         self._moving: set[str] = set()
+        self._links: dict[tuple[str, str], None] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Add a transform. The first one counts; a frame whose transform changes later is moving."""
+        self._links[parent, child] = None
         first_parent, first = self._parents.setdefault(child, (parent, T_parent_child))
-        if first is not T_parent_child and (parent != first_parent or _differ(first, T_parent_child)):
+        if first is not T_parent_child and (parent != first_parent or differ(first, T_parent_child)):
             self._moving.add(child)
 
     def __contains__(self, frame: str) -> bool:
@@ -102,6 +110,43 @@ class TransformTree:
                 )
         return _compose(_inverse(self._chain(up)), self._chain(down))
 
+    def robot(self, frame: str, odom_frame: str | None = None, base_frame: str | None = None) -> Link:
+        """The transform in which the robot with ``frame`` moves: its parent and child.
+
+        On the way up from ``frame``, it is the first whose parent has "odom" in its name. Without one, it is the first
+        that moves and is neither a joint of the robot nor its pose in a map. The parent is empty if there is none; the
+        child is then the last frame to which ``frame`` is fixed.
+
+        Args:
+            frame: any of the robot.
+            odom_frame, base_frame: names of the parent and the child; None: any.
+        """
+        above = [link for child in self._above(frame) for link in self._links if link[1] == child]
+        above = [link for link in above if _matches(link, odom_frame, base_frame)]
+        named = [link for link in above if is_odom(link[0])]
+        moving = [link for link in above if link[1] in self._moving and last_part(link[0]) not in _NO_ODOMETRY]
+        fixed = (each for each in self._above(frame) if each in self._moving or each not in self._parents)
+        return next(iter((*named, *moving, *(above if odom_frame else ()))), ("", next(fixed, frame)))
+
+    def odometry_link(self, frame: str, odom_frame: str | None = None, base_frame: str | None = None) -> Link | None:
+        """The transform that is the odometry of the robot with ``frame``; None without one.
+
+        It is that of ``robot``, else from "odom" to a usual base. If tf lacks ``frame``, it is the first that can be.
+        """
+        link = self.robot(frame, odom_frame, base_frame)
+        if link[0]:
+            return link
+        unconnected = [] if frame in self else self._links
+        if odom_frame or base_frame:
+            return next((each for each in unconnected if _matches(each, odom_frame, base_frame)), None)
+        bases = (each for each in self._links if is_odom(each[0]) and last_part(each[1]) in USUAL_BASES)
+        return next(bases, next((each for each in unconnected if is_odom(each[0])), None))
+
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """Parent and child of all transforms, in the order in which they appeared."""
+        return tuple(self._links)
+
     def _above(self, frame: str) -> Iterator[str]:
         """The frame and its ancestors; a cycle ends where it closes."""
         seen: set[str] = set()
@@ -116,6 +161,20 @@ class TransformTree:
         for frame in frames:
             result = _compose(self._parents[frame][1], result)
         return result
+
+
+def last_part(name: str) -> str:
+    """The name of a topic or a frame without its namespace."""
+    return name.rsplit("/", 1)[-1]
+
+
+def is_odom(frame: str) -> bool:
+    """Whether odometry is usually in a frame of this name."""
+    return "odom" in last_part(frame)
+
+
+def _matches(link: Link, parent: str | None, child: str | None) -> bool:
+    return parent in (None, link[0]) and child in (None, link[1])
 
 
 def rotated(rotation: Quaternion, vector: Vector) -> Vector:
@@ -155,7 +214,7 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-def _differ(first: Transform, second: Transform) -> bool:
+def differ(first: Transform, second: Transform) -> bool:
     """Whether two transforms differ by more than noise; q and -q are the same rotation."""
     apart = max(abs(a - b) for a, b in zip(first.translation_m, second.translation_m, strict=True))
     alike = abs(sum(a * b for a, b in zip(first.rotation, second.rotation, strict=True)))

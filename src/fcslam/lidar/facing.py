@@ -1,0 +1,193 @@
+"""Which way a laser faces: pairs of scans against the odometry between them.
+
+A laser that is turned by a large angle, or mounted upside down, contradicts the odometry in every step. The points of a
+scan are moved by the odometry to the pose of an earlier one, with each mounting that is possible. Where the mounting is
+right, they have the ranges that were measured there.
+"""
+
+import math
+from collections.abc import Iterable
+from itertools import islice
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fcslam.geometry import se2
+from fcslam.records import FloatArray, LaserScan
+
+LEAST_MOVE_M: Final = 0.3
+LEAST_TURN_RAD: Final = 0.3
+"""Two scans are compared once the robot has moved or turned by so much."""
+LONGEST_S: Final = 4.0
+"""Scans farther apart in time are not compared: odometry drifts."""
+MOST_SCANS: Final = 3000
+"""Scans that are read at most."""
+MOST_PAIRS: Final = 40
+"""Pairs with a move that are compared, and as many with a turn."""
+FEWEST_PAIRS: Final = 10
+"""Fewer pairs say nothing."""
+FEWEST_POINTS: Final = 20
+"""Fewer common points of two scans are not compared."""
+NOISE_M: Final = 0.1
+"""Standard deviation of the ranges with the odometry between two scans."""
+LARGEST_STEP_M: Final = 0.3
+"""Beams side by side whose ranges differ by more see two things."""
+STEPS_DEG: Final = (30, 3)
+"""Between the mountings that are tried, first and around the best."""
+DISTANCES: Final = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
+"""Scales of the distance that are tried; then those between."""
+SQUARE_DEG: Final = 3
+"""A laser that is turned by nearly a multiple of a right angle is turned by it."""
+ENOUGH_AGREEMENT: Final = 0.75
+"""Agreement with which a mounting is right."""
+LEAST_AGREEMENT: Final = 0.6
+"""Least agreement with the right mounting; below, the scans do not fit the odometry in any way."""
+LEAST_GAIN: Final = 0.1
+"""Least gain in agreement over the stated mounting."""
+LEAST_LEAD: Final = 0.05
+"""Least gain in agreement over any other mounting."""
+SIGMAS: Final = 5.0
+"""Least ratio of the gain to its standard deviation."""
+
+
+class Facing(NamedTuple):
+    """How a laser faces, against its stated mounting."""
+
+    turned_deg: float = 0.0
+    """Seen from above, to the left."""
+    upside_down: bool = False
+    """Whether it is upside down where it is said to be upright, or the other way round."""
+    distance: float = 1.0
+    """Distance of the robot per distance by odometry."""
+
+
+class Contradiction(NamedTuple):
+    """A mounting that the scans contradict."""
+
+    facing: Facing
+    agreement: float
+    """Mean agreement of the points with the odometry, 0 to 1, as the laser faces."""
+    stated_agreement: float
+    """The same with the stated mounting."""
+
+
+Pair = tuple[LaserScan, LaserScan]
+
+
+def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
+    """How the laser faces if it is certainly not as stated; None if the scans fit the odometry or say nothing.
+
+    Args:
+        scans: of one laser, with odometry; as many are read as are needed.
+    """
+    trial = _Trial(islice(scans, MOST_SCANS))
+    as_stated = trial.agreements(Facing())
+    if len(trial.pairs) < FEWEST_PAIRS or trial.mean(as_stated) > ENOUGH_AGREEMENT:
+        return None
+    coarse, fine = STEPS_DEG
+    scores = {
+        facing: trial.agreements(facing)
+        for facing in (
+            *(Facing(turned, flipped) for flipped in (False, True) for turned in range(0, 360, coarse)),
+            *(Facing(distance=distance) for distance in DISTANCES),
+        )
+    }
+    best = max(scores, key=lambda facing: trial.mean(scores[facing]))
+    near = [best._replace(turned_deg=best.turned_deg + step) for step in range(-coarse // 2, coarse // 2 + 1, fine)]
+    if best.distance != 1.0:
+        near = [best._replace(distance=best.distance * 1.04**step) for step in range(-5, 6)]
+    best = max(near, key=lambda facing: trial.mean(trial.agreements(facing)))
+    square_deg = 90 * round(best.turned_deg / 90)
+    if abs(best.turned_deg - square_deg) <= SQUARE_DEG:
+        best = best._replace(turned_deg=square_deg)
+    upright = best._replace(upside_down=False)
+    if best.upside_down and not trial.leads(trial.agreements(best), trial.agreements(upright), LEAST_LEAD):
+        best = upright  # moves alone do not tell
+    found = trial.agreements(best)
+    far = [each for each in scores if abs(math.remainder(each.turned_deg - best.turned_deg, 360)) > coarse]
+    if best.distance == 1.0:
+        far += [each for each in scores if each.distance != 1.0]
+    is_certain = trial.leads(found, as_stated, LEAST_GAIN) and all(
+        trial.leads(found, scores[each], LEAST_LEAD) for each in far
+    )
+    if not is_certain or trial.mean(found) < LEAST_AGREEMENT:
+        return None
+    turned_deg = math.remainder(best.turned_deg, 360)
+    return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated))
+
+
+class _Trial:
+    """Pairs of scans on which mountings are compared; those with a turn count as much as those with a move."""
+
+    def __init__(self, scans: Iterable[LaserScan]) -> None:
+        moves, turns = _pairs(scans)
+        kinds = [moves, turns] if min(len(moves), len(turns)) >= FEWEST_PAIRS // 2 else [[*moves, *turns]]
+        self.pairs = [pair for kind in kinds for pair in kind]
+        self._weights = np.array([1.0 / len(kind) for kind in kinds for _ in kind])
+
+    def agreements(self, facing: Facing) -> FloatArray:
+        """Of each pair with a mounting; NaN if too few points are common."""
+        return np.array([_agreement(pair, facing) for pair in self.pairs])
+
+    def mean(self, agreements: FloatArray) -> float:
+        """Mean of those that are known."""
+        known = np.isfinite(agreements)
+        weights = self._weights[known]
+        return float((weights * agreements[known]).sum() / weights.sum()) if known.any() else 0.0
+
+    def leads(self, scores: FloatArray, others: FloatArray, least: float) -> bool:
+        """Whether one mounting is certainly better than another."""
+        gains = scores - others
+        known = np.isfinite(gains)
+        if np.count_nonzero(known) < FEWEST_PAIRS:
+            return False
+        weights, gain = self._weights[known] / self._weights[known].sum(), self.mean(gains)
+        sigma = math.sqrt(float((weights**2 * (gains[known] - gain) ** 2).sum()))
+        return gain > max(least, SIGMAS * sigma)
+
+
+def _pairs(scans: Iterable[LaserScan]) -> tuple[list[Pair], list[Pair]]:
+    """Pairs of scans one after the other with a move between them, and those with a turn."""
+    moves: list[Pair] = []
+    turns: list[Pair] = []
+    first: LaserScan | None = None
+    for scan in scans:
+        if first is None or not 0.0 <= scan.stamp - first.stamp <= LONGEST_S:
+            first = scan
+            continue
+        x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
+        if abs(theta) > LEAST_TURN_RAD or math.hypot(x, y) > LEAST_MOVE_M:
+            pairs = turns if abs(theta) > LEAST_TURN_RAD else moves
+            if len(pairs) < MOST_PAIRS:
+                pairs.append((first, scan))
+            first = scan
+        if len(moves) == len(turns) == MOST_PAIRS:
+            break
+    return moves, turns
+
+
+def _agreement(pair: Pair, facing: Facing) -> float:
+    """Mean agreement, 0 to 1, of the points of the later scan with the earlier one; NaN if too few are in its view."""
+    before, after = pair
+    T_base_laser = se2.compose(before.laser.T_base_laser, (0.0, 0.0, math.radians(facing.turned_deg)))
+    moved = se2.between(before.T_odom_base, after.T_odom_base) * (facing.distance, facing.distance, 1.0)
+    T_before_after = se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
+    sign = -1.0 if facing.upside_down else 1.0
+    seen = (after.ranges_m > 0.0) & (after.ranges_m < after.laser.max_range_m)
+    angles, ranges_m = sign * after.laser.angles_rad()[seen], after.ranges_m[seen]
+    points = se2.transform(T_before_after, np.stack((ranges_m * np.cos(angles), ranges_m * np.sin(angles)), axis=1))
+    beams = before.laser.beams
+    middle_rad = beams.angle_min_rad + 0.5 * beams.span_rad
+    angle = se2.wrap_angle(sign * np.arctan2(points[:, 1], points[:, 0]) - middle_rad)
+    beam = (angle + 0.5 * beams.span_rad) / beams.angle_increment_rad
+    index = np.floor(beam).astype(np.intp)
+    inside = (index >= 0) & (index < beams.beam_count - 1)
+    index, share, distance = index[inside], (beam - index)[inside], np.hypot(points[:, 0], points[:, 1])[inside]
+    left, right = before.ranges_m[index].astype(np.float64), before.ranges_m[index + 1].astype(np.float64)
+    is_surface = (np.minimum(left, right) > 0.0) & (np.maximum(left, right) < before.laser.max_range_m)
+    left, right, share, distance = left[is_surface], right[is_surface], share[is_surface], distance[is_surface]
+    is_flat = np.abs(left - right) < LARGEST_STEP_M
+    if np.count_nonzero(is_flat) < FEWEST_POINTS:
+        return math.nan
+    error_m = (distance - (left + share * (right - left)))[is_flat]
+    return float(np.exp(-0.5 * (error_m / NOISE_M) ** 2).mean())

@@ -1,0 +1,107 @@
+"""A laser that is turned or upside down contradicts the odometry, and how it faces is found."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.lidar.facing import Facing, contradicted_facing
+from fcslam.lidar.frontend import LidarConfig
+from fcslam.records import LaserModel, LaserScan, frozen
+from fcslam.robot.calibrating import calibrated
+from fcslam.sources import BagOptions, open_source, write_bag
+from tests.lidar import worlds
+
+NARROW = LaserModel(91, -math.pi / 2, math.radians(2.0), 5.0, (0.2, 0.05, 0.0))
+WIDE = LaserModel(180, -math.pi, math.radians(2.0), 12.0, (0.2, 0.05, 0.0))
+
+
+def drive(laser):
+    poses = worlds.ring_drive(rounds=1.0)
+    rng = np.random.default_rng(3)
+    return worlds.recording(poses, worlds.drifting(poses, rng), worlds.ring(), laser)
+
+
+def stated(scans, turned_deg=0.0, upside_down=False, distance=1.0):
+    """The scans of a laser that faces so against what is stated, or of odometry with such a scale."""
+    found = []
+    for scan in scans:
+        x, y, theta = scan.laser.T_base_laser
+        laser = replace(scan.laser, T_base_laser=(x, y, theta - math.radians(turned_deg)))
+        ranges_m = scan.ranges_m
+        if upside_down:
+            first_rad = -(laser.angle_min_rad + laser.beams.span_rad)
+            laser, ranges_m = replace(laser, angle_min_rad=first_rad), frozen(ranges_m[::-1], np.float32)
+        odometry = frozen(scan.T_odom_base / (distance, distance, 1.0))
+        found.append(LaserScan(scan.stamp, ranges_m, laser, odometry))
+    return found
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("turned_deg", [0, 180, 90, -90, 40])
+@pytest.mark.parametrize("laser", [NARROW, WIDE], ids=["narrow", "wide"])
+def test_how_a_laser_faces_is_found(laser, turned_deg, upside_down):
+    found = contradicted_facing(stated(drive(laser), turned_deg, upside_down))
+    if not turned_deg and not upside_down:
+        assert found is None
+        return
+    assert math.remainder(found.facing.turned_deg - turned_deg, 360.0) == pytest.approx(0.0, abs=3.0)
+    assert found.facing[1:] == (upside_down, 1.0)
+    assert found.agreement > found.stated_agreement + 0.15
+
+
+@pytest.mark.parametrize("distance", [0.5, 2.0])
+def test_the_scale_of_the_odometry_is_found(distance):
+    poses = worlds.drive(3 * [(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.05)
+    scans = worlds.recording(poses, poses, worlds.room(), NARROW)
+    found = contradicted_facing(stated(scans, distance=distance))
+    assert found.facing == Facing(distance=pytest.approx(distance, rel=0.08))
+
+
+def test_a_bare_corridor_does_not_tell():
+    poses = worlds.drive([(0.0, 0.0), (20.0, 0.0)])
+    scans = worlds.recording(poses, poses, worlds.corridor(), WIDE)
+    for turned_deg, upside_down in ((0, False), (180, False), (0, True)):
+        assert contradicted_facing(stated(scans, turned_deg, upside_down)) is None
+
+
+def test_odometry_that_fits_in_no_way_corrects_nothing():
+    scans, rng = drive(WIDE), np.random.default_rng(1)
+    wild = [replace(scan, T_odom_base=frozen(rng.normal(0.0, 0.5, 3))) for scan in scans]
+    assert contradicted_facing(wild) is None
+    assert contradicted_facing(replace(scan, T_odom_base=frozen((math.nan,) * 3)) for scan in scans) is None
+
+
+@pytest.mark.parametrize(("turned_deg", "upside_down"), [(180, False), (0, True), (-90, True)])
+def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg, upside_down):
+    scans = drive(NARROW)
+    path = tmp_path / "wrong.mcap"
+    write_bag(path, stated(scans, turned_deg, upside_down))
+    wrong = open_source(path)
+    corrected = calibrated(wrong, LidarConfig())
+    notes = " ".join(corrected.survey().notes)
+    assert "the scans contradict the odometry" in notes
+    assert ("180 deg" in notes or "90 deg to the right" in notes) == bool(turned_deg)
+    assert ("upside down" in notes.split(";")[0]) == upside_down
+    first = next(record for record in corrected.records() if isinstance(record, LaserScan))
+    off = se2.between(NARROW.T_base_laser, first.laser.T_base_laser)
+    assert np.hypot(off[0], off[1]) < 0.1
+    assert off[2] == pytest.approx(0.0, abs=0.05)
+    assert np.array_equal(first.ranges_m, np.where(scans[0].ranges_m >= 5.0, np.inf, scans[0].ranges_m))
+    x, y, theta = NARROW.T_base_laser
+    given = BagOptions(laser_poses=((x, y, theta - math.radians(turned_deg)),))
+    kept = calibrated(open_source(path, given), LidarConfig())
+    assert "--laser-pose is kept" in " ".join(kept.survey().notes)
+    assert kept.survey().lasers[0].T_base_laser == given.laser_poses[0]
+
+
+def test_a_laser_may_be_given_upside_down(tmp_path):
+    scans = drive(NARROW)[:20]
+    path = tmp_path / "wrong.mcap"
+    write_bag(path, stated(scans, 0.0, upside_down=True))
+    source = open_source(path, BagOptions(laser_poses=((*NARROW.T_base_laser, True),)))
+    first = next(record for record in source.records() if isinstance(record, LaserScan))
+    assert first.laser.T_base_laser == NARROW.T_base_laser
+    assert np.array_equal(first.ranges_m, np.where(scans[0].ranges_m >= 5.0, np.inf, scans[0].ranges_m))
