@@ -1,0 +1,189 @@
+"""Evidence of a scan match against wheel odometry, counted by surfaces instead of points.
+
+Outdoors a scanner sees the ground: a line of returns across the path, which travels with the robot. Its many points fit
+wherever the ground was seen before, so the sum over points would overrule any odometry. But they are one surface, and
+one surface may move. So a match that contradicts odometry, or that itself is contradicted by a part of the scan, is
+compared with a match that trusts odometry as far as it was right so far.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.compiled import njit
+from fcslam.geometry import se2
+from fcslam.lidar.field import EMPTY, SurfelField, label_at
+from fcslam.lidar.matching import (
+    ALONG,
+    FIXED,
+    INDEPENDENT,
+    INLIER_RATIO,
+    INLIER_SIGMA_M,
+    OPPOSED,
+    MatchingConfig,
+    ScanMatch,
+    match_scan,
+)
+from fcslam.lidar.odometry import OdometryError
+from fcslam.lidar.scan import PointScan
+from fcslam.records import FloatArray
+
+CLEAR, CRISP = 0.8, 0.9
+"""Shares of the points in known area that a clear and a crisp match explain. What contradicts a less clear match may be
+the only part of the scan that stands still."""
+LEAST_KNOWN, CLEAR_KNOWN = 0.5, 0.75
+"""Least share of all points in known area, for a match that needs no odometry, and for a clear one."""
+FAR = 4.0
+"""A match farther than this from odometry contradicts it, in standard deviations of odometry's learned error."""
+LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
+"""Least standard deviations of odometry that a match is judged by, the heading's also per radian of turn: matches have
+an error of their own."""
+LEAST_STEP_M = 0.25
+"""Travel within which the errors of odometry are not independent, metres."""
+CORRELATED = 10.0
+"""Points of a scan that count as one in the match that trusts odometry: errors of neighbouring points are correlated.
+As points count fully in the matcher, odometry's information is raised instead."""
+SURFACE_NATS = 4.0
+"""Largest log-likelihood that one surface adds or takes: beyond it, the surface itself may have moved."""
+CLEAR_MARGIN, MARGIN = -2.0, 3.0
+"""A match against odometry is kept if its log-probability is higher by this. A clear match is wrong only where a single
+surface, as the ground, lies across the whole path; any other one is wrong often."""
+UNSUPPORTED = 0.3
+"""A crisp match is kept if odometry explains a smaller share of the points than this: then wheels have slipped."""
+GAP_M = 1.0
+"""Neighbouring returns farther apart than this lie on two surfaces."""
+CORNER: Final = float(np.cos(np.radians(35.0)))
+"""Neighbouring normals with a smaller dot product lie on two surfaces."""
+
+
+def over_steps(error: OdometryError, moved_m: float, step_m: float) -> OdometryError:
+    """Error of odometry over several steps whose errors are independent.
+
+    Args:
+        error: the error over all steps if they all erred the same way.
+        moved_m: travel over all steps, metres.
+        step_m: travel of the last one, metres.
+    """
+    share = math.sqrt(min(1.0, max(step_m, LEAST_STEP_M) / max(moved_m, LEAST_STEP_M)))
+    return OdometryError(share * error.position_m, share * error.heading_rad)
+
+
+def resolve(
+    scan: PointScan,
+    field: SurfelField,
+    T_field_guess: FloatArray,
+    match: ScanMatch,
+    learned: OdometryError,
+    turned_rad: float,
+    config: MatchingConfig,
+    velocity_information: FloatArray = FIXED,
+) -> tuple[ScanMatch, bool]:
+    """Choose between a match and one that trusts odometry as far as it was right so far.
+
+    Args:
+        scan: the points that were matched.
+        field: surfaces seen so far.
+        T_field_guess: the pose by odometry, shape (3,), metres and radians.
+        match: the match that hardly trusts odometry.
+        learned: the error of odometry as learned from earlier matches.
+        turned_rad: turn that odometry measured, radians.
+        config: settings of the second match.
+        velocity_information: as in ``match_scan``.
+
+    Returns:
+        The chosen match, and whether the scan contradicts odometry that is chosen, so that nothing is learned from it.
+    """
+    error = OdometryError(
+        max(LEAST_SIGMA_M, learned.position_m),
+        max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
+    )
+    innovation = se2.between(T_field_guess, match.T_field_base)
+    is_far = error.mahalanobis2(innovation) >= FAR**2
+    explains = match.explained >= CLEAR * match.known and match.known >= LEAST_KNOWN
+    if explains and not is_far:
+        return match, False
+    trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
+    if not is_far:
+        return trusting, False
+    if match.known < LEAST_KNOWN:
+        return trusting, True
+    is_clear = explains and match.known >= CLEAR_KNOWN
+    is_crisp = is_clear and match.explained >= CRISP * match.known
+    if is_crisp and trusting.explained < UNSUPPORTED:
+        return match, False
+    gain = surface_gain(scan, field, match.T_field_base, trusting.T_field_base, corners=is_clear)
+    gain += error.log_likelihood(innovation)
+    gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
+    if gain > (CLEAR_MARGIN if is_clear else MARGIN):
+        return match, False
+    return trusting, True
+
+
+def surface_gain(
+    scan: PointScan,
+    field: SurfelField,
+    T_field_base: FloatArray,
+    T_field_other: FloatArray,
+    corners: bool = True,
+) -> float:
+    """Log-likelihood of a scan at one pose relative to another, where each surface adds at most ``SURFACE_NATS``.
+
+    Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
+
+    Args:
+        scan: points in ``base``.
+        field: surfaces seen so far.
+        T_field_base: the one pose, shape (3,).
+        T_field_other: the other pose, shape (3,).
+        corners: whether a corner separates two surfaces. Without it, only a gap does.
+    """
+    gains = (
+        scan.normals.any(axis=1)
+        * INDEPENDENT
+        * (
+            _log_likelihoods(scan.points, scan.normals, T_field_base, field.arrays)
+            - _log_likelihoods(scan.points, scan.normals, T_field_other, field.arrays)
+        )
+    )
+    by_surface = np.bincount(surfaces(scan, corners), gains)
+    return float(np.clip(by_surface, -SURFACE_NATS, SURFACE_NATS).sum())
+
+
+def surfaces(scan: PointScan, corners: bool = True) -> NDArray[np.intp]:
+    """Number of each return's surface, shape (N,): a row of returns between two gaps, and optionally two corners."""
+    if not len(scan):
+        return np.zeros(0, np.intp)
+    ends = np.hypot(*np.diff(scan.points, axis=0).T) > GAP_M
+    if corners:
+        facing = np.flatnonzero(scan.normals.any(axis=1))
+        agreement = (scan.normals[facing[1:]] * scan.normals[facing[:-1]]).sum(axis=1)
+        ends[facing[1:][agreement < CORNER] - 1] = True
+    return np.concatenate(([0], np.cumsum(ends)))
+
+
+@njit
+def _log_likelihoods(points, normals, pose, field):  # type: ignore[no-untyped-def]
+    """Log-likelihood of each point (N,), as ``ScanMatch.log_likelihood`` sums it."""
+    surfels = field.surfels
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    found = np.zeros(len(points))
+    for i in range(len(points)):
+        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
+        label = label_at(x, y, field)
+        if label == EMPTY:
+            continue
+        s = surfels[label]
+        mx = cos * normals[i, 0] - sin * normals[i, 1]
+        my = sin * normals[i, 0] + cos * normals[i, 1]
+        if s[2] * mx + s[3] * my < OPPOSED:
+            continue
+        dx, dy = x - s[0], y - s[1]
+        likely2 = dx * dx + dy * dy
+        if s[2] != 0.0 or s[3] != 0.0:
+            e = s[2] * dx + s[3] * dy
+            likely2 = e * e + ALONG * (likely2 - e * e)
+        found[i] = np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
+    return found

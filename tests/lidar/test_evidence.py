@@ -1,0 +1,122 @@
+"""One surface does not overrule odometry that was right, several do; what moves with the robot enters no map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.lidar.evidence import SURFACE_NATS, over_steps, resolve, surface_gain, surfaces
+from fcslam.lidar.field import SurfelField
+from fcslam.lidar.frontend import LidarConfig, LidarFrontend
+from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.moving import moving_returns
+from fcslam.lidar.odometry import OdometryError, OdometryTrust
+from fcslam.lidar.scan import point_scan
+from fcslam.records import LaserModel
+from tests.lidar.worlds import LASER, drive, path, ranges, recording, room
+
+HERE = np.zeros(3)
+RIGHT = OdometryError(0.01, 0.005)
+"""Odometry that was right to a centimetre."""
+FRONT = LaserModel(181, -0.5 * np.pi, np.pi / 180, 30.0)
+
+
+def points(walls, pose=HERE, laser=LASER):
+    return point_scan(ranges(pose, walls, laser)[0], laser)
+
+
+def field_of(scan, pose=HERE):
+    field = SurfelField(np.zeros(3))
+    field.insert(scan, pose)
+    return field
+
+
+def ramp(ground_m, at_x=0.0):
+    """Two bare walls, and ground across the way, ``ground_m`` ahead of a robot at ``at_x``."""
+    ground = path((at_x + ground_m, -3.0), (at_x + ground_m, 3.0))
+    return np.vstack((path((-60, -3), (60, -3)), path((60, 3), (-60, 3)), ground))
+
+
+def resolved(walls_before, walls_now, T_field_guess, pose=HERE, learned=RIGHT):
+    field, scan = field_of(points(walls_before)), points(walls_now, pose)
+    config = MatchingConfig()
+    match = match_scan(scan, field, T_field_guess, np.diag((100.0, 100.0, 400.0)), config)
+    return match, *resolve(scan, field, T_field_guess, match, learned, 0.0, config)
+
+
+def test_ground_that_travels_along_does_not_hold_the_robot_back():
+    step = np.array((0.3, 0.0, 0.0))
+    match, chosen, contradicts = resolved(ramp(6.0), ramp(6.0, at_x=0.3), step, step)
+    assert match.T_field_base[0] < 0.1
+    assert chosen.T_field_base == pytest.approx(step, abs=0.03)
+    assert contradicts
+
+
+def test_several_surfaces_overrule_odometry():
+    slip = np.array((0.4, 0.2, 0.1))
+    match, chosen, contradicts = resolved(room(), room(), slip)
+    assert chosen is match
+    assert chosen.T_field_base == pytest.approx(HERE, abs=0.02)
+    assert not contradicts
+
+
+def test_odometry_that_was_wrong_before_does_not_overrule_a_single_surface():
+    step = np.array((0.3, 0.0, 0.0))
+    match, chosen, contradicts = resolved(ramp(6.0), ramp(6.0, at_x=0.3), step, step, OdometryError(0.3, 0.1))
+    assert chosen is match
+    assert not contradicts
+
+
+def test_a_surface_counts_once_whatever_its_number_of_points():
+    scan = points(path((5.0, -4.0), (5.0, 4.0)))
+    gain = surface_gain(scan, field_of(scan), HERE, np.array((0.3, 0.0, 0.0)))
+    assert gain == pytest.approx(SURFACE_NATS)
+    assert surface_gain(scan, field_of(scan), np.array((0.3, 0.0, 0.0)), HERE) == pytest.approx(-SURFACE_NATS)
+
+
+def test_gaps_and_corners_end_surfaces():
+    scan = points(np.vstack((path((3, -3), (3, 3), (-3, 3)), path((-3, -3), (-3, -1)))))
+    assert len(set(surfaces(scan))) == 3
+    assert len(set(surfaces(scan, corners=False))) == 2
+    assert len(surfaces(scan.only(np.zeros(len(scan), bool)))) == 0
+
+
+def test_errors_of_many_steps_grow_with_the_root():
+    error = OdometryError(1.6, 0.8)
+    assert over_steps(error, 4.0, 0.25) == pytest.approx((0.4, 0.2))
+    assert over_steps(error, 0.25, 0.25) == error
+    assert over_steps(error, 0.0, 0.0) == error
+
+
+def test_a_line_that_travels_along_moves_and_what_stands_does_not():
+    on = np.array((2.5, 0.0, 0.0))
+    before, now = points(ramp(6.0), HERE, FRONT), points(ramp(6.0, at_x=2.5), on, FRONT)
+    moving = moving_returns(now, before, se2.inverse(on))
+    is_ground = np.abs(now.points[:, 0] - 6.0) < 0.01
+    assert moving[is_ground].mean() > 0.9
+    is_seen_before = np.abs(now.points[:, 0]) < 6.0 - on[0] - 0.5  # other walls were behind the ground
+    assert not moving[is_seen_before].any()
+    assert not moving_returns(points(ramp(6.0), on, FRONT), before, se2.inverse(on)).any()
+
+
+def test_what_comes_towards_the_robot_moves_too():
+    before, now = points(ramp(20.0), HERE, FRONT), points(ramp(8.0), HERE, FRONT)
+    is_ground = np.abs(now.points[:, 0] - 8.0) < 0.01
+    assert moving_returns(now, before, HERE)[is_ground].mean() > 0.9
+
+
+def test_moving_ground_is_in_no_keyscan():
+    poses = drive([(0.0, 0.0), (8.0, 0.0)], step_m=0.3)
+    frontend, late = LidarFrontend("r", LidarConfig()), []
+    frontend._tracker._trust = OdometryTrust(0.1, 0.1, 200)  # learned where the scans tell the whole motion
+    for k, pose in enumerate(poses):
+        scan = recording(pose[None], pose[None], ramp(6.0, at_x=pose[0]), FRONT, seed=k, noise_m=0.005)[0]
+        step = frontend.process(replace(scan, stamp=0.2 * k))
+        if step.keyscan is not None and pose[0] > 4.0:
+            late.append(step.keyscan)
+    assert len(late) > 5
+    for keyscan in late:
+        assert np.mean(np.abs(keyscan.points.points[:, 0] - 6.0) < 0.2) < 0.05
+        assert np.count_nonzero(keyscan.record.ranges_m) == len(keyscan.points)
+    assert late[-1].T_local_base[0] == pytest.approx(poses[-1, 0] - poses[0, 0], abs=0.3)
