@@ -7,7 +7,8 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
+from fcslam.lidar.lost import LostConfig, can_decide, drove_on, is_doubtful, is_lost
+from fcslam.lidar.odometry import OdometryTrust
 from fcslam.records import frozen
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
@@ -78,6 +79,31 @@ def test_another_place_is_doubted_and_lost(around, elsewhere):
     frontend, there = mapped(before), moved_on(elsewhere, before)
     assert is_doubtful(frontend.localize(there[0]), frontend, CONFIG)
     assert judged(frontend, there[:20])
+
+
+def trusting(scans):
+    frontend = mapped(scans)
+    frontend._tracker._trust = OdometryTrust(0.2, 0.2, 200)
+    return frontend
+
+
+def test_who_drove_on_did_so_by_trusted_odometry_and_by_what_is_seen(around, elsewhere):
+    before = around[:60]
+    assert drove_on(before[-1], around[60], trusting(before))
+    assert not drove_on(before[-1], around[60], mapped(before[:2])), "nothing is known about odometry"
+    assert not drove_on(before[-1], moved_on(elsewhere, before)[0], trusting(before))
+
+
+def test_another_local_map_is_tied_to_the_past_by_odometry_alone(around):
+    frontend = trusting(around[:60])
+    past_m = frontend.travel_m
+    frontend.begin_local_map()
+    assert frontend.settled_m == 0.0
+    steps = [frontend.process(scan) for scan in around[60:75]]
+    first, second = [step.keyscan for step in steps if step.keyscan is not None][:2]
+    assert first.travel_m > past_m
+    # The motion is that of odometry, and its information that of the model, much less than with a match.
+    assert 10.0 * first.odometry.information[0, 0] < second.odometry.information[0, 0]
 
 
 def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):

@@ -5,6 +5,9 @@ did. A single scan that explains little of the known area may come from a crowd 
 deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
 
 A robot whose scans stopped while it drove on is lost, too: nobody saw the way.
+
+The newest keyscans may contradict the scans although the robot drove on, as after a match to the ground. Then the scan
+before and the first doubtful one show one place, where odometry says. Such a robot only needs another local map.
 """
 
 import math
@@ -15,10 +18,21 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.lidar.evidence import CORRELATED
+from fcslam.lidar.field import SurfelField
 from fcslam.lidar.frontend import LidarFrontend
+from fcslam.lidar.matching import match_scan
+from fcslam.lidar.odometry import odometry_error
+from fcslam.lidar.scan import point_scan
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.lidar.verification import verify
 from fcslam.records import FloatArray, LaserScan
+
+TRUSTED, TRUSTED_MATCHES = 0.5, 20
+"""Largest scale of odometry's error that is trusted without a map, and the least number of matches that showed it."""
+CONTINUOUS, CONTINUOUS_KNOWN = 0.6, 0.5
+"""Consecutive scans show one place if the later one has a larger share of its points in known area on surfaces of the
+earlier one, and a larger share of all points in known area."""
 
 
 class LostConfig(Settings):
@@ -83,7 +97,7 @@ def has_moved_unseen(before: LaserScan, now: LaserScan, config: LostConfig) -> b
 def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:
     """Whether a scan may show another place than the scans before it."""
     # False for a scan that was not matched, as both are NaN.
-    return frontend.travel_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
+    return frontend.settled_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
 
 
 def can_decide(scans: Sequence[LaserScan], config: LostConfig) -> bool:
@@ -109,6 +123,26 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: Lid
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
     worse = verify(before, now, predicted, frontend.config.verification).worse
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
+
+
+def drove_on(before: LaserScan, now: LaserScan, frontend: LidarFrontend) -> bool:
+    """Whether trusted odometry and the scans themselves agree that a robot drove from one scan to the next.
+
+    Args:
+        before: the last scan before the doubtful ones.
+        now: the first doubtful scan, of the same laser.
+        frontend: the robot's front end; it does not change.
+    """
+    trust, tracker = frontend.trust, frontend.config.tracker
+    if trust.matches < TRUSTED_MATCHES or trust.position > TRUSTED or before.laser != now.laser:
+        return False
+    x, y, turn = motion = se2.between(before.T_odom_base, now.T_odom_base)
+    error = trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), tracker.odometry))
+    field = SurfelField(np.zeros(3))
+    field.insert(point_scan(before.ranges_m, before.laser), np.zeros(3))
+    scan = point_scan(now.ranges_m, now.laser).thinned(tracker.point_spacing_m, tracker.point_limit)
+    match = match_scan(scan, field, motion, CORRELATED * error.information, tracker.matching)
+    return match.known >= CONTINUOUS_KNOWN and match.explained >= CONTINUOUS * match.known
 
 
 def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend, config: LostConfig) -> bool:
