@@ -1,4 +1,4 @@
-"""One surface does not overrule odometry that was right, several do; what moves with the robot enters no map."""
+"""One surface does not overrule odometry that was right, several do."""
 
 from dataclasses import replace
 
@@ -10,7 +10,6 @@ from fcslam.lidar.evidence import SURFACE_NATS, over_steps, resolve, surface_gai
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.matching import MatchingConfig, match_scan
-from fcslam.lidar.moving import moving_returns
 from fcslam.lidar.odometry import OdometryError, OdometryTrust
 from fcslam.lidar.scan import point_scan
 from fcslam.records import LaserModel
@@ -87,36 +86,3 @@ def test_errors_of_many_steps_grow_with_the_root():
     assert over_steps(error, 4.0, 0.25) == pytest.approx((0.4, 0.2))
     assert over_steps(error, 0.25, 0.25) == error
     assert over_steps(error, 0.0, 0.0) == error
-
-
-def test_a_line_that_travels_along_moves_and_what_stands_does_not():
-    on = np.array((2.5, 0.0, 0.0))
-    before, now = points(ramp(6.0), HERE, FRONT), points(ramp(6.0, at_x=2.5), on, FRONT)
-    moving = moving_returns(now, before, se2.inverse(on))
-    is_ground = np.abs(now.points[:, 0] - 6.0) < 0.01
-    assert moving[is_ground].mean() > 0.9
-    is_seen_before = np.abs(now.points[:, 0]) < 6.0 - on[0] - 0.5  # other walls were behind the ground
-    assert not moving[is_seen_before].any()
-    assert not moving_returns(points(ramp(6.0), on, FRONT), before, se2.inverse(on)).any()
-
-
-def test_what_comes_towards_the_robot_moves_too():
-    before, now = points(ramp(20.0), HERE, FRONT), points(ramp(8.0), HERE, FRONT)
-    is_ground = np.abs(now.points[:, 0] - 8.0) < 0.01
-    assert moving_returns(now, before, HERE)[is_ground].mean() > 0.9
-
-
-def test_moving_ground_is_in_no_keyscan():
-    poses = drive([(0.0, 0.0), (8.0, 0.0)], step_m=0.3)
-    frontend, late = LidarFrontend("r", LidarConfig()), []
-    frontend._tracker._trust = OdometryTrust(0.1, 0.1, 200)  # learned where the scans tell the whole motion
-    for k, pose in enumerate(poses):
-        scan = recording(pose[None], pose[None], ramp(6.0, at_x=pose[0]), FRONT, seed=k, noise_m=0.005)[0]
-        step = frontend.process(replace(scan, stamp=0.2 * k))
-        if step.keyscan is not None and pose[0] > 4.0:
-            late.append(step.keyscan)
-    assert len(late) > 5
-    for keyscan in late:
-        assert np.mean(np.abs(keyscan.points.points[:, 0] - 6.0) < 0.2) < 0.05
-        assert np.count_nonzero(keyscan.record.ranges_m) == len(keyscan.points)
-    assert late[-1].T_local_base[0] == pytest.approx(poses[-1, 0] - poses[0, 0], abs=0.3)

@@ -35,6 +35,9 @@ CLEAR, CRISP = 0.8, 0.9
 the only part of the scan that stands still."""
 LEAST_KNOWN, CLEAR_KNOWN = 0.5, 0.75
 """Least share of all points in known area, for a match that needs no odometry, and for a clear one."""
+TURNED = 0.7
+"""Share of the points in known area that a match explains whose heading alone is far from odometry, for it to be right:
+ground that travels along holds back the position. On a bump it turns the match, which then explains less."""
 FAR = 4.0
 """A match farther than this from odometry contradicts it, in standard deviations of odometry's learned error."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
@@ -47,11 +50,15 @@ CORRELATED = 10.0
 As points count fully in the matcher, odometry's information is raised instead."""
 SURFACE_NATS = 4.0
 """Largest log-likelihood that one surface adds or takes: beyond it, the surface itself may have moved."""
-CLEAR_MARGIN, MARGIN = -2.0, 3.0
-"""A match against odometry is kept if its log-probability is higher by this. A clear match is wrong only where a single
-surface, as the ground, lies across the whole path; any other one is wrong often."""
+CLEAR_MARGIN, NEAR_MARGIN, MARGIN = -2.0, 0.0, 3.0
+"""A match is kept if its log-probability is higher by this than that of the one that trusts odometry. A clear match
+against odometry is wrong only where a single surface, as the ground, lies across the whole path; any other one is wrong
+often. Near odometry neither is more likely beforehand."""
 UNSUPPORTED = 0.3
 """A crisp match is kept if odometry explains a smaller share of the points than this: then wheels have slipped."""
+BARELY = 0.6
+"""A clear match is kept if odometry explains a smaller share of the points than this times its own: not only one
+surface speaks for it, and the pose before may have been wrong."""
 GAP_M = 1.0
 """Neighbouring returns farther apart than this lie on two surfaces."""
 CORNER: Final = float(np.cos(np.radians(35.0)))
@@ -101,24 +108,26 @@ def resolve(
     )
     innovation = se2.between(T_field_guess, match.T_field_base)
     is_far = error.mahalanobis2(innovation) >= FAR**2
+    is_held = math.hypot(innovation[0], innovation[1]) >= FAR * error.position_m
+    if is_far and not is_held and match.known >= CLEAR_KNOWN and match.explained >= TURNED * match.known:
+        return match, False
     explains = match.explained >= CLEAR * match.known and match.known >= LEAST_KNOWN
-    if explains and not is_far:
+    if not is_far and (explains or error.position_m > INLIER_SIGMA_M):
         return match, False
     trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
-    if not is_far:
-        return trusting, False
-    if match.known < LEAST_KNOWN:
+    if is_far and match.known < LEAST_KNOWN:
         return trusting, True
-    is_clear = explains and match.known >= CLEAR_KNOWN
+    is_clear = explains and match.known >= CLEAR_KNOWN  # only if it is far
     is_crisp = is_clear and match.explained >= CRISP * match.known
     if is_crisp and trusting.explained < UNSUPPORTED:
+        return match, False
+    if is_clear and trusting.explained < BARELY * match.explained:
         return match, False
     gain = surface_gain(scan, field, match.T_field_base, trusting.T_field_base, corners=is_clear)
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
-    if gain > (CLEAR_MARGIN if is_clear else MARGIN):
-        return match, False
-    return trusting, True
+    margin = NEAR_MARGIN if not is_far else CLEAR_MARGIN if is_clear else MARGIN
+    return (match, False) if gain > margin else (trusting, is_far)
 
 
 def surface_gain(

@@ -8,7 +8,6 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
@@ -16,7 +15,6 @@ from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.lasers import Lasers
-from fcslam.lidar.moving import MovingReturns
 from fcslam.lidar.odometry import OdometryConfig, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
@@ -131,7 +129,6 @@ class LidarFrontend:
         self._newest: MappedKeyscan | None = None
         self._T_local_newest: dict[int, FloatArray] = {}
         """Pose of the newest keyscan of each laser."""
-        self._moving = MovingReturns()
         self._begun_m = 0.0
         """Path length at which the local map began."""
         self._recent: deque[MappedKeyscan] = deque()
@@ -183,7 +180,6 @@ class LidarFrontend:
     def begin_local_map(self) -> None:
         """Forget the surfaces seen so far. The next keyscan is tied to the one before by odometry alone."""
         self._tracker.empty_buffer()
-        self._moving = MovingReturns()
         self._recent.clear()
         self._begun_m = self.travel_m
 
@@ -220,11 +216,9 @@ class LidarFrontend:
         points = tracked.scan
         if points is None or sweep is not None:
             points = point_scan(scan.ranges_m, scan.laser, sweep)
-        moving = self._moving.find(laser, tracked.T_local_base, points)
-        points = points.only(~moving) if moving.any() else points
         self._tracker.insert(points, tracked.T_local_base, len(self.lasers))
         self._T_local_newest[laser] = tracked.T_local_base
-        ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m, moving), self.lasers[laser]
+        ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]
         beams = None if scan.laser == announced else scan.laser.beams
         record = Keyscan(KeyscanId(self.robot, self._count), scan.stamp, ranges_m, laser, beams, sweep)
         odometry, travel_m = self._odometry(tracked)
@@ -283,8 +277,7 @@ def least_sigmas(moved_m: float, turned_rad: float) -> tuple[float, float]:
     return FLOOR_SIGMA_M + FLOOR_SIGMA_PER_TRAVEL * moved_m, FLOOR_SIGMA_RAD + FLOOR_SIGMA_PER_TURN * turned_rad
 
 
-def _valid_ranges(ranges_m: Ranges, max_range_m: float, moving: NDArray[np.bool_]) -> Ranges:
-    """Ranges of a keyscan, metres; invalid ones become 0, as those of the valid ones that are ``moving``."""
+def _valid_ranges(ranges_m: Ranges, max_range_m: float) -> Ranges:
+    """Ranges of a keyscan, metres; invalid ones become 0."""
     valid = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m < max_range_m)
-    valid[np.flatnonzero(valid)[moving]] = False
     return frozen(np.where(valid, ranges_m, 0.0), np.float32)

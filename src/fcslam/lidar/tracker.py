@@ -176,10 +176,12 @@ class ScanTracker:
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
         velocity = self._velocity_information(scan.sweep)
         match = self._match(points, thinned, T_local_guess, error, velocity)
-        learned = over_steps(self._trust.scale(error), moved_m, moved_m - self._moved_m)
-        match, contradicts = resolve(
-            thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, config.matching, velocity
-        )
+        contradicts = False
+        if config.odometry.is_measured:  # a prediction was right only as long as the motion went on as before
+            learned = over_steps(self._trust.scale(error), moved_m, moved_m - self._moved_m)
+            match, contradicts = resolve(
+                thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, config.matching, velocity
+            )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)

@@ -283,17 +283,12 @@ class RobotFrontend:
         # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them. If the
         # robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
         if is_lost(scans, self._T_local_deferred, self._lidar, config):
-            if self._drove_on(scans[0]):
+            is_whole = self.odometry.jumps == self._jumps
+            if is_whole and drove_on(self._scans, scans, self._lidar):
                 self._lidar.begin_local_map()
             else:
                 self._end_session()
         self._process_deferred()
-
-    def _drove_on(self, now: LaserScan) -> bool:
-        """Whether odometry measured the way to the first doubtful scan, and the scan before confirms it."""
-        before = self._scans.get(now.laser.T_base_laser)
-        is_whole = self.odometry.jumps == self._jumps
-        return before is not None and is_whole and drove_on(before, now, self._lidar)
 
     def _end_session(self) -> None:
         """End a session and begin the next."""
