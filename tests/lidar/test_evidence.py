@@ -1,19 +1,15 @@
 """One surface does not overrule odometry that was right, several do."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from fcslam.geometry import se2
 from fcslam.lidar.evidence import SURFACE_NATS, over_steps, resolve, surface_gain, surfaces
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.matching import MatchingConfig, match_scan
-from fcslam.lidar.odometry import OdometryError, OdometryTrust
+from fcslam.lidar.odometry import OdometryError
 from fcslam.lidar.scan import point_scan
 from fcslam.records import LaserModel
-from tests.lidar.worlds import LASER, drive, path, ranges, recording, room
+from tests.lidar.worlds import LASER, path, ranges, room
 
 HERE = np.zeros(3)
 RIGHT = OdometryError(0.01, 0.005)
@@ -86,3 +82,32 @@ def test_errors_of_many_steps_grow_with_the_root():
     assert over_steps(error, 4.0, 0.25) == pytest.approx((0.4, 0.2))
     assert over_steps(error, 0.25, 0.25) == error
     assert over_steps(error, 0.0, 0.0) == error
+
+
+def test_a_clear_match_that_only_turns_is_kept():
+    turn = np.array((0.0, 0.0, 0.08))
+    corridor = np.vstack((path((-15, -1.5), (15, -1.5)), path((15, 1.5), (-15, 1.5))))
+    match, chosen, contradicts = resolved(corridor, corridor, turn)
+    assert match.T_field_base[2] == pytest.approx(0.0, abs=0.01)
+    assert chosen is match
+    assert not contradicts
+
+
+@pytest.mark.parametrize(("sigma_m", "is_kept"), [(0.03, False), (0.1, True)])
+def test_odometry_corrects_an_unclear_match_near_it_only_if_it_is_exact(sigma_m, is_kept):
+    behind = np.array((0.1, 0.0, 0.0))
+    match, chosen, contradicts = resolved(
+        ramp(6.0), np.vstack((ramp(6.0, at_x=0.1), path((4.0, -2.9), (4.0, -1.0), (3.0, -1.0)))),
+        behind, behind, OdometryError(sigma_m, 0.02),
+    )  # fmt: skip
+    assert match.explained < 0.8 * match.known
+    assert (chosen is match) == is_kept
+    assert not contradicts
+
+
+def test_a_clear_match_overrules_odometry_that_hardly_explains_the_scan():
+    walls = np.vstack((path((8, -4), (8, 4)), path((-8, 4), (-8, -4))))
+    match, chosen, contradicts = resolved(walls, walls, np.array((0.5, 0.0, 0.0)))
+    assert match.T_field_base[0] == pytest.approx(0.0, abs=0.02)
+    assert chosen is match
+    assert not contradicts

@@ -10,6 +10,7 @@ from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.lost import LostConfig, can_decide, drove_on, is_doubtful, is_lost
 from fcslam.lidar.odometry import OdometryTrust
 from fcslam.records import frozen
+from fcslam.robot.motion_prediction import without_odometry
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
 pytestmark = pytest.mark.slow
@@ -87,11 +88,30 @@ def trusting(scans):
     return frontend
 
 
+def last_of(scans):
+    return {scans[-1].laser.T_base_laser: scans[-1]}
+
+
 def test_who_drove_on_did_so_by_trusted_odometry_and_by_what_is_seen(around, elsewhere):
     before = around[:60]
-    assert drove_on(before[-1], around[60], trusting(before))
-    assert not drove_on(before[-1], around[60], mapped(before[:2])), "nothing is known about odometry"
-    assert not drove_on(before[-1], moved_on(elsewhere, before)[0], trusting(before))
+    assert drove_on(last_of(before), around[60:62], trusting(before))
+    assert not drove_on(last_of(before), around[60:62], mapped(before[:2])), "nothing is known about odometry"
+    assert not drove_on(last_of(before), moved_on(elsewhere, before)[:8], trusting(before))
+
+
+def test_one_scan_that_fits_is_enough_for_a_robot_that_drove_over_a_bump(around, elsewhere):
+    before = around[:60]
+    bump = replace(around[60], ranges_m=moved_on(elsewhere, before)[0].ranges_m)
+    assert not drove_on(last_of(before), [bump], trusting(before))
+    assert drove_on(last_of(before), [bump, around[61]], trusting(before))
+
+
+def test_a_robot_without_wheels_never_drove_on_by_odometry(around):
+    frontend = LidarFrontend("r", without_odometry(LidarConfig()))
+    for scan in around[:60]:
+        frontend.process(scan)
+    frontend._tracker._trust = OdometryTrust(0.5, 0.5, 200)
+    assert not drove_on(last_of(around[:60]), around[60:62], frontend)
 
 
 def test_another_local_map_is_tied_to_the_past_by_odometry_alone(around):

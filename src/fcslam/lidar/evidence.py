@@ -54,11 +54,9 @@ CLEAR_MARGIN, NEAR_MARGIN, MARGIN = -2.0, 0.0, 3.0
 """A match is kept if its log-probability is higher by this than that of the one that trusts odometry. A clear match
 against odometry is wrong only where a single surface, as the ground, lies across the whole path; any other one is wrong
 often. Near odometry neither is more likely beforehand."""
-UNSUPPORTED = 0.3
-"""A crisp match is kept if odometry explains a smaller share of the points than this: then wheels have slipped."""
-BARELY = 0.6
-"""A clear match is kept if odometry explains a smaller share of the points than this times its own: not only one
-surface speaks for it, and the pose before may have been wrong."""
+BARELY, HARDLY = 0.6, 0.3
+"""A crisp and a clear match are kept if odometry explains a smaller share of the points than this times their own: then
+wheels have slipped, or the pose before was wrong."""
 GAP_M = 1.0
 """Neighbouring returns farther apart than this lie on two surfaces."""
 CORNER: Final = float(np.cos(np.radians(35.0)))
@@ -119,9 +117,7 @@ def resolve(
         return trusting, True
     is_clear = explains and match.known >= CLEAR_KNOWN  # only if it is far
     is_crisp = is_clear and match.explained >= CRISP * match.known
-    if is_crisp and trusting.explained < UNSUPPORTED:
-        return match, False
-    if is_clear and trusting.explained < BARELY * match.explained:
+    if is_clear and trusting.explained < (BARELY if is_crisp else HARDLY) * match.explained:
         return match, False
     gain = surface_gain(scan, field, match.T_field_base, trusting.T_field_base, corners=is_clear)
     gain += error.log_likelihood(innovation)

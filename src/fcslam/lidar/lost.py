@@ -126,7 +126,9 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: Lid
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
 
 
-def drove_on(before: Mapping[tuple[float, float, float], LaserScan], scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
+def drove_on(
+    before: Mapping[tuple[float, float, float], LaserScan], scans: Sequence[LaserScan], frontend: LidarFrontend
+) -> bool:
     """Whether trusted odometry and the scans themselves agree that a robot drove from the last scans to doubtful ones.
 
     One pair of scans is enough: on a bump, a scan or two show only the ground.
