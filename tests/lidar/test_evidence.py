@@ -1,5 +1,7 @@
 """One surface does not overrule odometry that was right, several do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,29 +87,54 @@ def test_errors_of_many_steps_grow_with_the_root():
 
 
 def test_a_clear_match_that_only_turns_is_kept():
-    turn = np.array((0.0, 0.0, 0.08))
-    corridor = np.vstack((path((-15, -1.5), (15, -1.5)), path((15, 1.5), (-15, 1.5))))
-    match, chosen, contradicts = resolved(corridor, corridor, turn)
+    wall = path((-3, -1.5), (3, -1.5))
+    match, chosen, contradicts = resolved(wall, wall, np.array((0.0, 0.0, 0.05)))
     assert match.T_field_base[2] == pytest.approx(0.0, abs=0.01)
     assert chosen is match
     assert not contradicts
 
 
-@pytest.mark.parametrize(("sigma_m", "is_kept"), [(0.03, False), (0.1, True)])
-def test_odometry_corrects_an_unclear_match_near_it_only_if_it_is_exact(sigma_m, is_kept):
-    behind = np.array((0.1, 0.0, 0.0))
-    match, chosen, contradicts = resolved(
-        ramp(6.0), np.vstack((ramp(6.0, at_x=0.1), path((4.0, -2.9), (4.0, -1.0), (3.0, -1.0)))),
-        behind, behind, OdometryError(sigma_m, 0.02),
-    )  # fmt: skip
-    assert match.explained < 0.8 * match.known
+@pytest.mark.parametrize(
+    ("sigma_m", "explained", "is_kept"), [(0.026, 0.7, False), (0.1, 0.7, True), (0.026, 0.9, True)]
+)
+def test_odometry_corrects_a_match_near_it_only_if_it_is_exact_and_the_match_unclear(sigma_m, explained, is_kept):
+    step = np.array((0.1, 0.0, 0.0))
+    field, scan = field_of(points(ramp(25.0))), points(ramp(25.0, at_x=0.1), step)
+    match = match_scan(scan, field, step, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    match = replace(match, explained=explained * match.known)
+    chosen, contradicts = resolve(scan, field, step, match, OdometryError(sigma_m, 0.02), 0.0, MatchingConfig())
     assert (chosen is match) == is_kept
+    assert chosen.T_field_base[0] == pytest.approx(0.0 if is_kept else 0.1, abs=0.03)
+    assert not contradicts
+
+
+def test_near_odometry_a_match_of_more_surfaces_is_kept():
+    off = np.array((0.1, 0.0, 0.0))
+    field, scan = field_of(points(room())), points(room())
+    match = match_scan(scan, field, off, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    match = replace(match, explained=0.7 * match.known)
+    chosen, _ = resolve(scan, field, off, match, OdometryError(0.03, 0.02), 0.0, MatchingConfig())
+    assert chosen.T_field_base[0] == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("sigma_m", "is_kept"), [(0.03, False), (0.1, True)])
+def test_inexact_odometry_does_not_judge_a_match_near_it(sigma_m, is_kept):
+    field, scan = field_of(points(room())), points(room())
+    match = match_scan(scan, field, HERE, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    match = replace(match, T_field_base=np.array((0.1, 0.0, 0.0)), explained=0.7 * match.known)
+    chosen, _ = resolve(scan, field, HERE, match, OdometryError(sigma_m, 0.02), 0.0, MatchingConfig())
+    assert (chosen is match) == is_kept
+
+
+def test_a_match_far_from_odometry_is_kept_for_several_surfaces_that_both_explain():
+    match, chosen, contradicts = resolved(room(), room(), np.array((0.08, 0.08, 0.0)))
+    assert match.T_field_base == pytest.approx(HERE, abs=0.02)
+    assert chosen is match
     assert not contradicts
 
 
 def test_a_clear_match_overrules_odometry_that_hardly_explains_the_scan():
-    walls = np.vstack((path((8, -4), (8, 4)), path((-8, 4), (-8, -4))))
-    match, chosen, contradicts = resolved(walls, walls, np.array((0.5, 0.0, 0.0)))
-    assert match.T_field_base[0] == pytest.approx(0.0, abs=0.02)
-    assert chosen is match
-    assert not contradicts
+    off, wall = np.array((0.4, 0.0, 0.0)), path((8, -4), (8, 4))
+    field, scan = field_of(points(wall)), points(wall)
+    match = match_scan(scan, field, HERE, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    assert resolve(scan, field, off, match, RIGHT, 0.0, MatchingConfig()) == (match, False)

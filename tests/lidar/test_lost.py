@@ -106,6 +106,19 @@ def test_one_scan_that_fits_is_enough_for_a_robot_that_drove_over_a_bump(around,
     assert drove_on(last_of(before), [bump, around[61]], trusting(before))
 
 
+def test_odometry_worse_than_its_model_ties_nothing(around):
+    frontend = trusting(around[:60])
+    frontend._tracker._trust = OdometryTrust(1.5, 0.5, 200)
+    assert not drove_on(last_of(around[:60]), around[60:62], frontend)
+
+
+@pytest.mark.parametrize("farther_m", [3.0, 0.3])
+def test_scans_that_share_little_or_disagree_do_not_show_one_place(around, farther_m):
+    changed = np.arange(len(around[60].ranges_m)) % 3 > 0
+    now = replace(around[60], ranges_m=frozen(around[60].ranges_m + farther_m * changed, np.float32))
+    assert not drove_on(last_of(around[:60]), [now], trusting(around[:60]))
+
+
 def test_a_robot_without_wheels_never_drove_on_by_odometry(around):
     frontend = LidarFrontend("r", without_odometry(LidarConfig()))
     for scan in around[:60]:
