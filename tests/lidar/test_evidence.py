@@ -86,12 +86,17 @@ def test_errors_of_many_steps_grow_with_the_root():
     assert over_steps(error, 0.0, 0.0) == error
 
 
-def test_a_clear_match_that_only_turns_is_kept():
-    wall = path((-3, -1.5), (3, -1.5))
-    match, chosen, contradicts = resolved(wall, wall, np.array((0.0, 0.0, 0.05)))
-    assert match.T_field_base[2] == pytest.approx(0.0, abs=0.01)
-    assert chosen is match
-    assert not contradicts
+@pytest.mark.parametrize(
+    ("T_field_base", "explained", "is_kept"),
+    [((0.0, 0.0, 0.1), 0.75, True), ((0.0, 0.0, 0.1), 0.65, False), ((0.12, 0.0, 0.1), 0.75, False)],
+)
+def test_a_match_that_only_turns_needs_less_evidence_than_one_that_holds_back(T_field_base, explained, is_kept):
+    field, scan = field_of(points(room())), points(room())
+    match = match_scan(scan, field, HERE, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    match = replace(match, T_field_base=np.array(T_field_base), explained=explained * match.known)
+    chosen, contradicts = resolve(scan, field, HERE, match, RIGHT, 0.0, MatchingConfig())
+    assert (chosen is match) == is_kept
+    assert contradicts != is_kept
 
 
 @pytest.mark.parametrize(
