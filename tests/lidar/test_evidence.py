@@ -67,9 +67,12 @@ def test_odometry_that_was_wrong_before_does_not_overrule_a_single_surface():
 
 def test_a_surface_counts_once_whatever_its_number_of_points():
     scan = points(path((5.0, -4.0), (5.0, 4.0)))
-    gain = surface_gain(scan, field_of(scan), HERE, np.array((0.3, 0.0, 0.0)))
-    assert gain == pytest.approx(SURFACE_NATS)
-    assert surface_gain(scan, field_of(scan), np.array((0.3, 0.0, 0.0)), HERE) == pytest.approx(-SURFACE_NATS)
+    field, held = field_of(scan), np.diag((1e12, 1e12, 1e12))
+    here, off = (match_scan(scan, field, np.array((x, 0.0, 0.0)), held, MatchingConfig()) for x in (0.0, 0.3))
+    gains = here.log_likelihoods - off.log_likelihoods
+    assert gains.sum() > 2.0 * SURFACE_NATS
+    assert surface_gain(scan, gains) == pytest.approx(SURFACE_NATS)
+    assert surface_gain(scan, -gains) == pytest.approx(-SURFACE_NATS)
 
 
 def test_gaps_and_corners_end_surfaces():

@@ -12,20 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.compiled import njit
 from fcslam.geometry import se2
-from fcslam.lidar.field import EMPTY, SurfelField, label_at
-from fcslam.lidar.matching import (
-    ALONG,
-    FIXED,
-    INDEPENDENT,
-    INLIER_RATIO,
-    INLIER_SIGMA_M,
-    OPPOSED,
-    MatchingConfig,
-    ScanMatch,
-    match_scan,
-)
+from fcslam.lidar.field import SurfelField
+from fcslam.lidar.matching import FIXED, INLIER_SIGMA_M, MatchingConfig, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
@@ -119,40 +108,24 @@ def resolve(
     is_crisp = is_clear and match.explained >= CRISP * match.known
     if is_clear and trusting.explained < (BARELY if is_crisp else HARDLY) * match.explained:
         return match, False
-    gain = surface_gain(scan, field, match.T_field_base, trusting.T_field_base, corners=is_clear)
+    gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods, corners=is_clear)
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
     margin = NEAR_MARGIN if not is_far else CLEAR_MARGIN if is_clear else MARGIN
     return (match, False) if gain > margin else (trusting, is_far)
 
 
-def surface_gain(
-    scan: PointScan,
-    field: SurfelField,
-    T_field_base: FloatArray,
-    T_field_other: FloatArray,
-    corners: bool = True,
-) -> float:
-    """Log-likelihood of a scan at one pose relative to another, where each surface adds at most ``SURFACE_NATS``.
+def surface_gain(scan: PointScan, gains: FloatArray, corners: bool = True) -> float:
+    """Gain of a scan's log-likelihood at one pose over another, where each surface adds at most ``SURFACE_NATS``.
 
     Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
 
     Args:
-        scan: points in ``base``.
-        field: surfaces seen so far.
-        T_field_base: the one pose, shape (3,).
-        T_field_other: the other pose, shape (3,).
+        scan: the points.
+        gains: gain of each, shape (N,).
         corners: whether a corner separates two surfaces. Without it, only a gap does.
     """
-    gains = (
-        scan.normals.any(axis=1)
-        * INDEPENDENT
-        * (
-            _log_likelihoods(scan.points, scan.normals, T_field_base, field.arrays)
-            - _log_likelihoods(scan.points, scan.normals, T_field_other, field.arrays)
-        )
-    )
-    by_surface = np.bincount(surfaces(scan, corners), gains)
+    by_surface = np.bincount(surfaces(scan, corners), gains * scan.normals.any(axis=1))
     return float(np.clip(by_surface, -SURFACE_NATS, SURFACE_NATS).sum())
 
 
@@ -166,29 +139,3 @@ def surfaces(scan: PointScan, corners: bool = True) -> NDArray[np.intp]:
         agreement = (scan.normals[facing[1:]] * scan.normals[facing[:-1]]).sum(axis=1)
         ends[facing[1:][agreement < CORNER] - 1] = True
     return np.concatenate(([0], np.cumsum(ends)))
-
-
-@njit
-def _log_likelihoods(points, normals, pose, field):  # type: ignore[no-untyped-def]
-    """Log-likelihood of each point (N,), as ``ScanMatch.log_likelihood`` sums it."""
-    surfels = field.surfels
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    found = np.zeros(len(points))
-    for i in range(len(points)):
-        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
-        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
-        label = label_at(x, y, field)
-        if label == EMPTY:
-            continue
-        s = surfels[label]
-        mx = cos * normals[i, 0] - sin * normals[i, 1]
-        my = sin * normals[i, 0] + cos * normals[i, 1]
-        if s[2] * mx + s[3] * my < OPPOSED:
-            continue
-        dx, dy = x - s[0], y - s[1]
-        likely2 = dx * dx + dy * dy
-        if s[2] != 0.0 or s[3] != 0.0:
-            e = s[2] * dx + s[3] * dy
-            likely2 = e * e + ALONG * (likely2 - e * e)
-        found[i] = np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
-    return found
