@@ -19,14 +19,9 @@ from fcslam.lidar.odometry import OdometryError
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
-CLEAR, CRISP = 0.8, 0.9
-"""Shares of the points in known area that a clear and a crisp match explain. What contradicts a less clear match may be
-the only part of the scan that stands still."""
-LEAST_KNOWN, CLEAR_KNOWN = 0.5, 0.75
-"""Least share of all points in known area, for a match that needs no odometry, and for a clear one."""
-TURNED = 0.7
-"""Share of the points in known area that a match explains whose heading alone is far from odometry, for it to be right:
-ground that travels along holds back the position. On a bump it turns the match, which then explains less."""
+CLEAR, UNCLEAR, LEAST_KNOWN = 0.8, 0.5, 0.5
+"""Shares of the points in known area that a clear match explains at least, and an unclear one at most; least share of
+all points in known area. What contradicts an unclear match may be the only part of the scan that stands still."""
 FAR = 4.0
 """A match farther than this from odometry contradicts it, in standard deviations of odometry's learned error."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
@@ -39,13 +34,6 @@ CORRELATED = 10.0
 As points count fully in the matcher, odometry's information is raised instead."""
 SURFACE_NATS = 4.0
 """Largest log-likelihood that one surface adds or takes: beyond it, the surface itself may have moved."""
-CLEAR_MARGIN, NEAR_MARGIN, MARGIN = -2.0, 0.0, 3.0
-"""A match is kept if its log-probability is higher by this than that of the one that trusts odometry. A clear match
-against odometry is wrong only where a single surface, as the ground, lies across the whole path; any other one is wrong
-often. Near odometry neither is more likely beforehand."""
-BARELY, HARDLY = 0.6, 0.3
-"""A crisp and a clear match are kept if odometry explains a smaller share of the points than this times their own: then
-wheels have slipped, or the pose before was wrong."""
 GAP_M = 1.0
 """Neighbouring returns farther apart than this lie on two surfaces."""
 CORNER: Final = float(np.cos(np.radians(35.0)))
@@ -95,27 +83,19 @@ def resolve(
     )
     innovation = se2.between(T_field_guess, match.T_field_base)
     is_far = error.mahalanobis2(innovation) >= FAR**2
-    is_held = math.hypot(innovation[0], innovation[1]) >= FAR * error.position_m
-    if is_far and not is_held and match.known >= CLEAR_KNOWN and match.explained >= TURNED * match.known:
-        return match, False
-    explains = match.explained >= CLEAR * match.known and match.known >= LEAST_KNOWN
-    if not is_far and (explains or error.position_m > INLIER_SIGMA_M):
+    # Odometry that is less exact than points lie on surfaces corrects only unclear matches near it.
+    share = CLEAR if error.position_m <= INLIER_SIGMA_M else UNCLEAR
+    if not is_far and match.known >= LEAST_KNOWN and match.explained >= share * match.known:
         return match, False
     trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
-    if is_far and match.known < LEAST_KNOWN:
-        return trusting, True
-    is_clear = explains and match.known >= CLEAR_KNOWN  # only if it is far
-    is_crisp = is_clear and match.explained >= CRISP * match.known
-    if is_clear and trusting.explained < (BARELY if is_crisp else HARDLY) * match.explained:
-        return match, False
-    gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods, corners=is_clear)
+    gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
-    margin = NEAR_MARGIN if not is_far else CLEAR_MARGIN if is_clear else MARGIN
-    return (match, False) if gain > margin else (trusting, is_far)
+    is_kept = gain > 0.0 and (match.known >= LEAST_KNOWN or not is_far)
+    return (match, False) if is_kept else (trusting, is_far)
 
 
-def surface_gain(scan: PointScan, gains: FloatArray, corners: bool = True) -> float:
+def surface_gain(scan: PointScan, gains: FloatArray) -> float:
     """Gain of a scan's log-likelihood at one pose over another, where each surface adds at most ``SURFACE_NATS``.
 
     Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
@@ -123,19 +103,17 @@ def surface_gain(scan: PointScan, gains: FloatArray, corners: bool = True) -> fl
     Args:
         scan: the points.
         gains: gain of each, shape (N,).
-        corners: whether a corner separates two surfaces. Without it, only a gap does.
     """
-    by_surface = np.bincount(surfaces(scan, corners), gains * scan.normals.any(axis=1))
+    by_surface = np.bincount(surfaces(scan), gains * scan.normals.any(axis=1))
     return float(np.clip(by_surface, -SURFACE_NATS, SURFACE_NATS).sum())
 
 
-def surfaces(scan: PointScan, corners: bool = True) -> NDArray[np.intp]:
-    """Number of each return's surface, shape (N,): a row of returns between two gaps, and optionally two corners."""
+def surfaces(scan: PointScan) -> NDArray[np.intp]:
+    """Number of each return's surface, shape (N,): a row of returns between two gaps or corners."""
     if not len(scan):
         return np.zeros(0, np.intp)
     ends = np.hypot(*np.diff(scan.points, axis=0).T) > GAP_M
-    if corners:
-        facing = np.flatnonzero(scan.normals.any(axis=1))
-        agreement = (scan.normals[facing[1:]] * scan.normals[facing[:-1]]).sum(axis=1)
-        ends[facing[1:][agreement < CORNER] - 1] = True
+    facing = np.flatnonzero(scan.normals.any(axis=1))
+    agreement = (scan.normals[facing[1:]] * scan.normals[facing[:-1]]).sum(axis=1)
+    ends[facing[1:][agreement < CORNER] - 1] = True
     return np.concatenate(([0], np.cumsum(ends)))
