@@ -2,8 +2,8 @@
 
 Outdoors a scanner sees the ground: a line of returns across the path, which travels with the robot. Its many points fit
 wherever the ground was seen before, so the sum over points would overrule any odometry. But they are one surface, and
-one surface may move. So a match that contradicts odometry, or that itself is contradicted by a part of the scan, is
-compared with a match that trusts odometry as far as it was right so far.
+one surface may move. So a match that contradicts odometry, or leaves a part of the scan unexplained, is compared with
+another one. That trusts odometry as far as it was right so far.
 """
 
 import math
@@ -21,12 +21,12 @@ from fcslam.records import FloatArray
 
 CLEAR, UNCLEAR, LEAST_KNOWN = 0.8, 0.5, 0.5
 """Shares of the points in known area that a clear match explains at least, and an unclear one at most; least share of
-all points in known area. What contradicts an unclear match may be the only part of the scan that stands still."""
+all points in known area. The part that an unclear match does not explain may be the only one that stands still."""
 FAR = 4.0
 """A match farther than this from odometry contradicts it, in standard deviations of odometry's learned error."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
-"""Least standard deviations of odometry that a match is judged by, the heading's also per radian of turn: matches have
-an error of their own."""
+"""Least standard deviations of odometry that a match is judged by, metres and radians, and their growth per radian of
+turn. Matches have an error of their own, and the learned error is mostly that of small turns."""
 LEAST_STEP_M = 0.25
 """Travel within which the errors of odometry are not independent, metres."""
 CORRELATED = 10.0
@@ -34,6 +34,9 @@ CORRELATED = 10.0
 As points count fully in the matcher, odometry's information is raised instead."""
 SURFACE_NATS = 4.0
 """Largest log-likelihood that one surface adds or takes: beyond it, the surface itself may have moved."""
+CLEAR_GAIN = 2.0
+"""Log-probability that a clear match against odometry has beforehand over one that trusts odometry: it is wrong only
+where a single surface, as the ground, lies across the whole path."""
 GAP_M = 1.0
 """Neighbouring returns farther apart than this lie on two surfaces."""
 CORNER: Final = float(np.cos(np.radians(35.0)))
@@ -78,21 +81,22 @@ def resolve(
         The chosen match, and whether the scan contradicts odometry that is chosen, so that nothing is learned from it.
     """
     error = OdometryError(
-        max(LEAST_SIGMA_M, learned.position_m),
+        max(LEAST_SIGMA_M + SIGMA_PER_TURN * turned_rad, learned.position_m),
         max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
     )
     innovation = se2.between(T_field_guess, match.T_field_base)
     is_far = error.mahalanobis2(innovation) >= FAR**2
     # Odometry that is less exact than points lie on surfaces corrects only unclear matches near it.
     share = CLEAR if error.position_m <= INLIER_SIGMA_M else UNCLEAR
-    if not is_far and match.known >= LEAST_KNOWN and match.explained >= share * match.known:
+    is_seen = match.known >= LEAST_KNOWN
+    if not is_far and is_seen and match.explained >= share * match.known:
         return match, False
     trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
     gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
-    is_kept = gain > 0.0 and (match.known >= LEAST_KNOWN or not is_far)
-    return (match, False) if is_kept else (trusting, is_far)
+    gain += CLEAR_GAIN * (is_seen and match.explained >= CLEAR * match.known)
+    return (match, False) if gain > 0.0 and (is_seen or not is_far) else (trusting, is_far)
 
 
 def surface_gain(scan: PointScan, gains: FloatArray) -> float:

@@ -32,8 +32,8 @@ TRUSTED, TRUSTED_MATCHES = 1.0, 20
 """Largest scale of odometry's error that is trusted without a map, and the least number of matches that showed it. The
 constraint over the gap has the error by the model, of scale 1."""
 CONTINUOUS, CONTINUOUS_KNOWN = 0.6, 0.5
-"""Consecutive scans show one place if the later one has a larger share of its points in known area on surfaces of the
-earlier one, and a larger share of all points in known area."""
+"""Two scans show one place if the later one has a larger share of its points in known area on surfaces of the earlier
+one. A larger share of all points lies in known area, too."""
 
 
 class LostConfig(Settings):
