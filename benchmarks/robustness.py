@@ -5,7 +5,7 @@
 
 The logs hold poses that a particle filter corrected, good to 5 to 10 cm: they are the reference, and odometry is drawn
 from them with noise. Errors are of positions after alignment (SE(2), least squares). Most logs hold one scan every
-metre or so; stamps are missing in some, so each scan is given the next multiple of 0.2 s. A closure contradicts the
+metre or so; stamps are missing in some, so each scan is given the next second. A closure contradicts the
 reference if it is more than 1 m off.
 """
 
@@ -26,7 +26,7 @@ from fcslam.sources.faults import Faults
 
 LOGS = ("acapulco", "belgioioso", "csail", "edmonton", "fhw", "freiburg-101", "freiburg-campus", "orebro", "seattle",
         "intel", "freiburg-079")  # fmt: skip
-STEP_S, CONTRADICTION_M = 0.2, 1.0
+STEP_S, CONTRADICTION_M = 1.0, 1.0
 TRAVEL_NOISE, STANDING_NOISE_M = 0.03, 0.002
 """Standard deviation in each direction, a metre of a step's travel and besides."""
 HEADING_NOISE_RAD, TURN_NOISE = 0.02, 0.05

@@ -19,7 +19,7 @@ from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 COLUMNS = {"building": "", "cameras": "", "floor, m2": ".0f", "rooms": "", "driven, s": ".0f", "scans": ",",
            "images": ",", "wall, s": ".1f", "CPU, s": ".1f", "x real time": ".1f", "if alone": ".1f",
            "peak, MB": ".0f"}  # fmt: skip
-INDOORS = [building for building in Building if building is not Building.YARD]
+INDOORS = [building for building in Building if not building.is_outdoors]
 """Kinds of building that have cameras."""
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
+from fcslam.lidar.lost import LostConfig, can_decide, drove_on, is_doubtful, is_lost
+from fcslam.lidar.odometry import OdometryTrust
 from fcslam.records import frozen
+from fcslam.robot.motion_prediction import without_odometry
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
 pytestmark = pytest.mark.slow
@@ -78,6 +80,63 @@ def test_another_place_is_doubted_and_lost(around, elsewhere):
     frontend, there = mapped(before), moved_on(elsewhere, before)
     assert is_doubtful(frontend.localize(there[0]), frontend, CONFIG)
     assert judged(frontend, there[:20])
+
+
+def trusting(scans):
+    frontend = mapped(scans)
+    frontend._tracker._trust = OdometryTrust(0.2, 0.2, 200)
+    return frontend
+
+
+def last_of(scans):
+    return {scans[-1].laser.T_base_laser: scans[-1]}
+
+
+def test_who_drove_on_did_so_by_trusted_odometry_and_by_what_is_seen(around, elsewhere):
+    before = around[:60]
+    assert drove_on(last_of(before), around[60:62], trusting(before))
+    assert not drove_on(last_of(before), around[60:62], mapped(before[:2])), "nothing is known about odometry"
+    assert not drove_on(last_of(before), moved_on(elsewhere, before)[:8], trusting(before))
+
+
+def test_one_scan_that_fits_is_enough_for_a_robot_that_drove_over_a_bump(around, elsewhere):
+    before = around[:60]
+    bump = replace(around[60], ranges_m=moved_on(elsewhere, before)[0].ranges_m)
+    assert not drove_on(last_of(before), [bump], trusting(before))
+    assert drove_on(last_of(before), [bump, around[61]], trusting(before))
+
+
+def test_odometry_worse_than_its_model_ties_nothing(around):
+    frontend = trusting(around[:60])
+    frontend._tracker._trust = OdometryTrust(1.5, 0.5, 200)
+    assert not drove_on(last_of(around[:60]), around[60:62], frontend)
+
+
+@pytest.mark.parametrize("farther_m", [3.0, 0.3])
+def test_scans_that_share_little_or_disagree_do_not_show_one_place(around, farther_m):
+    changed = np.arange(len(around[60].ranges_m)) % 3 > 0
+    now = replace(around[60], ranges_m=frozen(around[60].ranges_m + farther_m * changed, np.float32))
+    assert not drove_on(last_of(around[:60]), [now], trusting(around[:60]))
+
+
+def test_a_robot_without_wheels_never_drove_on_by_odometry(around):
+    frontend = LidarFrontend("r", without_odometry(LidarConfig()))
+    for scan in around[:60]:
+        frontend.process(scan)
+    frontend._tracker._trust = OdometryTrust(0.5, 0.5, 200)
+    assert not drove_on(last_of(around[:60]), around[60:62], frontend)
+
+
+def test_another_local_map_is_tied_to_the_past_by_odometry_alone(around):
+    frontend = trusting(around[:60])
+    past_m = frontend.travel_m
+    frontend.begin_local_map()
+    assert frontend.settled_m == 0.0
+    steps = [frontend.process(scan) for scan in around[60:75]]
+    first, second = [step.keyscan for step in steps if step.keyscan is not None][:2]
+    assert first.travel_m > past_m
+    # The motion is that of odometry, and its information that of the model, much less than with a match.
+    assert 10.0 * first.odometry.information[0, 0] < second.odometry.information[0, 0]
 
 
 def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):

@@ -1,12 +1,14 @@
 """A robot with drifting odometry stays where it is in the buffer of what it saw."""
 
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import TABLE
+from fcslam.lidar.odometry import OdometryConfig, odometry_error
 from fcslam.lidar.tracker import ScanTracker, TrackerConfig
 from fcslam.records import LaserModel, frozen
 from tests.lidar.worlds import (
@@ -208,3 +210,18 @@ def test_the_buffer_does_not_grow_with_the_drive(truth):
     once, twice = memory(1.0), memory(2.0)
     assert twice[0] < 1.3 * once[0]
     assert twice[1] <= 2 * once[1]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 1.0])
+def test_the_learned_error_of_odometry_is_its_true_error(truth, share):
+    """The normalised innovation is about 1: trust is neither too high nor too low."""
+    poses = truth[:250]
+    rng, steps = np.random.default_rng(4), se2.relative(poses)
+    model = [odometry_error(np.hypot(x, y), abs(turn), OdometryConfig()) for x, y, turn in steps.tolist()]
+    sigmas = np.array([(error.position_m, error.position_m, error.heading_rad) for error in model])
+    errors = share * sigmas * rng.standard_normal(steps.shape)
+    odometry = list(accumulate(se2.compose(steps, errors), se2.compose, initial=np.zeros(3)))
+    _, tracker = track(recording(poses, np.array(odometry), ring()))
+    learned = [tracker.trust.scale(error) for error in model]
+    normalised = [error.mahalanobis2(e) / 3.0 for error, e in zip(learned, errors, strict=True)]
+    assert 0.5 < np.sqrt(np.mean(normalised)) < 2.0

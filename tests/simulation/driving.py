@@ -5,7 +5,7 @@ import numpy as np
 from fcslam.simulation.options import Building
 from fcslam.simulation.route import draw_goals, plan_route
 
-INDOORS = [building for building in Building if building is not Building.YARD]
+INDOORS = [building for building in Building if not building.is_outdoors]
 
 
 def route(plan, length_m, rng):

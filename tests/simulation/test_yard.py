@@ -196,6 +196,34 @@ def test_uphill_the_beam_ends_on_the_ground_and_downhill_it_passes_over_a_low_wa
     assert np.mean(downhill == 30.0) > 0.8
 
 
+@pytest.mark.parametrize("slope", [0.01, 0.06])
+def test_the_slope_of_a_yard_is_an_option_that_moves_nothing_else(slope):
+    plan, default = draw_yard(np.random.default_rng(2), slope), draw_yard(np.random.default_rng(2))
+    np.testing.assert_array_equal(plan.segments, default.segments)
+    rises = np.diff(plan.terrain.heights_m, axis=1) / CELL_M
+    assert np.sqrt(np.mean(rises**2)) == pytest.approx(slope, rel=0.4)
+
+
+def test_bumps_tilt_a_robot_here_and_there():
+    plan = draw_yard(np.random.default_rng(2), slope=0.0, bumps=0.1)
+    points = np.random.default_rng(0).uniform(1.0, 60.0, (2000, 2))
+    tilts = np.hypot(*np.array([plan.terrain.slope(point) for point in points]).T)
+    assert 0.05 < np.mean(tilts > 0.01) < 0.15
+    assert tilts.max() > 0.1
+
+
+def test_in_the_hollow_of_a_ramp_the_ground_travels_with_the_robot():
+    settings = TINY.model_copy(update={"building": Building.RAMP, "slope": 0.12})
+    plan = simulate_fleet(settings, 1).plan
+    caster, rng = OutdoorRayCaster(plan), np.random.default_rng(0)
+    laser = LaserModel(3, -0.001, 0.001, 80.0)
+    for x in (50.0, 56.0, 62.0):
+        ahead_m = [caster.scan(np.array((x, 20.0, 0.0)), laser, rng)[1] for _ in range(60)]
+        assert 8.0 < np.median(ahead_m) < 20.0
+    beside = np.array([caster.cast(np.array((x, 20.0, 0.5 * np.pi)), laser)[1] for x in (40.0, 62.0)])
+    assert beside == pytest.approx(3.0, abs=0.4)
+
+
 def test_a_dark_car_is_not_met_from_far():
     near, far = (np.mean(scans(meadow(ahead(PieceKind.CAR, at)), 200) < 30.0) for at in (8.0, 18.0))
     assert near > 0.8

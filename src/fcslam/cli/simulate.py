@@ -58,7 +58,7 @@ def simulate(
             min=1.0,
             max=500.0,
             help="Range of the LiDARs, in metres.",
-            show_default="the scanner's; in a yard 30 if it does not spin",
+            show_default="the scanner's; outdoors 30 if it does not spin",
         ),
     ] = None,
     lidar_rate: Annotated[
@@ -81,6 +81,12 @@ def simulate(
     odometry: Annotated[
         OdometryKind, typer.Option(help="Kind of wheel odometry, or what is wrong with it.")
     ] = OdometryKind.DEFAULT,
+    slope: Annotated[
+        float, typer.Option(min=0.0, max=0.3, help="Slope of a yard (root mean square) or ramp (steepest).")
+    ] = 0.01,
+    bumps: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of the ground of a yard or ramp that is a bump.")
+    ] = 0.0,
     no_camera: NoCamera = False,
     bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
     resume: Annotated[
@@ -98,7 +104,7 @@ def simulate(
     if resume and output is None:
         raise OutputError("--resume continues a simulation in its folder; give --output")
     lidar = SCANNERS[scanner]
-    if lidar_range is None and building is Building.YARD and not lidar.spin:
+    if lidar_range is None and building.is_outdoors and not lidar.spin:
         lidar_range = 30.0
     given = {
         "beams": beams,
@@ -114,6 +120,8 @@ def simulate(
         moved_furniture=moved_furniture,
         turn_rate_rad_s=turn_rate,
         lidar=lidar.model_copy(update={key: value for key, value in given.items() if value is not None}),
+        slope=slope,
+        bumps=bumps,
         drift=KINDS[odometry],
         camera=None if no_camera else CameraSettings(),
     )

@@ -15,7 +15,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.lasers import Lasers
-from fcslam.lidar.odometry import OdometryConfig, odometry_error
+from fcslam.lidar.odometry import OdometryConfig, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackerConfig, TrackingResult
@@ -129,6 +129,8 @@ class LidarFrontend:
         self._newest: MappedKeyscan | None = None
         self._T_local_newest: dict[int, FloatArray] = {}
         """Pose of the newest keyscan of each laser."""
+        self._begun_m = 0.0
+        """Path length at which the local map began."""
         self._recent: deque[MappedKeyscan] = deque()
         """The keyscans of the last ``submap_reach_m`` of travel."""
 
@@ -164,6 +166,22 @@ class LidarFrontend:
     def travel_m(self) -> float:
         """Path length up to the newest keyscan, metres; turns count as ``TURN_AS_TRAVEL_M`` per radian."""
         return 0.0 if self._newest is None else self._newest.travel_m
+
+    @property
+    def settled_m(self) -> float:
+        """Path length since the local map began, metres; as ``travel_m``, unless another one was begun."""
+        return self.travel_m - self._begun_m
+
+    @property
+    def trust(self) -> OdometryTrust:
+        """Trust in odometry, learned from all matches so far."""
+        return self._tracker.trust
+
+    def begin_local_map(self) -> None:
+        """Forget the surfaces seen so far. The next keyscan is tied to the one before by odometry alone."""
+        self._tracker.empty_buffer()
+        self._recent.clear()
+        self._begun_m = self.travel_m
 
     def recent_submap(self) -> tuple[Submap, FloatArray]:
         """The submap of the last ``submap_reach_m`` of travel.

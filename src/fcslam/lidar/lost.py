@@ -5,20 +5,35 @@ did. A single scan that explains little of the known area may come from a crowd 
 deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
 
 A robot whose scans stopped while it drove on is lost, too: nobody saw the way.
+
+The newest keyscans may contradict the scans although the robot drove on, as after a match to the ground. Then the scan
+before and one of the doubtful ones show one place, where odometry says. Such a robot only needs another local map.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.lidar.evidence import CORRELATED
+from fcslam.lidar.field import SurfelField
 from fcslam.lidar.frontend import LidarFrontend
+from fcslam.lidar.matching import match_scan
+from fcslam.lidar.odometry import odometry_error
+from fcslam.lidar.scan import point_scan
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.lidar.verification import verify
 from fcslam.records import FloatArray, LaserScan
+
+TRUSTED, TRUSTED_MATCHES = 1.0, 20
+"""Largest scale of odometry's error that is trusted without a map, and the least number of matches that showed it. The
+constraint over the gap has the error by the model, of scale 1."""
+CONTINUOUS, CONTINUOUS_KNOWN = 0.6, 0.5
+"""Two scans show one place if the later one has a larger share of its points in known area on surfaces of the earlier
+one. A larger share of all points lies in known area, too."""
 
 
 class LostConfig(Settings):
@@ -83,7 +98,7 @@ def has_moved_unseen(before: LaserScan, now: LaserScan, config: LostConfig) -> b
 def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:
     """Whether a scan may show another place than the scans before it."""
     # False for a scan that was not matched, as both are NaN.
-    return frontend.travel_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
+    return frontend.settled_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
 
 
 def can_decide(scans: Sequence[LaserScan], config: LostConfig) -> bool:
@@ -109,6 +124,41 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: Lid
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
     worse = verify(before, now, predicted, frontend.config.verification).worse
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
+
+
+def drove_on(
+    before: Mapping[tuple[float, float, float], LaserScan], scans: Sequence[LaserScan], frontend: LidarFrontend
+) -> bool:
+    """Whether trusted odometry and the scans themselves agree that a robot drove from the last scans to doubtful ones.
+
+    One pair of scans is enough: on a bump, a scan or two show only the ground.
+
+    Args:
+        before: the last scan of each laser before the doubtful ones, by its mounting.
+        scans: consecutive doubtful scans.
+        frontend: the robot's front end; it does not change.
+    """
+    trust = frontend.trust
+    if trust.matches < TRUSTED_MATCHES or max(trust.position, trust.heading) > TRUSTED:
+        return False
+    if not frontend.config.tracker.odometry.is_measured:
+        return False
+    pairs = ((before.get(scan.laser.T_base_laser), scan) for scan in scans)
+    return any(last is not None and _show_one_place(last, scan, frontend) for last, scan in pairs)
+
+
+def _show_one_place(before: LaserScan, now: LaserScan, frontend: LidarFrontend) -> bool:
+    """Whether a scan shows what an earlier one of the same laser shows, where odometry says."""
+    trust, tracker = frontend.trust, frontend.config.tracker
+    if before.laser != now.laser:
+        return False
+    x, y, turn = motion = se2.between(before.T_odom_base, now.T_odom_base)
+    error = trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), tracker.odometry))
+    field = SurfelField(np.zeros(3))
+    field.insert(point_scan(before.ranges_m, before.laser, before.sweep), np.zeros(3))
+    scan = point_scan(now.ranges_m, now.laser, now.sweep).thinned(tracker.point_spacing_m, tracker.point_limit)
+    match = match_scan(scan, field, motion, CORRELATED * error.information, tracker.matching)
+    return match.known >= CONTINUOUS_KNOWN and match.explained >= CONTINUOUS * match.known
 
 
 def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend, config: LostConfig) -> bool:

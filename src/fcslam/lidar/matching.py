@@ -66,13 +66,19 @@ class ScanMatch:
     """Share of the scan's points that lie on a surface."""
     known: float
     """Share of the scan's points that fall near any surface."""
-    log_likelihood: float
-    """Log-likelihood of the scan, relative to a scan without a point on a surface.
+    log_likelihoods: FloatArray
+    """Log-likelihood of each point, relative to one on no surface, shape (N,).
 
-    Each point lies on its nearest surface, with a normally distributed distance, or is an outlier.
+    Each point lies on its nearest surface, with a normally distributed distance, or is an outlier. Errors of
+    neighbouring points are correlated, so each counts as a share.
     """
     velocity: FloatArray
     """Correction of the velocity in the sweep, in ``base``, shape (3,), m/s and rad/s; zeros for a scan at once."""
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the scan, relative to a scan without a point on a surface."""
+        return float(self.log_likelihoods.sum())
 
 
 def match_scan(
@@ -100,13 +106,13 @@ def match_scan(
     Returns:
         The pose, the information of the points, and how well they fit.
     """
-    pose, velocity, information, explained, known, log_likelihood = _match(
+    pose, velocity, information, explained, known, log_likelihoods = _match(
         _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
         np.array(T_field_guess),  # a writable copy: code is compiled once
         prior_information, velocity_information, field.arrays,
         config.iterations, config.wide_scale_m, config.narrow_scale_m, config.point_sigma_m, config.explained_m,
     )  # fmt: skip
-    return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihood, velocity)
+    return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihoods, velocity)
 
 
 class _Points(NamedTuple):
@@ -150,11 +156,11 @@ def _match(scan, guess, prior, velocity_prior, field, iterations, wide, narrow, 
         scale = max(narrow, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     H, g, _ = _normal_equations(scan, pose, velocity, field, narrow, sigma, velocity_prior)
-    explained, known, log_likelihood = _fit(scan, pose, velocity, field, explained_m)
+    explained, known, log_likelihoods = _fit(scan, pose, velocity, field, explained_m)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
     velocity[0], velocity[1] = cos * x + sin * y, cos * y - sin * x
-    return pose, velocity, H, explained, known, log_likelihood
+    return pose, velocity, H, explained, known, log_likelihoods
 
 
 @njit(allocates=False)
@@ -280,13 +286,13 @@ def _swept_point(points, i, cos, sin, t, velocity):  # type: ignore[no-untyped-d
     return rx + t * (velocity[0] - velocity[2] * ry), ry + t * (velocity[1] + velocity[2] * rx)
 
 
-@njit(allocates=False)
+@njit
 def _fit(scan, pose, velocity, field, limit):  # type: ignore[no-untyped-def]
-    """Share of the points on a surface, share near any, and the log-likelihood of the points."""
+    """Share of the points on a surface, share near any, and the log-likelihood of each, shape (N,)."""
     points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     explained = known = 0
-    total = 0.0
+    log_likelihoods = np.zeros(len(points))
     swept = len(scan.times) > 0
     for i in range(len(points)):
         rx, ry = _swept_point(points, i, cos, sin, scan.times[i] if swept else 0.0, velocity)
@@ -311,6 +317,6 @@ def _fit(scan, pose, velocity, field, limit):  # type: ignore[no-untyped-def]
             on_surface = abs(e) < limit and d2 <= ALONG_LIMIT2 * limit * limit
         if on_surface:
             explained += 1
-        total += np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
+        log_likelihoods[i] = np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
     n = max(1, len(points))
-    return explained / n, known / n, total
+    return explained / n, known / n, log_likelihoods

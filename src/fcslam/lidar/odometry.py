@@ -18,6 +18,8 @@ TAIL: float = 1.0
 """Degrees of freedom of the Student t distribution of the error; few, as wheels may slip."""
 FIRST_MATCHES, LATEST_MATCHES = 20, 200
 """The model counts as many matches as the first number; later matches replace the oldest of the second number."""
+FIRST_TRUST = 0.5
+"""Learned scale before the first match: most robots' odometry is better than the model."""
 LEAST_TRUST = 0.1
 """Least learned scale: matches have an error of their own."""
 
@@ -86,8 +88,8 @@ def odometry_error(moved_m: float, turned_rad: float, config: OdometryConfig) ->
 class OdometryTrust:
     """The error of one robot's odometry relative to the model, as learned from its good matches."""
 
-    position: float = 1.0
-    heading: float = 1.0
+    position: float = FIRST_TRUST
+    heading: float = FIRST_TRUST
     matches: int = 0
     """Number of matches that it was learned from."""
 

@@ -9,15 +9,17 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.evidence import over_steps, resolve
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.matching import FIXED, MatchingConfig, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryConfig, OdometryError, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
 
-GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA_M = 0.8, 0.5, 0.01
+GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA = 0.8, 0.5, 0.3
 """Limits of a good match, by which odometry is judged: the share of the points in known area that it explains, and the
-share of all points that lie there. Its points fix the position to this many metres in every direction.
+share of all points that lie there. Its points fix the position in every direction to this share of odometry's error
+by the model, so that its distance from odometry is the error of odometry.
 """
 SEARCH_GAIN = 3.0
 """The result of a search replaces a match near odometry only if its log-probability is higher by this: the best of many
@@ -173,18 +175,24 @@ class ScanTracker:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
-        # 3. Scan matching; a doubtful match starts a correlative search, and one after a jump where the robot was.
+        # 3. Scan matching; a doubtful match starts a correlative search, also where the robot was if odometry may have
+        #    jumped. A match against odometry needs evidence.
         error = odometry_error(moved_m, turned_rad, config.odometry)
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
         velocity = self._velocity_information(scan.sweep)
-        match, innovation = self._match(points, thinned, T_local_guess, error, velocity)
-        has_jumped = False
+        match = self._match(points, thinned, T_local_guess, error, velocity)
+        has_jumped = contradicts = False
         if match.explained < config.doubtful and self._is_long_step(T_local_guess):
-            other, _ = self._match(points, thinned, self._T_local_base, error, velocity)
+            other = self._match(points, thinned, self._T_local_base, error, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
             is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
-            has_jumped = is_fixed and is_better and other.explained >= JUMP_SHARE
-            match = other if has_jumped else match
+            if is_fixed and is_better and other.explained >= JUMP_SHARE:
+                match, T_local_guess, has_jumped = other, self._T_local_base, True
+        if config.odometry.is_measured:  # a prediction was right only as long as the motion went on as before
+            learned = over_steps(self._trust.scale(error), moved_m, moved_m - self._moved_m)
+            match, contradicts = resolve(
+                thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, config.matching, velocity
+            )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
@@ -192,7 +200,9 @@ class ScanTracker:
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
         tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
-        trust = self._trust.learn(innovation, error) if _is_good(match) and not has_jumped else self._trust
+        innovation = se2.between(T_local_guess, match.T_field_base)
+        learns = _is_good(match, error) and not (contradicts or has_jumped)
+        trust = self._trust.learn(innovation, error) if learns else self._trust
         usual = _learn_usual(self._usual, match.log_likelihood / max(1, len(thinned)))
         accepted = match.explained, match.known, scan.T_odom_base, 0.0, 0.0
         return TrackingResult(tracked, *accepted, matched_here, trust, usual)
@@ -222,6 +232,15 @@ class ScanTracker:
         for field, _ in self._fields:
             field.insert(points, T_local_base)
         self._fields = [(field, count + 1) for field, count in self._fields]
+
+    @property
+    def trust(self) -> OdometryTrust:
+        """Trust in odometry, learned from all matches so far."""
+        return self._trust
+
+    def empty_buffer(self) -> None:
+        """Forget all keyscans: the pose goes on by odometry until the next one is inserted."""
+        self._fields = []
 
     def _predict(self, scan: LaserScan) -> tuple[FloatArray, float, float]:
         """The last pose moved by odometry; travel and turn since the last accepted match."""
@@ -255,12 +274,8 @@ class ScanTracker:
         T_local_guess: FloatArray,
         error: OdometryError,
         velocity: FloatArray,
-    ) -> tuple[ScanMatch, FloatArray]:
-        """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match.
-
-        Returns:
-            The match, and its pose relative to the guess, shape (3,), metres and radians.
-        """
+    ) -> ScanMatch:
+        """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
         config, field = self._config, self._fields[0][0]
         learned = self._trust.scale(error)
         match = match_scan(thinned, field, T_local_guess, error.information, config.matching, velocity)
@@ -269,19 +284,19 @@ class ScanTracker:
         is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= config.surprise**2
         is_unlikely = log_posterior < self._usual * len(thinned) - config.unlikely  # False before the first match
         if not is_doubtful and not is_unlikely:
-            return match, innovation
+            return match
         window = SearchWindow(config.search_radius_m, config.search_angle_rad)
         found = search(
             points, field, T_local_guess, window, config.search, visible_only=True, better_than=match.T_field_base
         )
         if np.array_equal(found.T_field_base, match.T_field_base):
-            return match, innovation
+            return match
         other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching, velocity)
         other_innovation = se2.between(T_local_guess, other.T_field_base)
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
-            return other, other_innovation
-        return match, innovation
+            return other
+        return match
 
 
 def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
@@ -299,10 +314,10 @@ def _learn_usual(usual: float, likelihood: float) -> float:
     return usual + USUAL_WEIGHT * min(max(likelihood - usual, -USUAL_STEP), USUAL_STEP)
 
 
-def _is_good(match: ScanMatch) -> bool:
-    """Whether a match is clear enough to judge odometry by it."""
+def _is_good(match: ScanMatch, error: OdometryError) -> bool:
+    """Whether a match is clear enough to judge odometry by it, whose error by the model is ``error``."""
     explains = match.explained >= GOOD_SHARE * match.known and match.known >= GOOD_KNOWN
-    return explains and weakest_sigma_m(match.information) <= GOOD_SIGMA_M
+    return explains and weakest_sigma_m(match.information) <= GOOD_SIGMA * error.position_m
 
 
 def weakest_sigma_m(information: FloatArray) -> float:

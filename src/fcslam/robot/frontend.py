@@ -20,7 +20,7 @@ from pydantic import Field
 from fcslam.errors import FeatureError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
-from fcslam.lidar.lost import LostConfig, can_decide, has_moved_unseen, is_doubtful, is_lost
+from fcslam.lidar.lost import LostConfig, can_decide, drove_on, has_moved_unseen, is_doubtful, is_lost
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord, Sweep
 from fcslam.robot.backend import (
@@ -128,6 +128,8 @@ class RobotFrontend:
         """Stamps of the two newest scans."""
         self._scans: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser, by its mounting."""
+        self._jumps = 0
+        """Jumps of the odometry up to the newest scan that was processed."""
         self._deferred: list[LaserScan | CameraImage] = []
         """Records since the first doubtful scan."""
         self._T_local_deferred: FloatArray | None = None
@@ -285,9 +287,14 @@ class RobotFrontend:
         scans = [record for record in self._deferred if isinstance(record, LaserScan)]
         if not can_decide(scans, config):
             return
-        # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them.
+        # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them. If the
+        # robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
         if is_lost(scans, self._T_local_deferred, self._lidar, config):
-            self._end_session()
+            is_whole = self.odometry.jumps == self._jumps
+            if is_whole and drove_on(self._scans, scans, self._lidar):
+                self._lidar.begin_local_map()
+            else:
+                self._end_session()
         self._process_deferred()
 
     def _end_session(self) -> None:
@@ -323,6 +330,7 @@ class RobotFrontend:
         self.newest = _newest(step.pose, tracking, is_deferred=False)
         self._newest = scan, step.pose
         self._scans[scan.laser.T_base_laser] = scan
+        self._jumps = self.odometry.jumps
 
     def _describe(self, image: CameraImage) -> None:
         if self._newest is not None:

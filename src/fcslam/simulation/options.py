@@ -12,6 +12,13 @@ class Building(StrEnum):
     CORRIDOR = "corridor"
     YARD = "yard"
     """Outdoors, between buildings."""
+    RAMP = "ramp"
+    """Outdoors, between two walls: down and up again."""
+
+    @property
+    def is_outdoors(self) -> bool:
+        """Whether it has a terrain instead of a level floor."""
+        return self in (Building.YARD, Building.RAMP)
 
 
 class LidarKind(StrEnum):

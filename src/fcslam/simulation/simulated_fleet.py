@@ -35,9 +35,11 @@ from fcslam.simulation.noise import SCANNERS, LidarSettings, scan_beams, simulat
 from fcslam.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
 from fcslam.simulation.options import Building, Lighting, OdometryKind, Scanner
 from fcslam.simulation.outdoor_rays import OutdoorRayCaster
+from fcslam.simulation.ramp import draw_ramp
 from fcslam.simulation.route import TURN_RATE_RAD_S, Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
+from fcslam.simulation.terrain import SLOPE
 from fcslam.simulation.walk import draw_starts, plan_walk
 from fcslam.simulation.yard import draw_yard, move_cars
 from fcslam.sources.motion import moving_sweep
@@ -80,7 +82,7 @@ class SimulationSettings(Settings):
     """A simulated fleet."""
 
     building: Building = Field(
-        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor or yard"
+        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor, yard or ramp"
     )
     robots: int = Field(default=3, ge=1, description="number of robots")
     path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
@@ -107,6 +109,18 @@ class SimulationSettings(Settings):
     )
     turn_rate_rad_s: float = Field(
         default=TURN_RATE_RAD_S, gt=0.0, le=6.0, description="rate at which the robots turn [rad/s]"
+    )
+    slope: float = Field(
+        default=SLOPE,
+        ge=0.0,
+        le=0.3,
+        description="root mean square slope of a yard in each direction, or steepest slope of a ramp",
+    )
+    bumps: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the ground of a yard or ramp that tilts a robot for one or two scans",
     )
     lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
     drift: OdometryNoiseSettings | None = Field(
@@ -260,13 +274,15 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     Raises:
         SimulationError: the building is too small for this many robots, or has too little free space.
     """
-    outdoors = settings.building is Building.YARD
+    outdoors = settings.building.is_outdoors
     if settings.closed_doors and settings.camera:
         raise SimulationError("closed doors are simulated for LiDARs only; leave the cameras off")
     if outdoors and settings.camera:
-        raise SimulationError("a yard is simulated for LiDARs only; leave the cameras off (--no-camera)")
+        raise SimulationError(
+            f"a {settings.building} is simulated for LiDARs only; leave the cameras off (--no-camera)"
+        )
     building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
-    plan = draw_yard(building) if outdoors else draw_floor_plan(building, settings.building)
+    plan = _draw_plan(settings, building)
     _check_room(plan, settings)
     if outdoors:
         goals = draw_starts(plan, settings.robots, goals_rng)
@@ -286,6 +302,16 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
         robots.append(robot)
         left = found if settings.lasting_changes else plan
     return SimulatedFleet(plan, tuple(robots))
+
+
+def _draw_plan(settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
+    match settings.building:
+        case Building.YARD:
+            return draw_yard(rng, settings.slope, settings.bumps)
+        case Building.RAMP:
+            return draw_ramp(rng, settings.slope, settings.bumps)
+        case building:
+            return draw_floor_plan(rng, building)
 
 
 def _moved(plan: FloorPlan, goals: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray, frozen
 from fcslam.simulation.floorplan import FloorPlan, Piece, PieceKind, disc, distance_m, rectangle, rotation, segments_of
 from fcslam.simulation.layouts import Lane
-from fcslam.simulation.terrain import draw_terrain
+from fcslam.simulation.terrain import SLOPE, draw_terrain
 
 CLEARANCE_M = 1.7
 """Distance of everything from the centre line of a way."""
@@ -62,8 +62,11 @@ class _Site:
         return self.stand(kind, disc(radius) + centre)
 
 
-def draw_yard(rng: np.random.Generator) -> FloorPlan:
-    """Draw a yard of 70 to 120 m in each direction; the same generator state gives the same one."""
+def draw_yard(rng: np.random.Generator, slope: float = SLOPE, bumps: float = 0.0) -> FloorPlan:
+    """Draw a yard of 70 to 120 m in each direction; the same generator state gives the same one.
+
+    ``slope`` and ``bumps`` describe its ground as in ``draw_terrain``; they change nothing else.
+    """
     columns, rows = rng.permutation((2, 3)) if rng.random() < 0.6 else (3, 3)
     xs, x_lanes = _axis(int(columns), rng)
     ys, y_lanes = _axis(int(rows), rng)
@@ -79,7 +82,7 @@ def draw_yard(rng: np.random.Generator) -> FloorPlan:
     for block in blocks:
         _beside_ways(block, site)
     _around(size_m, site)
-    terrain = draw_terrain(size_m, rng)
+    terrain = draw_terrain(size_m, rng, slope, bumps)
     return FloorPlan(size_m, tuple(site.pieces), segments_of(site.pieces), site.lanes, (), terrain)
 
 

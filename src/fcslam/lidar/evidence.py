@@ -1,0 +1,123 @@
+"""Evidence of a scan match against wheel odometry, counted by surfaces instead of points.
+
+Outdoors a scanner sees the ground: a line of returns across the path, which travels with the robot. Its many points fit
+wherever the ground was seen before, so the sum over points would overrule any odometry. But they are one surface, and
+one surface may move. So a match that contradicts odometry, or leaves a part of the scan unexplained, is compared with
+another one. That trusts odometry as far as it was right so far.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.lidar.field import SurfelField
+from fcslam.lidar.matching import FIXED, INLIER_SIGMA_M, MatchingConfig, ScanMatch, match_scan
+from fcslam.lidar.odometry import OdometryError
+from fcslam.lidar.scan import PointScan
+from fcslam.records import FloatArray
+
+CLEAR, UNCLEAR, LEAST_KNOWN = 0.8, 0.5, 0.5
+"""Shares of the points in known area that a clear match explains at least, and an unclear one at most; least share of
+all points in known area. The part that an unclear match does not explain may be the only one that stands still."""
+FAR = 4.0
+"""A match farther than this from odometry contradicts it, in standard deviations of odometry's learned error."""
+LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
+"""Least standard deviations of odometry that a match is judged by, metres and radians, and their growth per radian of
+turn. Matches have an error of their own, and the learned error is mostly that of small turns."""
+LEAST_STEP_M = 0.25
+"""Travel within which the errors of odometry are not independent, metres."""
+CORRELATED = 10.0
+"""Points of a scan that count as one in the match that trusts odometry: errors of neighbouring points are correlated.
+As points count fully in the matcher, odometry's information is raised instead."""
+SURFACE_NATS = 4.0
+"""Largest log-likelihood that one surface adds or takes: beyond it, the surface itself may have moved."""
+CLEAR_GAIN = 2.0
+"""Log-probability that a clear match against odometry has beforehand over one that trusts odometry: it is wrong only
+where a single surface, as the ground, lies across the whole path."""
+GAP_M = 1.0
+"""Neighbouring returns farther apart than this lie on two surfaces."""
+CORNER: Final = float(np.cos(np.radians(35.0)))
+"""Neighbouring normals with a smaller dot product lie on two surfaces."""
+
+
+def over_steps(error: OdometryError, moved_m: float, step_m: float) -> OdometryError:
+    """Error of odometry over several steps whose errors are independent.
+
+    Args:
+        error: the error over all steps if they all erred the same way.
+        moved_m: travel over all steps, metres.
+        step_m: travel of the last one, metres.
+    """
+    share = math.sqrt(min(1.0, max(step_m, LEAST_STEP_M) / max(moved_m, LEAST_STEP_M)))
+    return OdometryError(share * error.position_m, share * error.heading_rad)
+
+
+def resolve(
+    scan: PointScan,
+    field: SurfelField,
+    T_field_guess: FloatArray,
+    match: ScanMatch,
+    learned: OdometryError,
+    turned_rad: float,
+    config: MatchingConfig,
+    velocity_information: FloatArray = FIXED,
+) -> tuple[ScanMatch, bool]:
+    """Choose between a match and one that trusts odometry as far as it was right so far.
+
+    Args:
+        scan: the points that were matched.
+        field: surfaces seen so far.
+        T_field_guess: the pose by odometry, shape (3,), metres and radians.
+        match: the match that hardly trusts odometry.
+        learned: the error of odometry as learned from earlier matches.
+        turned_rad: turn that odometry measured, radians.
+        config: settings of the second match.
+        velocity_information: as in ``match_scan``.
+
+    Returns:
+        The chosen match, and whether the scan contradicts odometry that is chosen, so that nothing is learned from it.
+    """
+    error = OdometryError(
+        max(LEAST_SIGMA_M + SIGMA_PER_TURN * turned_rad, learned.position_m),
+        max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
+    )
+    innovation = se2.between(T_field_guess, match.T_field_base)
+    is_far = error.mahalanobis2(innovation) >= FAR**2
+    # Odometry that is less exact than points lie on surfaces corrects only unclear matches near it.
+    share = CLEAR if error.position_m <= INLIER_SIGMA_M else UNCLEAR
+    is_seen = match.known >= LEAST_KNOWN
+    if not is_far and is_seen and match.explained >= share * match.known:
+        return match, False
+    trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
+    gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
+    gain += error.log_likelihood(innovation)
+    gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
+    gain += CLEAR_GAIN * (is_seen and match.explained >= CLEAR * match.known)
+    return (match, False) if gain > 0.0 and (is_seen or not is_far) else (trusting, is_far)
+
+
+def surface_gain(scan: PointScan, gains: FloatArray) -> float:
+    """Gain of a scan's log-likelihood at one pose over another, where each surface adds at most ``SURFACE_NATS``.
+
+    Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
+
+    Args:
+        scan: the points.
+        gains: gain of each, shape (N,).
+    """
+    by_surface = np.bincount(surfaces(scan), gains * scan.normals.any(axis=1))
+    return float(np.clip(by_surface, -SURFACE_NATS, SURFACE_NATS).sum())
+
+
+def surfaces(scan: PointScan) -> NDArray[np.intp]:
+    """Number of each return's surface, shape (N,): a row of returns between two gaps or corners."""
+    if not len(scan):
+        return np.zeros(0, np.intp)
+    ends = np.hypot(*np.diff(scan.points, axis=0).T) > GAP_M
+    facing = np.flatnonzero(scan.normals.any(axis=1))
+    agreement = (scan.normals[facing[1:]] * scan.normals[facing[:-1]]).sum(axis=1)
+    ends[facing[1:][agreement < CORNER] - 1] = True
+    return np.concatenate(([0], np.cumsum(ends)))
