@@ -7,12 +7,14 @@ right, they have the ranges that were measured there.
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.lidar.scan import point_scan
 from fcslam.records import FloatArray, LaserScan
 
 LEAST_MOVE_M: Final = 0.3
@@ -173,9 +175,8 @@ def _agreement(pair: Pair, facing: Facing) -> float:
     moved = se2.between(before.T_odom_base, after.T_odom_base) * (facing.distance, facing.distance, 1.0)
     T_before_after = se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
     sign = -1.0 if facing.upside_down else 1.0
-    seen = (after.ranges_m > 0.0) & (after.ranges_m < after.laser.max_range_m)
-    angles, ranges_m = sign * after.laser.angles_rad()[seen], after.ranges_m[seen]
-    points = se2.transform(T_before_after, np.stack((ranges_m * np.cos(angles), ranges_m * np.sin(angles)), axis=1))
+    in_laser = point_scan(after.ranges_m, replace(after.laser, T_base_laser=(0.0, 0.0, 0.0))).points
+    points = se2.transform(T_before_after, in_laser * (1.0, sign))
     beams = before.laser.beams
     middle_rad = beams.angle_min_rad + 0.5 * beams.span_rad
     angle = se2.wrap_angle(sign * np.arctan2(points[:, 1], points[:, 0]) - middle_rad)

@@ -130,6 +130,8 @@ class RobotFrontend:
         """The newest scan of each laser, by its mounting."""
         self._jumps = 0
         """Jumps of the odometry up to the newest scan that was processed."""
+        self._explained: dict[tuple[float, float, float], LaserScan] = {}
+        """The newest scan of each laser that the map explained, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
         """Records since the first doubtful scan."""
         self._T_local_deferred: FloatArray | None = None
@@ -291,7 +293,7 @@ class RobotFrontend:
         # robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
         if is_lost(scans, self._T_local_deferred, self._lidar, config):
             is_whole = self.odometry.jumps == self._jumps
-            if is_whole and drove_on(self._scans, scans, self._lidar):
+            if is_whole and drove_on(self._explained, scans, self._lidar):
                 self._lidar.begin_local_map()
             else:
                 self._end_session()
@@ -305,7 +307,7 @@ class RobotFrontend:
     def _begin(self) -> None:
         """Begin a session."""
         self._lidar = LidarFrontend(self.robot, self.lidar_config)
-        self._newest, self._scans = None, {}
+        self._newest, self._scans, self._explained = None, {}, {}
         self.tracks.append(ScanTrack())
 
     def _process_deferred(self) -> None:
@@ -330,6 +332,8 @@ class RobotFrontend:
         self.newest = _newest(step.pose, tracking, is_deferred=False)
         self._newest = scan, step.pose
         self._scans[scan.laser.T_base_laser] = scan
+        if tracking.explained >= self.lidar_config.tracker.doubtful * tracking.known:  # false if it was not matched
+            self._explained[scan.laser.T_base_laser] = scan
         self._jumps = self.odometry.jumps
 
     def _describe(self, image: CameraImage) -> None:
