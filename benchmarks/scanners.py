@@ -1,10 +1,7 @@
-"""Other scanners: are maps as accurate as of the full logs, of fast turns, and with faulty odometry?
+"""Three logs of the SLAM benchmark as other scanners would have measured them: are maps as accurate as of the full log?
 
     FCSLAM_DATA=/path/to/data python benchmarks/scanners.py
     FCSLAM_DATA=/path/to/data python benchmarks/scanners.py --logs mit-csail --seeds 0
-    python benchmarks/scanners.py --logs --seeds 1 --path-length 10
-
-Three logs of the SLAM benchmark are mapped as other scanners would have measured them:
 
 - interleaved: cycles of four scans, each a quarter of an increment further; the first has n beams, the others n - 1.
   A direction between two beams gets the line between their returns if both lie on one surface, else the nearer beam.
@@ -12,17 +9,12 @@ Three logs of the SLAM benchmark are mapped as other scanners would have measure
   interpolated.
 - dropped: each beam returns nothing with a probability of 10 %.
 - jittering: the number of beams of each scan is up to 3 % off, over the same field of view, interpolated as above.
-- no odometry: the full log without its odometry.
 
 Errors follow Kuemmerle et al. 2009 over all relations; one robot. The ratio is to the mean error of the full log.
-
-One simulated robot drives in a building of each seed (`fcslam simulate --scanner --turn-rate --odometry`). Spinning
-scanners measure each beam at its own time. The error is that of the positions at all scans after a rigid alignment.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import product
 
 import common
 import numpy as np
@@ -30,14 +22,8 @@ from robustness import Recording
 
 from fcslam.evaluation.fleet.relations import pose_table
 from fcslam.metrics.relations import read_relations, relation_errors
-from fcslam.metrics.trajectory import PositionErrors, align, position_errors
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserScan, frozen
-from fcslam.simulation.noise import SCANNERS as SIMULATED
-from fcslam.simulation.odometry import KINDS
-from fcslam.simulation.options import OdometryKind
-from fcslam.simulation.options import Scanner as SimulatedScanner
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources import open_source
 
 DROPPED, JITTER = 0.1, 0.03
@@ -46,9 +32,6 @@ SAME_SURFACE = 3.0
 NEAR_M = 0.1
 COLUMNS = {"log": "", "scanner": "", "seed": "", "relations": "", "mean, m": ".4f", "max, m": ".3f",
            "mean, deg": ".3f", "ratio": ".3f"}  # fmt: skip
-SIMULATED_COLUMNS = {"scanner": "", "turn rate, rad/s": ".1f", "odometry": "", "seed": "", "scans": "",
-                     "ATE (RMSE), m": ".4f", "max, m": ".3f"}  # fmt: skip
-SLOW_RAD_S, FAST_RAD_S = 0.9, 2.0
 
 Scanner = Callable[[LaserScan, int, np.random.Generator], LaserScan]
 """A scan of the log, its number and a generator in; a scan of another scanner out."""
@@ -56,18 +39,13 @@ Scanner = Callable[[LaserScan, int, np.random.Generator], LaserScan]
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--logs", nargs="*", default=tuple(common.SPLITS), choices=common.SPLITS, metavar="LOG")
-    parser.add_argument(
-        "--seeds", nargs="+", type=int, default=(0, 1, 2), help="of dropped beams, jitter and buildings"
-    )
-    parser.add_argument("--path-length", type=float, default=60.0, help="of a simulated drive, metres")
+    parser.add_argument("--logs", nargs="+", default=tuple(common.SPLITS), choices=common.SPLITS, metavar="LOG")
+    parser.add_argument("--seeds", nargs="+", type=int, default=(0, 1, 2), help="of dropped beams and of the jitter")
     chosen = parser.parse_args()
-    folder = common.recordings(*common.slam_benchmark_files()) if chosen.logs else None
+    folder = common.recordings(*common.slam_benchmark_files())
     report = common.Report(__file__, __doc__, chosen)
     rows = [row for name in chosen.logs for row in measure(folder, name, chosen.seeds)]
-    if rows:
-        report.table("Scanners", COLUMNS, rows)
-    report.table("Simulated scanners", SIMULATED_COLUMNS, list(simulate(chosen.seeds, chosen.path_length)))
+    report.table("Scanners", COLUMNS, rows)
     report.write()
 
 
@@ -84,22 +62,6 @@ def measure(folder, name: str, seeds) -> Iterator[tuple]:
             full = errors.translation.mean if full is None else full
             six = errors.translation.mean, errors.translation.maximum, errors.rotation.mean
             yield name, scanner, seed, errors.used, *six, errors.translation.mean / full
-
-
-def simulate(seeds, path_m: float) -> Iterator[tuple]:
-    scanners = [SimulatedScanner.INSTANT, *(scanner for scanner, lidar in SIMULATED.items() if lidar.spin)]
-    cases = list(product(scanners, (SLOW_RAD_S, FAST_RAD_S), (OdometryKind.GOOD,)))
-    cases += [(SimulatedScanner.LD19, FAST_RAD_S, kind) for kind in OdometryKind if kind is not OdometryKind.GOOD]
-    for (scanner, turn_rate, kind), seed in product(cases, seeds):
-        settings = SimulationSettings(
-            robots=1, path_length_m=path_m, camera=None, turn_rate_rad_s=turn_rate, lidar=SIMULATED[scanner],
-            drift=KINDS[kind],
-        )  # fmt: skip
-        (robot,) = simulate_fleet(settings, seed).robots
-        run = run_mission([Recording(robot.name, list(robot.scans()))], MissionConfig())
-        found, truth = run.trajectories[robot.name], robot.T_building_base
-        errors = PositionErrors.of(position_errors(align(truth, found.T_map_base), truth, found.T_map_base))
-        yield scanner, turn_rate, kind, seed, len(truth), errors.rmse_m, errors.max_m
 
 
 def interleaved(scan: LaserScan, number: int, _: np.random.Generator) -> LaserScan:
@@ -151,7 +113,6 @@ SCANNERS: dict[str, Scanner] = {
     "every second beam": every_second,
     "dropped": dropped,
     "jittering": jittering,
-    "no odometry": lambda scan, _, __: replace(scan, T_odom_base=frozen(np.full(3, np.nan))),
 }
 RANDOM = ("dropped", "jittering")
 

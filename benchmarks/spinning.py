@@ -1,0 +1,78 @@
+"""Scanners that spin while the robot turns, odometry that is wrong, and none: how far are poses from the truth?
+
+    FCSLAM_DATA=/path/to/data python benchmarks/spinning.py
+    python benchmarks/spinning.py --logs --seeds 1 --path-length 10
+
+One simulated robot drives in a building of each seed (`fcslam simulate --scanner --turn-rate --odometry`). Scanners that
+spin measure each beam at its own time. The error is that of the positions at all scans after a rigid alignment.
+
+Three logs of the SLAM benchmark are mapped without their odometry. Errors follow Kuemmerle et al. 2009 over all
+relations.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+
+import common
+import numpy as np
+from robustness import Recording
+
+from fcslam.evaluation.fleet.relations import pose_table
+from fcslam.metrics.relations import read_relations, relation_errors
+from fcslam.metrics.trajectory import PositionErrors, align, position_errors
+from fcslam.mission import MissionConfig, run_mission
+from fcslam.records import LaserScan, frozen
+from fcslam.simulation.noise import SCANNERS
+from fcslam.simulation.odometry import KINDS
+from fcslam.simulation.options import OdometryKind, Scanner
+from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.sources import open_source
+
+SLOW_RAD_S, FAST_RAD_S = 0.9, 2.0
+COLUMNS = {"scanner": "", "turn rate, rad/s": ".1f", "odometry": "", "seed": "", "scans": "", "ATE (RMSE), m": ".4f",
+           "max, m": ".3f"}  # fmt: skip
+LOG_COLUMNS = {"log": "", "relations": "", "mean, m": ".4f", "max, m": ".3f", "mean, deg": ".3f"}
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--logs", nargs="*", default=tuple(common.SPLITS), choices=common.SPLITS, metavar="LOG")
+    parser.add_argument("--seeds", nargs="+", type=int, default=(0, 1, 2), help="of the buildings")
+    parser.add_argument("--path-length", type=float, default=60.0, help="of a simulated drive, metres")
+    chosen = parser.parse_args()
+    folder = common.recordings(*common.slam_benchmark_files()) if chosen.logs else None
+    report = common.Report(__file__, __doc__, chosen)
+    report.table("Simulated scanners", COLUMNS, list(simulate(chosen.seeds, chosen.path_length)))
+    if chosen.logs:
+        report.table("Logs without their odometry", LOG_COLUMNS, [without_odometry(folder, log) for log in chosen.logs])
+    report.write()
+
+
+def simulate(seeds, path_m: float) -> Iterator[tuple]:
+    scanners = [Scanner.INSTANT, *(scanner for scanner, lidar in SCANNERS.items() if lidar.spin)]
+    cases = list(product(scanners, (SLOW_RAD_S, FAST_RAD_S), (OdometryKind.GOOD,)))
+    cases += [(Scanner.LD19, FAST_RAD_S, kind) for kind in OdometryKind if kind is not OdometryKind.GOOD]
+    for (scanner, turn_rate, kind), seed in product(cases, seeds):
+        settings = SimulationSettings(
+            robots=1, path_length_m=path_m, camera=None, turn_rate_rad_s=turn_rate, lidar=SCANNERS[scanner],
+            drift=KINDS[kind],
+        )  # fmt: skip
+        (robot,) = simulate_fleet(settings, seed).robots
+        run = run_mission([Recording(robot.name, list(robot.scans()))], MissionConfig())
+        found, truth = run.trajectories[robot.name], robot.T_building_base
+        errors = PositionErrors.of(position_errors(align(truth, found.T_map_base), truth, found.T_map_base))
+        yield scanner, turn_rate, kind, seed, len(truth), errors.rmse_m, errors.max_m
+
+
+def without_odometry(folder, name: str) -> tuple:
+    unknown = frozen(np.full(3, np.nan))
+    records = open_source(common.log_path(folder, name)).records()
+    scans = [replace(record, T_odom_base=unknown) for record in records if isinstance(record, LaserScan)]
+    run = run_mission([Recording(name, scans)], MissionConfig())
+    errors = relation_errors(read_relations(common.relations_path(folder, name)), pose_table(run))
+    return name, errors.used, errors.translation.mean, errors.translation.maximum, errors.rotation.mean
+
+
+if __name__ == "__main__":
+    main()
