@@ -3,8 +3,8 @@
     FCSLAM_DATA=/path/to/data python benchmarks/spinning.py
     python benchmarks/spinning.py --logs --seeds 1 --path-length 10
 
-One simulated robot drives in a building of each seed (`fcslam simulate --scanner --turn-rate --odometry`). Scanners that
-spin measure each beam at its own time. The error is that of the positions at all scans after a rigid alignment.
+One simulated robot drives in a building of each seed (`fcslam simulate --scanner --turn-rate --odometry`). Scanners
+that spin measure each beam at its own time. The error is that of the positions at all scans after a rigid alignment.
 
 Three logs of the SLAM benchmark are mapped without their odometry. Errors follow Kuemmerle et al. 2009 over all
 relations.
