@@ -46,8 +46,10 @@ def odometry(stamp, pose, frame="odom", child="base_link"):
     return make(ODOMETRY, header=header(stamp, frame), child_frame_id=child, pose=posed, twist=twist)
 
 
-def transform(stamp, parent, child, pose=LASER_POSE):
-    return CODEC.transforms(header(stamp, parent), child, in_space(np.array(pose)))
+def transform(stamp, parent, child, pose=LASER_POSE, height_m=0.0):
+    flat = in_space(np.array(pose))
+    at = flat._replace(translation_m=(*flat.translation_m[:2], height_m))
+    return CODEC.transforms(header(stamp, parent), child, at)
 
 
 def image(stamp, width=8, height=6):

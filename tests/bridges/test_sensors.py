@@ -9,18 +9,21 @@ from fcslam.bridges.topics import SensorTopics
 from fcslam.errors import NetworkError
 from fcslam.records import CameraImage
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
 from tests.bridges.ros_messages import (
+    CODEC,
     KINDS,
     LASER_POSE,
     camera_info,
     encoded,
+    header,
     image,
     multi_echo,
     odometry,
     scan,
     transform,
 )
+from tests.sources.clouds import PERIOD_S, VELODYNE, at_rest, cloud, depth_image, plan_ranges, rotation, spinning
 
 RANGES = np.full(180, 5.0)
 
@@ -378,3 +381,72 @@ def test_raw_images_become_records_at_a_rate_that_is_enough(camera_robot):
     assert len(images) == 3
     assert images[0].T_odom_base == pytest.approx([6.0, 0.0, 0.0])
     assert images[0].camera.T_base_camera.translation_m == pytest.approx((0.1, 0.0, 0.0))
+
+
+def test_a_range_max_that_grows_cuts_no_range(robot):
+    robot.drives(np.arange(1.0, 9.0))
+    robot.hears("/scan", scan(9.0, np.full(180, 25.0), range_max=30.0))
+    robot.hears("/odom", odometry(9.5, (9.5, 0.0, 0.0)))
+    record = robot.records[-1]
+    assert robot.records[0].laser.max_range_m == 20.0
+    assert (record.ranges_m == 25.0).all()
+    assert record.laser.max_range_m > 25.0
+
+
+def test_sectors_of_a_turn_are_joined(robot):
+    for number in range(40):
+        stamp = 1.0 + 0.05 * number
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
+        sector = scan(
+            stamp, np.full(90, 1.0 + number % 4), angle_min=-np.pi + np.pi / 2 * (number % 4), beam_s=0.05 / 90
+        )
+        robot.hears("/scan", sector)
+    robot.hears("/odom", odometry(4.0, (4.0, 0.0, 0.0)))
+    assert robot.stamps == pytest.approx(1.0 + 0.2 * np.arange(10))
+    for record in robot.records:
+        assert np.array_equal(record.ranges_m, np.repeat(np.float32([1, 2, 3, 4]), 90))
+        assert record.sweep.duration_s == pytest.approx(0.2 * 359 / 360)
+
+
+def test_point_clouds_wait_for_tf_and_then_are_scans():
+    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",))
+    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8, columns=480)
+
+    def drives(stamps):
+        for stamp in stamps:
+            robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
+            robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+
+    drives([1.0, 1.1])
+    robot.waits(PATIENCE_S + 1.0)
+    assert any("waits for tf: it has no transform from 'base_link' to 'lidar'" in line for line in robot.said)
+    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    drives(1.2 + 0.1 * np.arange(2 * SCANS_FOR_RIG))
+    record = robot.records[0]
+    assert record.laser.T_base_laser == pytest.approx(LASER_POSE)
+    assert record.sweep.duration_s == pytest.approx(PERIOD_S, rel=0.01)
+    angles = record.laser.angles_rad() + LASER_POSE[2]
+    errors = np.abs(record.ranges_m - plan_ranges(*LASER_POSE[:2], angles))
+    assert np.nanmedian(errors) < 0.005
+    assert np.isfinite(errors).mean() > 0.9
+
+
+def test_depth_images_wait_for_their_calibration():
+    kinds = {**KINDS, "/depth/image": IMAGE, "/depth/camera_info": CAMERA_INFO}
+    robot = Robot(kinds=kinds, scans=("/depth/image",), laser_poses=((0.0, 0.0, 0.0),))
+    frame, info = depth_image(1.0, "32FC1")
+
+    def drives(stamps):
+        for stamp in stamps:
+            frame.header = header(stamp, "depth_optical_frame")
+            robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
+            robot.hears("/depth/image", CODEC.encode(frame, IMAGE))
+
+    drives([1.0, 1.1])
+    robot.waits(PATIENCE_S + 1.0)
+    assert any("waits for the calibration of /depth/image: /depth/camera_info is silent" in each for each in robot.said)
+    robot.hears("/depth/camera_info", CODEC.encode(info, CAMERA_INFO))
+    drives(1.2 + 0.1 * np.arange(SCANS_FOR_RIG + 1))
+    record = robot.records[0]
+    errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, record.laser.angles_rad()))
+    assert np.nanmedian(errors) < 0.005

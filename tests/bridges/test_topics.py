@@ -6,7 +6,16 @@ from fcslam.bridges.addresses import RosAddress, open_network, parse_address
 from fcslam.bridges.topics import choose_sensor_topics
 from fcslam.errors import NetworkError
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    MULTI_ECHO_SCAN,
+    ODOMETRY,
+    POINT_CLOUD,
+    SCAN,
+    TRANSFORMS,
+)
 from tests.bridges.memory_network import offered
 
 
@@ -24,6 +33,17 @@ def test_topics_are_found_by_type_in_the_namespace():
     assert found.transforms == ("/tf", "/tf_static")
     assert found.camera is None
     assert found.notes == ("reads laser scans from /robot1/front/scan, not from /robot1/a (--scan-topic chooses)",)
+
+
+def test_laser_scans_go_before_point_clouds_and_these_before_depth_images():
+    depth = (("/depth/image", IMAGE), ("/depth/camera_info", CAMERA_INFO))
+    cloud, laser = ("/points", POINT_CLOUD), ("/z/lidar", SCAN)
+    assert choose(*depth, cloud, laser, namespace="").scans == ("/z/lidar",)
+    assert choose(*depth, cloud, namespace="").scans == ("/points",)
+    found = choose(*depth, namespace="")
+    assert (found.scans, found.camera) == (("/depth/image",), None)
+    assert found.kinds["/depth/camera_info"] == CAMERA_INFO
+    assert choose(cloud, laser, namespace="", scan_topics=("points",)).scans == ("/points",)
 
 
 def test_tf_of_the_namespace_goes_before_that_of_all_robots():
@@ -53,7 +73,7 @@ def test_named_topics_may_be_relative_or_of_tf():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({}, r"no laser scans \(sensor_msgs/LaserScan\) in /robot1; .* the topics are /robot1/odom \(nav_msgs/Odom"),
+        ({}, r"no laser scans \(sensor_msgs/LaserScan\).* in /robot1; .* the topics are /robot1/odom \(nav_msgs/Odom"),
         ({"scan_topics": ("scan",)}, r"topic /robot1/scan is not there; --scan-topic needs sensor_msgs/LaserScan or"),
         ({"scan_topics": ("odom",)}, r"topic /robot1/odom has the type nav_msgs/Odometry; --scan-topic needs"),
     ],

@@ -153,7 +153,7 @@ def _message(store, kind, fields):
             header=header(fields["frame"]),
             **{name: fields[name] for name in names},
             angle_max=fields.get("angle_max", fields["angle_min"] + (len(ranges) - 1) * fields["angle_increment"]),
-            time_increment=0.0,
+            time_increment=fields.get("time_increment", 0.0),
             scan_time=0.0,
             ranges=ranges,
             intensities=np.zeros(0, np.float32),

@@ -28,7 +28,7 @@ from fcslam.errors import FcslamError, NetworkError
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.runs import RobotTrajectory
 from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, SCANS, MessageCodec
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.storage.files import write_file
@@ -48,7 +48,7 @@ _POLL_S = 0.1
 _SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
 """A longer pause of the scans is reported."""
-_DEPTHS = {**dict.fromkeys(SCANS, 100), COMPRESSED_IMAGE: 10, IMAGE: 10, CAMERA_INFO: 1}
+_DEPTHS = {**dict.fromkeys((*SCANS, COMPRESSED_IMAGE, IMAGE), 10), **dict.fromkeys(LASER_SCANS, 100), CAMERA_INFO: 1}
 _DEPTH = 1000
 """Messages that the middleware keeps for this process; of odometry and tf there are many."""
 
@@ -175,7 +175,7 @@ class RobotNode:
                 for record in records:
                     self._map(record)
                     watch(self.scans, self._pose)
-                if message is not None and self._topics.kinds[message.topic] in SCANS:
+                if message is not None and message.topic in self._topics.scans:
                     if is_silent:
                         self._notify(f"scans arrive again after {now_s - heard_s:.0f} s")
                     heard_s, is_silent = now_s, False

@@ -6,25 +6,28 @@ whose odometry is silent from the start is mapped without.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from math import inf
 
-from fcslam.bridges.topics import SensorTopics
+from fcslam.bridges.topics import SensorTopics, info_beside
 from fcslam.errors import NetworkError
 from fcslam.records import Beams, SensorRecord
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
+from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
+    LASER_SCANS,
     ODOMETRY,
     OLD_TRANSFORMS,
-    SCANS,
     TRANSFORMS,
     MessageCodec,
 )
 from fcslam.sources.bags.merging import ScanMerger
 from fcslam.sources.bags.messages import (
+    UNKNOWN_RANGE_M,
     BeamsError,
     OdometryReading,
     ScanMessage,
@@ -39,11 +42,12 @@ from fcslam.sources.bags.rig import (
     Rig,
     TiltedLaserError,
     given_mounting,
-    level_mounting,
     mounted_camera,
     rig_of,
+    sensor_mounting,
     tilt_note,
 )
+from fcslam.sources.bags.sectors import SectorJoiner, are_sectors
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransformError, TransformTree
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
@@ -97,10 +101,15 @@ class LiveSensors:
         self._has_odometry = self._is_camera_ahead = False
         self._edge: Link | None = None
         """Frames of the odometry in tf, once the laser's are known."""
-        self._calibration: Calibration | None = None
+        self._calibrations: dict[str, Calibration] = {}
+        """By the topic of camera_info."""
         self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]
         self._frames: dict[str, str] = {}
         """Of the scans on each topic."""
+        self._awaited: dict[str, str] = {}
+        """Topics whose messages cannot be scans before tf and a calibration are known, and a line that says it."""
+        self._joiners: dict[int, SectorJoiner] = {}
+        """Of the lasers whose messages are sectors of a turn."""
         self._rig: Rig | None = None
         self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()
@@ -130,7 +139,7 @@ class LiveSensors:
             NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
         """
         self._counts[topic] += 1
-        if self._is_needless(self._topics.kinds[topic], now_s):
+        if topic not in self._topics.scans and self._is_needless(self._topics.kinds[topic], now_s):
             return
         try:
             items = self._decoded(topic, payload, received_ns)
@@ -180,6 +189,10 @@ class LiveSensors:
         """Yield all that waits, as no more messages come."""
         if self._rig is None:
             return
+        for joiner in self._joiners.values():
+            for turn in joiner.flush():
+                for number, item in self._merger.add(0, turn):
+                    yield from self._paired(number, item)
         for number, item in self._merger.flush():
             yield from self._paired(number, item)
         for number, entry in self._pairing.flush():
@@ -211,19 +224,8 @@ class LiveSensors:
         """Raises ValueError if the message is invalid."""
         kind = self._topics.kinds[topic]
         content = self._codec.decode(payload, kind)
-        if kind in SCANS:
-            laser = self._topics.scans.index(topic)
-            scan = scan_of(content, received_ns)._replace(laser=laser)
-            if scan.frame != self._frames.setdefault(topic, scan.frame):
-                self._notify(
-                    f"{topic} has scans of the frames '{self._frames[topic]}' and '{scan.frame}', the last are left "
-                    "out; publish the scans of each laser on a topic of its own"
-                )
-                self.audit.add(Fault.OTHER_BEAMS, self._counts[topic])
-                return []
-            if self._rig is None:
-                self._first[laser].append(scan)
-            return [scan]
+        if topic in self._topics.scans:
+            return self._scan_items(topic, content, received_ns)
         if kind == ODOMETRY:
             reading = odometry_of(content, received_ns)
             self.odom_frame = reading.odom_frame or USUAL_ODOM
@@ -233,9 +235,49 @@ class LiveSensors:
         if kind in (COMPRESSED_IMAGE, IMAGE):
             return [image_of(content, kind, received_ns)]
         if kind == CAMERA_INFO:
-            self._calibration = self._calibration or calibration_of(content)
+            self._calibrations.setdefault(topic, calibration_of(content))
             return []
         return self._transforms(content, received_ns)
+
+    def _scan_items(self, topic: str, content: object, received_ns: int) -> list[Message]:
+        laser = self._topics.scans.index(topic)
+        scan = self._scan(topic, content, received_ns)
+        if scan is None:
+            return []
+        scan = scan._replace(laser=laser)
+        if scan.frame != self._frames.setdefault(topic, scan.frame):
+            self._notify(
+                f"{topic} has scans of the frames '{self._frames[topic]}' and '{scan.frame}', the last are left "
+                "out; publish the scans of each laser on a topic of its own"
+            )
+            self.audit.add(Fault.OTHER_BEAMS, self._counts[topic])
+            return []
+        if self._rig is None:
+            self._first[laser].append(scan)
+        return [scan]
+
+    def _scan(self, topic: str, content: object, received_ns: int) -> ScanMessage | None:
+        """The scan in a message; None while what it needs is awaited. Raises ValueError if the message is invalid."""
+        kind, info = self._topics.kinds[topic], info_beside(topic)
+        if kind in LASER_SCANS:
+            return scan_of(content, received_ns)
+        if kind == IMAGE and info not in self._calibrations:
+            self._awaited[topic] = f"waits for the calibration of {topic}: {info} is silent; publish it"
+            return None
+        cloud = cloud_of(content, kind, received_ns, self._calibrations.get(info))
+        if self._options.laser_poses:
+            pose = self._options.laser_poses[self._topics.scans.index(topic)]
+            return cloud.scan(given_cloud_mounting(pose, cloud.frame), self._options.cloud_band)
+        try:
+            mounting = cloud_mounting(self._tree.fixed(self._known_base_frame(), cloud.frame))
+        except NoTransformError as error:
+            self._awaited[topic] = _missing_mounting(error)
+            return None
+        return cloud.scan(mounting, self._options.cloud_band)
+
+    def _known_base_frame(self) -> str:
+        """The frame of the odometry, or else a usual one that tf has."""
+        return self.base_frame or next((frame for frame in USUAL_BASES if frame in self._tree), USUAL_BASES[-1])
 
     def _transforms(self, content: object, received_ns: int) -> list[Message]:
         transforms = list(transforms_of(content, received_ns))
@@ -257,32 +299,37 @@ class LiveSensors:
         self._find_odometry(is_late)
         if not self._is_heard(is_late):
             return None
-        known = (frame for frame in USUAL_BASES if frame in self._tree)
-        self.base_frame = base_frame = self.base_frame or next(known, USUAL_BASES[-1])
-        usual = [usual_beams([scan.beams for scan in scans]) for scans in self._first]
-        first = [
-            next(scan for scan in scans if scan.beams == beams) for scans, beams in zip(self._first, usual, strict=True)
-        ]
+        self.base_frame = base_frame = self._known_base_frame()
+        self._joiners = {laser: SectorJoiner() for laser, scans in enumerate(self._first) if are_sectors(scans)}
+        turns = [self._turns(laser, scans) for laser, scans in enumerate(self._first)]
+        usual = [usual_beams([scan.beams for scan in scans]) for scans in turns]
+        first = [next(scan for scan in scans if scan.beams == beams) for scans, beams in zip(turns, usual, strict=True)]
         try:
             mountings = self._mountings(first, base_frame)
         except NoTransformError as error:
             if not is_late:
                 return None
-            self._notify(
-                f"waits for tf: it has {error}, so it does not say where a laser sits; start robot_state_publisher or "
-                "static_transform_publisher, or give --laser-pose X,Y,THETA (metres, radians)"
-            )
+            self._notify(_missing_mounting(error))
             return None
         camera, note = None, ""
         if self._topics.camera is not None:
-            camera, note = mounted_camera(self._calibration, self._tree, base_frame)
+            camera, note = mounted_camera(
+                self._calibrations.get(self._topics.camera_info or ""), self._tree, base_frame
+            )
             if camera is None and not is_late:
                 return None
         self._tell_rig(mountings, note)
         self._beams = usual
         for scans in self._first:
             scans.clear()
-        return rig_of(first, mountings, camera)
+        return rig_of(usual, [max(scan.range_max_m for scan in scans) for scans in turns], mountings, camera)
+
+    def _turns(self, laser: int, scans: Sequence[ScanMessage]) -> list[ScanMessage]:
+        """The first scans of a laser, with sectors joined."""
+        if laser not in self._joiners:
+            return list(scans)
+        joiner = SectorJoiner()
+        return [turn for sector in scans for turn in joiner.add(sector)] or list(joiner.flush())
 
     def _find_odometry(self, is_late: bool) -> None:
         """Find the odometry in tf, on the way up from the laser; only without a way, elsewhere."""
@@ -299,7 +346,8 @@ class LiveSensors:
         """Whether there are scans of every laser, and odometry."""
         for topic, scans in zip(self._topics.scans, self._first, strict=True):
             if not scans and is_late:
-                self._notify(f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s")
+                silent = f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s"
+                self._notify(self._awaited.get(topic, silent))
         enough = all(len(scans) >= (1 if is_late else SCANS_FOR_RIG) for scans in self._first)
         if is_late and not (self._has_odometry or self.is_without_odometry):
             if self._topics.odometry is not None:
@@ -324,7 +372,8 @@ class LiveSensors:
 
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
         if self._options.laser_poses:
-            return list(map(given_mounting, self._options.laser_poses))
+            kinds = [self._topics.kinds[topic] for topic in self._topics.scans]
+            return list(map(given_mounting, self._options.laser_poses, kinds))
         frames = [scan.frame for scan in first]
         if len(set(frames)) < len(frames):
             raise NetworkError(
@@ -334,7 +383,8 @@ class LiveSensors:
         mountings = []
         for topic, scan in zip(self._topics.scans, first, strict=True):
             try:
-                mountings.append(level_mounting(self._tree, base_frame, scan.frame))
+                kind = self._topics.kinds[topic]
+                mountings.append(sensor_mounting(self._tree, base_frame, scan.frame, kind))
             except TiltedLaserError as error:
                 raise NetworkError(
                     f"the laser of {topic} is {error} and does not look along the floor; choose a level one by "
@@ -346,8 +396,24 @@ class LiveSensors:
         if isinstance(item, OdometryReading) and self._edge not in (None, (item.odom_frame, item.base_frame)):
             return
         self._watch_clock(item)
-        for merged, message in self._merger.add(number, item):
-            yield from self._paired(merged, message)
+        messages: Iterable[Message] = (item,)
+        if isinstance(item, ScanMessage):
+            self._widen_range(item)
+            if item.laser in self._joiners:
+                messages = self._joiners[item.laser].add(item)
+        for message in messages:
+            for merged, each in self._merger.add(number, message):
+                yield from self._paired(merged, each)
+
+    def _widen_range(self, scan: ScanMessage) -> None:
+        """Give a laser whose range_max grows none of its own: that of each message counts."""
+        rig = self._rig
+        assert rig is not None  # nothing is read before
+        laser = rig.lasers[scan.laser]
+        if scan.range_max_m > laser.max_range_m:
+            lasers = list(rig.lasers)
+            lasers[scan.laser] = replace(laser, max_range_m=UNKNOWN_RANGE_M)
+            self._rig = rig._replace(lasers=tuple(lasers))
 
     def _paired(self, number: int, message: Message) -> Iterator[SensorRecord]:
         """Give the next message in order its odometry."""
@@ -418,3 +484,10 @@ class LiveSensors:
                 yield rig.image(entry)
             except ValueError:
                 self.audit.add(Fault.BROKEN_IMAGE, number)
+
+
+def _missing_mounting(error: NoTransformError) -> str:
+    return (
+        f"waits for tf: it has {error}, so it does not say where a laser sits; start robot_state_publisher or "
+        "static_transform_publisher, or give --laser-pose X,Y,THETA (metres, radians)"
+    )

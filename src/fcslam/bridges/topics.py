@@ -12,12 +12,14 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     ODOMETRY,
     OLD_TRANSFORMS,
+    POINT_CLOUD,
     SCAN,
     SCANS,
     TRANSFORMS,
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.robots import is_truth
+from fcslam.sources.bags.topics import is_depth
 
 TF, TF_STATIC = "tf", "tf_static"
 
@@ -29,7 +31,7 @@ class SensorTopics:
     kinds: Mapping[str, str]
     """Type of every topic below."""
     scans: tuple[str, ...]
-    """One for each laser."""
+    """One for each laser, 3D LiDAR or depth camera."""
     odometry: str | None
     """None: odometry comes from tf."""
     transforms: tuple[str, ...]
@@ -47,7 +49,8 @@ def resolved(namespace: str, name: str) -> str:
 def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options: BagOptions) -> SensorTopics:
     """Choose the topics to read in ``namespace``, by these rules:
 
-    - laser: one echo a beam, the name ``scan``, first by name;
+    - laser: laser scans before point clouds and these before depth images, one echo a beam, the name ``scan``, first by
+      name;
     - odometry: the name ``odom``, first by name, else tf; ground truth only if the user names it;
     - camera: calibrated, compressed images, first by name;
     - tf: the namespace's own if there is one, else that of all robots.
@@ -60,12 +63,19 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     inside = [topic for topic in known if topic.startswith(f"{namespace}/")]
     chosen = _Choice(endpoints, known, namespace)
     notes: list[str] = []
-    scans = [chosen.named(name, "--scan-topic", *SCANS) for name in options.scan_topics]
+    scans = [chosen.named(name, "--scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
     if not scans:
-        candidates = [topic for topic in inside if known[topic] in SCANS]
+        depths = [
+            topic for topic in inside if known[topic] == IMAGE and is_depth(topic) and info_beside(topic) in known
+        ]
+        candidates = [*(topic for topic in inside if known[topic] in SCANS), *depths]
         if not candidates:
-            raise NetworkError(f"no laser scans ({SCAN}) in {namespace or '/'}; start the driver; {chosen.known()}")
-        scans = [min(candidates, key=lambda topic: (known[topic] != SCAN, _basename(topic) != "scan", topic))]
+            raise NetworkError(
+                f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images in {namespace or '/'}; start "
+                f"the driver; {chosen.known()}"
+            )
+        rank = [*SCANS, IMAGE].index
+        scans = [min(candidates, key=lambda topic: (rank(known[topic]), _basename(topic) != "scan", topic))]
         notes += _note("laser scans", "--scan-topic", scans[0], candidates)
     odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
     if options.odom_topic == NO_ODOMETRY:
@@ -80,7 +90,8 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     if odometry is not None and known[odometry] != ODOMETRY:
         transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
     camera, info = _camera(chosen, known, inside, options.camera_topic)
-    read = (*scans, *transforms, *filter(None, (odometry, camera, info)))
+    depth_infos = [info_beside(topic) for topic in scans if known[topic] == IMAGE]
+    read = (*scans, *depth_infos, *transforms, *filter(None, (odometry, camera, info)))
     kinds = {topic: known.get(topic, TRANSFORMS) for topic in read}
     return SensorTopics(kinds, tuple(scans), odometry, transforms, camera, info, tuple(notes))
 
@@ -121,15 +132,21 @@ def _camera(
     images = [topic for topic in inside if known[topic] in (COMPRESSED_IMAGE, IMAGE)]
     if wanted is not None:
         images = [chosen.named(wanted, "--camera-topic", COMPRESSED_IMAGE, IMAGE)]
-    infos = {topic: _info_beside(topic) for topic in images if "depth" not in topic}
+    infos = {topic: info_beside(topic) for topic in images if not is_depth(topic)}
     calibrated = {topic: info for topic, info in infos.items() if known.get(info) == CAMERA_INFO}
     camera = min(calibrated, key=lambda topic: (known[topic] != COMPRESSED_IMAGE, topic), default=None)
     if wanted is not None and camera is None:
-        raise NetworkError(f"topic {images[0]} has no calibration: {_info_beside(images[0])} is not there; publish it")
+        raise NetworkError(f"topic {images[0]} has no calibration: {info_beside(images[0])} is not there; publish it")
     return camera, None if camera is None else calibrated[camera]
 
 
-def _info_beside(camera: str) -> str:
+def _is_depth(topic: str, known: Mapping[str, str]) -> bool:
+    """Whether a topic has depth images with their calibration."""
+    return known[topic] == IMAGE and is_depth(topic) and known.get(info_beside(topic)) == CAMERA_INFO
+
+
+def info_beside(camera: str) -> str:
+    """The topic of the calibration of a camera."""
     return camera.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
 
 

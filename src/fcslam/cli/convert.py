@@ -15,6 +15,7 @@ from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
     BaseFrame,
     CameraTopic,
+    CloudHeights,
     LaserPose,
     OdomFrame,
     OdomTopic,
@@ -54,13 +55,14 @@ def convert(
     base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    cloud_band: CloudHeights = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the scans, odometry and images of a recording in another format."""
     console = notices(quiet)
     source = open_recording(
-        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
     )
     _prepare(output, force)
     survey = source.survey()

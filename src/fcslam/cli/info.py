@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.recordings import BaseFrame, CameraTopic, LaserPose, OdomFrame, OdomTopic, ScanTopic, bag_options
+from fcslam.cli.recordings import (
+    BaseFrame,
+    CameraTopic,
+    CloudHeights,
+    LaserPose,
+    OdomFrame,
+    OdomTopic,
+    ScanTopic,
+    bag_options,
+)
 from fcslam.errors import printable
 
 if TYPE_CHECKING:
@@ -40,11 +49,12 @@ def info(
     base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    cloud_band: CloudHeights = None,
 ) -> None:
     """Say what is in a recording, and whether it can be mapped; if not, why."""
     from fcslam.sources.inspection import inspect
 
-    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
     found = inspect(recording, options)
     console = answers()
     if as_json:

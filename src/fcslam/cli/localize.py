@@ -12,6 +12,7 @@ from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
     BaseFrame,
     CameraTopic,
+    CloudHeights,
     InitialPose,
     LaserPose,
     OdomFrame,
@@ -60,6 +61,7 @@ def localize(
     base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    cloud_band: CloudHeights = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -76,7 +78,7 @@ def localize(
     settings = mission_config(config)
     initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
     source = open_recording(
-        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
     )
     survey = source.survey()
     console = notices(quiet)

@@ -25,6 +25,7 @@ from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
     BaseFrame,
     CameraTopic,
+    CloudHeights,
     LaserPose,
     OdomFrame,
     OdomTopic,
@@ -97,6 +98,7 @@ def map_recordings(
     base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    cloud_band: CloudHeights = None,
     seed: MissionSeed = None,
     live: Live = False,
     port: Port = 0,
@@ -124,7 +126,7 @@ def map_recordings(
         earlier = None if onto is None else read_mission(onto)
         settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier), preset)
         vetoes = read_vetoes(veto) if veto else ()
-        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from fcslam.sources import BagOptions, Source
     from fcslam.sources.bags.options import GivenPose
     from fcslam.sources.faults import Faults
+    from fcslam.sources.point_clouds import CloudBand
 
 _BAGS = "ROS bags"
 
@@ -66,6 +67,14 @@ LaserPose = Annotated[
 ]
 
 
+CloudHeights = Annotated[
+    str | None,
+    typer.Option(
+        "--cloud-band", metavar="LOW,HIGH[,BODY]", rich_help_panel=_BAGS,
+        help="Heights above the floor (metres) of the points of a 3D LiDAR or depth camera that count; 0.1,0.6 if not "
+        "given. Points within BODY metres (0.4) of the base are of the robot.",
+    ),
+]  # fmt: skip
 InitialPose = Annotated[
     str | None,
     typer.Option(
@@ -79,11 +88,12 @@ InitialPose = Annotated[
 def bag_options(
     scan_topics: list[str] | None, odom_topic: str | None, camera_topic: str | None, laser_poses: list[str] | None,
     odom_frame: str | None = None, base_frame: str | None = None,
+    cloud_band: str | None = None,
 ) -> "BagOptions | None":  # fmt: skip
     """The options of bags; None if none is given.
 
     Raises:
-        InputError: one of ``laser_poses`` is no pose.
+        InputError: one of ``laser_poses`` is no pose, or ``cloud_band`` no band.
     """
     from fcslam.sources import BagOptions
 
@@ -94,6 +104,7 @@ def bag_options(
         tuple(map(_laser_pose, laser_poses or ())),
         odom_frame,
         base_frame,
+        cloud_band=_cloud_band(cloud_band),
     )
     return None if options == BagOptions() else options
 
@@ -102,6 +113,18 @@ def _laser_pose(text: str) -> "GivenPose":
     upright = text.removesuffix(",upside-down")
     x, y, theta = pose("--laser-pose", upright)
     return (x, y, theta) if upright == text else (x, y, theta, True)
+
+
+def _cloud_band(text: str | None) -> "CloudBand":
+    from fcslam.sources.point_clouds import CloudBand
+
+    try:
+        band = CloudBand(*map(float, text.split(","))) if text else CloudBand()
+    except (TypeError, ValueError):
+        band = CloudBand(math.nan)
+    if not (band.low_m < band.high_m and 0.0 <= band.body_radius_m < math.inf):  # false for NaN
+        raise InputError(f"--cloud-band {text!r} is no band of heights; give metres, as in --cloud-band 0.1,0.6")
+    return band
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":

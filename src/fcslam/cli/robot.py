@@ -17,6 +17,7 @@ from fcslam.cli.output import RUNS, answers, notices, print_line
 from fcslam.cli.recordings import (
     BaseFrame,
     CameraTopic,
+    CloudHeights,
     InitialPose,
     LaserPose,
     OdomFrame,
@@ -168,6 +169,7 @@ def robot(
     base_frame: BaseFrame = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    cloud_band: CloudHeights = None,
     domain: DomainId = None,
     ros_parameters: RosParameters = None,
     use_sim_time: UseSimTime = False,
@@ -223,7 +225,10 @@ def robot(
                 _fetch(localize, server, token, ca, own, notices(quiet))
             initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
             start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings, floor=floor)
-        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame) or BagOptions()
+        options = (
+            bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
+            or BagOptions()
+        )
         parameters = node_parameters(ros_parameters, use_sim_time)
         plan = learning.plan(name or parse_address(source).robot, settings.robot, server, state)
         map_live(source, name, start, options, domain, parameters, output, notices(quiet), plan)
@@ -234,7 +239,7 @@ def robot(
     pace = _speed(speed)
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(
-        argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame)
+        argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
     )
     _check_name(recording.name)
     survey = recording.survey()

@@ -57,14 +57,14 @@ class RangeSample:
 
     def wants(self, T_odom_base: Pose) -> bool:
         """Whether to add the next scan."""
-        if self._last is not None and self._seen >= _FIRST and not _is_apart(self._last, T_odom_base):
+        if self._last is not None and self._seen >= _FIRST and not is_apart(self._last, T_odom_base):
             return False
         self._seen += 1
         return self._seen % self._step == 0
 
     def add(self, T_odom_base: Pose, values: Ranges, range_min_m: float, range_max_m: float) -> None:
         """Add a scan that is wanted, with its values as sent and the ranges that are returns."""
-        is_elsewhere = self._last is not None and _is_apart(self._last, T_odom_base)
+        is_elsewhere = self._last is not None and is_apart(self._last, T_odom_base)
         if self._last is None or is_elsewhere:
             self._last = T_odom_base
         self._samples.append(_Sample(values, range_min_m, range_max_m, is_elsewhere))
@@ -131,7 +131,8 @@ def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> l
     return [f"{path}: {shown} m repeats exactly in many beams{which} everywhere, so it is no range"] * bool(shown)
 
 
-def _is_apart(a: Pose, b: Pose) -> bool:
+def is_apart(a: Pose, b: Pose) -> bool:
+    """Whether a robot at these poses sees the building from different places."""
     return hypot(b[0] - a[0], b[1] - a[1]) > _APART_M or abs(remainder(b[2] - a[2], tau)) > _APART_RAD
 
 

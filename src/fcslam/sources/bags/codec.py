@@ -10,7 +10,10 @@ if TYPE_CHECKING:
 
 SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
 MULTI_ECHO_SCAN = "sensor_msgs/MultiEchoLaserScan"
-SCANS = SCAN, MULTI_ECHO_SCAN
+LASER_SCANS = SCAN, MULTI_ECHO_SCAN
+POINT_CLOUD = "sensor_msgs/PointCloud2"
+LIVOX_CLOUDS = "livox_ros_driver/CustomMsg", "livox_ros_driver2/CustomMsg"
+SCANS = *LASER_SCANS, POINT_CLOUD, *LIVOX_CLOUDS
 COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 """Message types that are read, as ROS 1 writes them."""
@@ -24,6 +27,21 @@ TRIGGER_RESPONSE = "std_srvs/Trigger_Response"
 _NANOSECONDS = 10**9
 _GRID_UPDATE_FIELDS = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
 _TRIGGER_RESPONSE_FIELDS = "bool success\nstring message"
+_LIVOX_FIELDS = """std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+{package}/CustomPoint[] points
+================================================================================
+MSG: {package}/CustomPoint
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line"""
 
 
 class MessageCodec:
@@ -108,4 +126,6 @@ def typestore(ros1: bool) -> "Typestore":
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", full_name(TRANSFORMS)))
     store.register(get_types_from_msg(_GRID_UPDATE_FIELDS, full_name(GRID_UPDATE)))
     store.register(get_types_from_msg(_TRIGGER_RESPONSE_FIELDS, full_name(TRIGGER_RESPONSE)))
+    for kind in LIVOX_CLOUDS:
+        store.register(get_types_from_msg(_LIVOX_FIELDS.format(package=kind.partition("/")[0]), full_name(kind)))
     return store

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Final
 
+from fcslam.sources.point_clouds import CloudBand
 from fcslam.sources.pose import Pose
 
 NO_ODOMETRY: Final = "none"
@@ -45,4 +46,6 @@ class BagOptions:
     """Frame whose pose the odometry is."""
     robot: str | None = None
     """Name of one of several robots in the bag."""
+    cloud_band: CloudBand = field(default_factory=CloudBand)
+    """The points of point clouds and depth images that count."""
     correction: BagCorrection = field(default_factory=BagCorrection)

@@ -1,5 +1,6 @@
 """The mounted sensors of a robot: they turn its messages into records."""
 
+from collections.abc import Sequence
 from math import degrees, radians
 from typing import NamedTuple
 
@@ -8,7 +9,8 @@ import numpy as np
 from fcslam.errors import FcslamError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
 from fcslam.sources.bags.camera import Calibration
-from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
+from fcslam.sources.bags.codec import LASER_SCANS
+from fcslam.sources.bags.messages import measured_ranges, reversed_sweep
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
@@ -49,29 +51,36 @@ class Rig(NamedTuple):
         return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, T_odom_base)
 
 
-def rig_of(first_scans: list[ScanMessage], mountings: list[Mounting], camera: CameraModel | None) -> Rig:
-    """The rig whose lasers have these scans and mountings."""
-    lasers = tuple(map(_laser_model, first_scans, mountings))
+def rig_of(
+    beams: Sequence[Beams], ranges_max_m: Sequence[float], mountings: Sequence[Mounting], camera: CameraModel | None
+) -> Rig:
+    """The rig whose lasers have these usual beams, largest ranges and mountings."""
+    lasers = tuple(
+        LaserModel(*_turned_beams(its, mounted.upside_down), range_max_m, mounted.T_base_laser)
+        for its, range_max_m, mounted in zip(beams, ranges_max_m, mountings, strict=True)
+    )
     return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera)
 
 
-def level_mounting(tree: TransformTree, base_frame: str, laser_frame: str) -> Mounting:
-    """Where tf says that a laser sits.
+def sensor_mounting(tree: TransformTree, base_frame: str, frame: str, kind: str) -> Mounting:
+    """Where tf says that a laser, or another sensor with messages of type ``kind``, sits.
 
     Raises:
         NoTransformError: tf does not say it.
-        TiltedLaserError: the laser does not look along the floor.
+        TiltedLaserError: a laser does not look along the floor.
     """
-    mounted = mounting(tree.fixed(base_frame, laser_frame))
+    mounted = mounting(tree.fixed(base_frame, frame))
+    if kind not in LASER_SCANS:  # their scans are level
+        return Mounting(mounted.T_base_laser, upside_down=False, tilt_rad=0.0)
     if mounted.tilt_rad > _STEEPEST_RAD:
         raise TiltedLaserError(f"tilted by {degrees(mounted.tilt_rad):.0f} degrees")
     return mounted
 
 
-def given_mounting(pose: GivenPose) -> Mounting:
-    """The mounting that the user gives."""
+def given_mounting(pose: GivenPose, kind: str) -> Mounting:
+    """The mounting that the user gives, of a sensor with messages of type ``kind``."""
     x, y, theta, *upside_down = pose
-    return Mounting((x, y, theta), upside_down=any(upside_down), tilt_rad=0.0)
+    return Mounting((x, y, theta), upside_down=any(upside_down) and kind in LASER_SCANS, tilt_rad=0.0)
 
 
 def tilt_note(mounted: Mounting) -> str:
@@ -92,11 +101,6 @@ def mounted_camera(
     except NoTransformError as error:
         return None, f"is left out, as tf has {error}"
     return camera, "has distorted images, read as if they were not" if calibration.is_distorted else ""
-
-
-def _laser_model(first: ScanMessage, mounted: Mounting) -> LaserModel:
-    beams = _turned_beams(first.beams, mounted.upside_down)
-    return LaserModel(*beams, first.range_max_m, mounted.T_base_laser)
 
 
 def _turned_beams(beams: Beams, upside_down: bool) -> Beams:

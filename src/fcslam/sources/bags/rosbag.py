@@ -15,6 +15,7 @@ from typing import NamedTuple
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Odometry, SensorRecord
+from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
@@ -22,19 +23,20 @@ from fcslam.sources.bags.rig import (
     Rig,
     TiltedLaserError,
     given_mounting,
-    level_mounting,
     mounted_camera,
     rig_of,
+    sensor_mounting,
     tilt_note,
 )
 from fcslam.sources.bags.robots import BagRobot, robots_of, slashed
-from fcslam.sources.bags.stream import BagStream
+from fcslam.sources.bags.stream import BagStream, RecordedLaser
 from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError, TransformTree
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
 from fcslam.sources.pose import pose_array
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -115,11 +117,17 @@ class RosBag:
         audit, tree = _audit(), self.stream.tree
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in self.stream.lasers]
+        bodies = [BodySample() for _ in self.stream.lasers]
+        farthest_m = [laser.first.range_max_m for laser in self.stream.lasers]
         base_frame = self._options.base_frame or ""
         self.stream.count_broken_transforms(audit)
         for _, entry in self.stream.entries(audit):
             if isinstance(entry, PosedScan):
-                if (sample := samples[entry.scan.laser]).wants(entry.T_odom_base):
+                laser = entry.scan.laser
+                farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
+                if self.stream.lasers[laser].topic.type not in LASER_SCANS:
+                    bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
+                if (sample := samples[laser]).wants(entry.T_odom_base):
                     scan = entry.scan
                     sample.add(entry.T_odom_base, scan.raw_ranges_m, scan.range_min_m, scan.range_max_m)
                 scans.add(entry.scan.stamp, entry.T_odom_base)
@@ -133,19 +141,24 @@ class RosBag:
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
+        body_notes = self._leave_out_body(bodies, mountings)
         camera, camera_notes = self._camera(tree, base_frame)
         tilts = (
             self._tilt_note(laser.name, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
         unlimited = (
             f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
-            for laser in self.stream.lasers
-            if laser.first.range_max_m == UNKNOWN_RANGE_M
+            for laser, its_m in zip(self.stream.lasers, farthest_m, strict=True)
+            if its_m == UNKNOWN_RANGE_M
         )
         notes = (
             *self._notes,
             *self.stream.reading_notes,
             *unlimited,
+            *chain.from_iterable(
+                laser.notes(self.stream.path, self._options.cloud_band) for laser in self.stream.lasers
+            ),
+            *body_notes,
             *chain.from_iterable(
                 placeholder_note(self.stream.path, values, its) for values, its in zip(placeholders, which, strict=True)
             ),
@@ -155,9 +168,18 @@ class RosBag:
             *filter(None, tilts),
             *camera_notes,
         )
-        rig = rig_of([laser.first for laser in self.stream.lasers], mountings, camera)
+        rig = rig_of([laser.first.beams for laser in self.stream.lasers], farthest_m, mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
         return _Reading(survey, rig, placeholders)
+
+    def _leave_out_body(self, bodies: list[BodySample], mountings: list[Mounting]) -> list[str]:
+        """Leave out the points of clouds up to the farthest one that is of the robot, with a note."""
+        band = self._options.cloud_band
+        radius_m = max(body.radius_m(its.T_base_laser) for body, its in zip(bodies, mountings, strict=True))
+        if radius_m <= band.body_radius_m:
+            return []
+        self.stream.cloud_band = band._replace(body_radius_m=radius_m + SAME_SURFACE_M)
+        return [f"{self.stream.path}: points up to {radius_m:.2f} m from the base are of the robot and left out"]
 
     def _check_options(self, path: Path) -> None:
         topics, poses = self._options.scan_topics, self._options.laser_poses
@@ -189,7 +211,7 @@ class RosBag:
             named = ", ".join(laser.name for laser in lasers)
             raise SourceError(f"{self.stream.path}: {len(poses)} --laser-pose for the lasers {named}; {_EACH_LASER}")
         if poses:
-            return list(map(given_mounting, poses))
+            return [given_mounting(pose, laser.topic.type) for pose, laser in zip(poses, lasers, strict=True)]
         topic_of: dict[str, str] = {}
         for laser in lasers:
             other = topic_of.setdefault(laser.first.frame, laser.topic.name)
@@ -199,7 +221,7 @@ class RosBag:
                     f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --laser-pose X,Y,THETA "
                     "for each"
                 )
-        return [self._mounting(laser.name, laser.first.frame, tree, base_frame) for laser in lasers]
+        return [self._mounting(laser, tree, base_frame) for laser in lasers]
 
     @property
     def is_upside_down(self) -> bool:
@@ -240,9 +262,10 @@ class RosBag:
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
         return RosBag(self.stream.path, called, options, self._notes, robot)
 
-    def _mounting(self, topic: str, laser_frame: str, tree: TransformTree, base_frame: str) -> Mounting:
+    def _mounting(self, laser: RecordedLaser, tree: TransformTree, base_frame: str) -> Mounting:
+        topic = laser.name
         try:
-            return level_mounting(tree, base_frame, laser_frame)
+            return sensor_mounting(tree, base_frame, laser.first.frame, laser.topic.type)
         except NoTransformError as error:
             raise SourceError(
                 f"{self.stream.path}: tf has {error}{self._first_errors()}, so it does not say where the laser of "

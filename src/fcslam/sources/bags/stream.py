@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from itertools import islice
+from math import tau
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,8 @@ from fcslam.sources.bags.camera import (
     image_of,
 )
 from fcslam.sources.bags.census import CountedBag
-from fcslam.sources.bags.codec import ODOMETRY
+from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
+from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, ODOMETRY
 from fcslam.sources.bags.container import RawMessage, Topic
 from fcslam.sources.bags.merging import merge_scans
 from fcslam.sources.bags.messages import (
@@ -33,12 +35,14 @@ from fcslam.sources.bags.messages import (
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry, without_odometry
 from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
-from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
-from fcslam.sources.bags.transforms import TransformTree
+from fcslam.sources.bags.sectors import SectorJoiner, are_sectors
+from fcslam.sources.bags.topics import Candidates, Topics, calibration_beside, choose_topics, find_candidates
+from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
+from fcslam.sources.point_clouds import CloudBand, CloudMounting
 from fcslam.sources.pose import Pose
 
 _IMAGES_TRIED = 5
@@ -55,11 +59,23 @@ class RecordedLaser(NamedTuple):
     """The first scan with its usual beams."""
     frame: str | None = None
     """Frame of its scans, on a topic with several; None: any."""
+    is_in_sectors: bool = False
+    """Whether its messages are sectors of a turn."""
 
     @property
     def name(self) -> str:
         """The topic, and the frame if it has several."""
         return self.topic.name if self.frame is None else f"{self.topic.name} in '{self.frame}'"
+
+    def notes(self, path: Path, band: CloudBand) -> Iterator[str]:
+        """How its messages become scans, if they are none."""
+        if self.is_in_sectors:
+            yield f"{path}: the scans of {self.name} are sectors of a turn, those of each turn are joined"
+        if self.topic.type not in LASER_SCANS:
+            yield (
+                f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
+                "above the floor (--cloud-band chooses)"
+            )
 
 
 class OdometryInput(NamedTuple):
@@ -92,6 +108,12 @@ class BagStream:
         self._options = options
         self.odometry_notes: list[str] = []
         """Why an odometry is not used."""
+        self.cloud_band = options.cloud_band
+        """The points of clouds that count."""
+        self._depth_calibrations: dict[Topic, Calibration | None] = {}
+        """Of depth images."""
+        self._cloud_mountings: dict[tuple[Topic, str], CloudMounting] = {}
+        """By topic and frame."""
         self.first_errors: dict[str, str] = {}
         """The fault of the first invalid message of each topic, by its name."""
 
@@ -166,13 +188,19 @@ class BagStream:
                 f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read"
                 f"{self._reason(topic)}; correct the laser's driver, or copy the bag again"
             )
+        is_in_sectors = are_sectors(scans)
+        if is_in_sectors:
+            joiner = SectorJoiner()
+            scans = [turn for sector in scans for turn in joiner.add(sector)] or list(joiner.flush())
         usual = usual_beams([scan.beams for scan in scans])
-        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual), frame)
+        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual), frame, is_in_sectors)
 
     @cached_property
     def calibration(self) -> Calibration | None:
         """Calibration of the camera; None without a camera or a readable calibration."""
-        topic = self.topics.camera_info
+        return self._calibration_in(self.topics.camera_info)
+
+    def _calibration_in(self, topic: Topic | None) -> Calibration | None:
         for message in () if topic is None else self.bag.messages([topic]):
             try:
                 return calibration_of(self.bag.decode(message))
@@ -183,7 +211,7 @@ class BagStream:
     def entries(self, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         """Odometry, consistent scans with odometry, and images if asked, each with its message's number."""
         gates = [ScanGate(laser.first.beams, audit) for laser in self.lasers]
-        items = merge_scans(self._items(audit, with_images), len(gates))
+        items = merge_scans(self._joined(self._items(audit, with_images)), len(gates))
         for number, entry in (without_odometry if self.odometry is None else pair_with_odometry)(items):
             if not isinstance(entry, PosedScan):
                 if isinstance(entry, OdometryReading) and entry.is_after_jump:
@@ -194,6 +222,17 @@ class BagStream:
                     audit.add(entry.fault, number)
                 if entry.fault is not Fault.NO_ODOMETRY:
                     yield number, entry
+
+    def _joined(self, items: Iterator[tuple[int, Message]]) -> Iterator[tuple[int, Message]]:
+        """The items with the sectors of a turn joined to one scan."""
+        joiners = {laser: SectorJoiner() for laser, each in enumerate(self.lasers) if each.is_in_sectors}
+        number = 0
+        for number, item in items:
+            if isinstance(item, ScanMessage) and item.laser in joiners:
+                yield from ((number, turn) for turn in joiners[item.laser].add(item))
+            else:
+                yield number, item
+        yield from ((number, turn) for joiner in joiners.values() for turn in joiner.flush())
 
     def count_broken_transforms(self, audit: Audit) -> None:
         """Count the transforms that no pass over the scans reads."""
@@ -222,7 +261,7 @@ class BagStream:
     def _items_in(self, message: RawMessage) -> list[Message]:
         """Decode one message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
-            scan = scan_of(self.bag.decode(message), message.bag_time_ns)
+            scan = self._scan_in(message)
             return [self._corrected(scan)._replace(laser=laser) for laser in self._lasers_of(message.topic, scan.frame)]
         if message.topic == self.topics.camera:
             return [self._image_in(message)]
@@ -335,16 +374,57 @@ class BagStream:
     def _scans_of(self, topic: Topic) -> Iterator[ScanMessage]:
         for message in self.bag.messages([topic]):
             try:
-                scan = scan_of(self.bag.decode(message), message.bag_time_ns)
+                scan = self._scan_in(message)
             except ValueError:
                 continue
             yield scan
+
+    def _scan_in(self, message: RawMessage) -> ScanMessage:
+        """Decode a laser scan, a point cloud or a depth image; raises ValueError if it is invalid."""
+        content, topic = self.bag.decode(message), message.topic
+        if topic.type in LASER_SCANS:
+            return scan_of(content, message.bag_time_ns)
+        if topic not in self._depth_calibrations:
+            info = calibration_beside(topic, self.robot) if topic.type == IMAGE else None
+            self._depth_calibrations[topic] = self._calibration_in(info)
+        cloud = cloud_of(content, topic.type, message.bag_time_ns, self._depth_calibrations[topic])
+        if (topic, cloud.frame) not in self._cloud_mountings:
+            self._cloud_mountings[topic, cloud.frame] = self._cloud_mounting(topic, cloud.frame)
+        return cloud.scan(self._cloud_mountings[topic, cloud.frame], self.cloud_band)
+
+    def _cloud_mounting(self, topic: Topic, frame: str) -> CloudMounting:
+        """The mounting in tf, or the one that the user gives.
+
+        Raises:
+            SourceError: tf lacks it.
+        """
+        if self._options.laser_poses:
+            return given_cloud_mounting(self._options.laser_poses[self.topics.scans.index(topic)], frame)
+        try:
+            return cloud_mounting(self.tree.fixed(self._base_frame_of(frame), frame))
+        except NoTransformError as error:
+            raise SourceError(
+                f"{self.path}: tf has {error}, so it does not say where the sensor of {topic.name} sits; say it by "
+                "--laser-pose X,Y,THETA (metres, radians)"
+            ) from error
+
+    def _base_frame_of(self, frame: str) -> str:
+        """The base of the robot with ``frame``, before its lasers are known."""
+        bases = [self._options.base_frame]
+        for topic in (topic for topic in self.topics.odometry if topic.type == ODOMETRY):
+            bases.append(self._base_frame(topic))
+            for message in islice(self.bag.messages([topic]), _READINGS_TRIED):
+                with suppress(ValueError):
+                    bases.append(odometry_of(self.bag.decode(message), message.bag_time_ns).base_frame)
+        link = self.tree.odometry_link(frame, self._options.odom_frame)
+        usual_ones = [each for each in USUAL_BASES if each in self.tree]
+        return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
 
     def _reason(self, topic: Topic) -> str:
         """The fault of the first scan, in brackets."""
         for message in islice(self.bag.messages([topic]), 1):
             try:
-                scan_of(self.bag.decode(message), message.bag_time_ns)
+                self._scan_in(message)
             except ValueError as error:
                 return f" ({error})"
         return ""
@@ -363,6 +443,8 @@ class BagStream:
         return False
 
     def _field_of_view_rad(self, topic: Topic) -> float:
-        """Of the topic's first scan; 0 if it cannot be read."""
+        """Of the topic's first scan; 0 if it cannot be read; a full turn of a point cloud."""
+        if topic.type not in LASER_SCANS:
+            return tau
         scan = next(self._scans_of(topic), None)
         return 0.0 if scan is None else scan.beams.span_rad

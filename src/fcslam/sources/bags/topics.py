@@ -8,7 +8,16 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, SCANS
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    LASER_SCANS,
+    ODOMETRY,
+    POINT_CLOUD,
+    SCAN,
+    SCANS,
+)
 from fcslam.sources.bags.container import Topic, is_transforms
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.robots import BagRobot, is_truth, slashed
@@ -16,7 +25,7 @@ from fcslam.sources.bags.transforms import last_part
 
 _NAMED_AT_MOST = 15
 _NEEDED = {
-    "--scan-topic": SCAN,
+    "--scan-topic": f"{SCAN}, {POINT_CLOUD} or a depth image",
     "--odom-topic": f"{ODOMETRY}, or tf",
     "--camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
 }
@@ -60,7 +69,8 @@ def choose_topics(
 ) -> Topics:
     """Choose the topics of a robot to read, by these rules in order:
 
-    - laser: the widest field of view (to 0.1 rad), one echo a beam, the name ``scan``, most messages, first by name;
+    - laser: laser scans before point clouds and these before depth images, the widest field of view (to 0.1 rad), one
+      echo a beam, the name ``scan``, most messages, first by name;
     - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
     - camera: calibrated, most messages, compressed images, first by name.
 
@@ -69,10 +79,15 @@ def choose_topics(
     """
     heard, scans = _heard(robot), _scans(robot)
     if not scans:
-        raise SourceError(f"{robot.bag.path}: no laser scans ({SCAN}); record them; {_known(robot.topics)}")
-    lasers = [topic for name in options.scan_topics for topic in _candidates(robot, scans, name, "--scan-topic")] or [
-        _best_scan(scans, [_views_rad(scans, field_of_view_rad)])
-    ]
+        raise SourceError(
+            f"{robot.bag.path}: no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images; record them; "
+            f"{_known(robot.topics)}"
+        )
+    readable = [*scans, *_images(robot)]
+    lasers = [topic for name in options.scan_topics for topic in _candidates(robot, readable, name, "--scan-topic")]
+    if not lasers:
+        preferred = _preferred(scans)
+        lasers = [_best_scan(preferred, [_views_rad(preferred, field_of_view_rad)])]
     transforms, wanted = robot.transforms, options.odom_topic
     able = [*_measured(robot), *transforms]
     if wanted is not None:
@@ -98,7 +113,7 @@ def find_candidates(
     Raises:
         SourceError: the bag cannot be read.
     """
-    scans, images = _scans(robot), _images(robot)
+    scans, images = _preferred(_scans(robot)), _images(robot)
     calibrated = [topic for topic in images if _calibration_of(topic, robot) and has_images(topic)]
     return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(robot), calibrated)
 
@@ -136,7 +151,18 @@ def _heard(robot: BagRobot) -> list[Topic]:
 
 
 def _scans(robot: BagRobot) -> list[Topic]:
-    return [topic for topic in _heard(robot) if topic.type in SCANS]
+    return [topic for topic in _heard(robot) if topic.type in SCANS or _is_depth(topic, robot)]
+
+
+def _preferred(scans: Sequence[Topic]) -> list[Topic]:
+    """The laser scans, else the point clouds, else the depth images."""
+    kinds = ([topic for topic in scans if topic.type in types] for types in (LASER_SCANS, SCANS, (IMAGE,)))
+    return next(filter(None, kinds), [])
+
+
+def _is_depth(topic: Topic, robot: BagRobot) -> bool:
+    """Whether a topic is named as one of depth images, and has their calibration beside it."""
+    return topic.type == IMAGE and is_depth(topic.name) and calibration_beside(topic, robot) is not None
 
 
 def _measured(robot: BagRobot) -> list[Topic]:
@@ -202,7 +228,8 @@ def _choose_camera(
 
 
 def _images(robot: BagRobot) -> list[Topic]:
-    return [topic for topic in _heard(robot) if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+    images = [topic for topic in _heard(robot) if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+    return [topic for topic in images if not is_depth(topic.name)]
 
 
 def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
@@ -212,9 +239,20 @@ def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
 def _calibration_of(camera: Topic, robot: BagRobot) -> Topic | None:
     """The calibration topic beside the images, or the only one if there is only one camera."""
     infos = [topic for topic in _heard(robot) if topic.type == CAMERA_INFO]
+    only = infos[0] if len(infos) == len(_images(robot)) == 1 else None
+    return calibration_beside(camera, robot) or only
+
+
+def calibration_beside(camera: Topic, robot: BagRobot) -> Topic | None:
+    """The calibration topic beside the images."""
     name = camera.name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    beside = [info for info in infos if slashed(info.name) == slashed(name)]
-    return next(iter(beside or (infos if len(infos) == len(_images(robot)) == 1 else [])), None)
+    infos = (topic for topic in _heard(robot) if topic.type == CAMERA_INFO)
+    return next((info for info in infos if slashed(info.name) == slashed(name)), None)
+
+
+def is_depth(name: str) -> bool:
+    """Whether the images of a topic of this name are depth images."""
+    return "depth" in name.lower()
 
 
 def _candidates(robot: BagRobot, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:

@@ -1,0 +1,168 @@
+"""Point clouds and depth images of a bag or a live robot as scans."""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from fcslam.records import FloatArray, Transform
+from fcslam.sources.bags.camera import Calibration
+from fcslam.sources.bags.codec import IMAGE, POINT_CLOUD
+from fcslam.sources.bags.messages import ScanMessage, header_of
+from fcslam.sources.bags.options import GivenPose
+from fcslam.sources.bags.transforms import in_space, planar, rotated
+from fcslam.sources.images import MAX_SIDE_PX
+from fcslam.sources.point_clouds import (
+    FARTHEST_M,
+    CloudBand,
+    CloudMounting,
+    PointCloud,
+    depth_points,
+    scan_of_cloud,
+)
+
+MOST_POINTS: Final = 4_000_000
+"""In one message; the largest scanners measure a tenth of it in a turn."""
+_TYPES: Final = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+"""Of the values of sensor_msgs/PointField, by their number."""
+_TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts")
+"""Names of fields with the time of a point."""
+_UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
+_SHORTEST_CLOUD_S, _LONGEST_CLOUD_S = 5e-3, 1.0
+"""Time between the first and the last point of a cloud; it shows the unit of the times."""
+_NEAR_STAMP_S: Final = 1.5
+"""Times that begin this near to the stamp, or to 0, are by its clock, or after it."""
+_DEPTHS: Final = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
+"""Type and unit of the pixels of a depth image, by its encoding."""
+_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Rotation of the optical frame of a camera that looks along x (REP 103)."""
+
+
+class CloudMessage(NamedTuple):
+    """The points of a message."""
+
+    stamp: float
+    frame: str
+    cloud: PointCloud
+
+    def scan(self, mounting: CloudMounting, band: CloudBand) -> ScanMessage:
+        """The scan in the level frame of the sensor.
+
+        Raises:
+            ValueError: the height of the sensor is not known.
+        """
+        beams, ranges_m, offset_s, sweep = scan_of_cloud(self.cloud, mounting, band)
+        return ScanMessage(self.stamp + offset_s, self.frame, beams, 0.0, FARTHEST_M, ranges_m, sweep=sweep)
+
+
+def cloud_mounting(T_base_sensor: Transform) -> CloudMounting:
+    """The mounting that tf has."""
+    columns = [rotated(T_base_sensor.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+    heading_rad = planar(T_base_sensor)[2]
+    return CloudMounting(np.array(columns).T, np.array(T_base_sensor.translation_m), heading_rad)
+
+
+def given_cloud_mounting(pose: GivenPose, frame: str) -> CloudMounting:
+    """The mounting that the user gives, without a height; the sensor is level."""
+    x, y, theta, *upside_down = pose
+    mounting = cloud_mounting(in_space(np.array([x, y, theta])))
+    turn = np.diag([1.0, -1.0, -1.0]) if any(upside_down) else np.eye(3)
+    axes = _OPTICAL if "optical" in frame else np.eye(3)
+    return mounting._replace(rotation=mounting.rotation @ turn @ axes, is_height_known=False)
+
+
+def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration | None = None) -> CloudMessage:
+    """Convert a message of type ``kind``: a point cloud, or a depth image with its calibration.
+
+    Raises:
+        ValueError: it is invalid.
+    """
+    stamp, frame = header_of(content.header, bag_time_ns)
+    if kind == IMAGE:
+        return CloudMessage(stamp, frame, PointCloud(_depth_points(content, calibration), np.empty(0)))
+    if kind == POINT_CLOUD:
+        points, times = _fields(content)
+    else:
+        points = np.array([(each.x, each.y, each.z) for each in content.points], np.float64).reshape(-1, 3)
+        times = np.array([each.offset_time for each in content.points], np.int64)
+    measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
+    times_s: FloatArray = np.empty(0) if times is None else _seconds(times[measured], stamp)
+    return CloudMessage(stamp, frame, PointCloud(points[measured], times_s))
+
+
+def _fields(content: Any) -> tuple[FloatArray, Any]:
+    """Points, shape (N, 3), and their times as they are sent, shape (N,), or None."""
+    width, height, step, data = content.width, content.height, content.point_step, content.data
+    row_bytes = content.row_step if height > 1 else width * step
+    if width * height > MOST_POINTS:
+        raise ValueError(f"width {width} and height {height} are too large for a point cloud")
+    if not step or row_bytes < width * step or len(data) < height * row_bytes:
+        raise ValueError(
+            f"{len(data)} bytes of data do not hold {height} rows of {width} points with point_step {step} and "
+            f"row_step {content.row_step}"
+        )
+    order = ">" if content.is_bigendian else "<"
+    types = {}
+    for each in content.fields:
+        name = each.name
+        if name not in ("x", "y", "z", *_TIMES) or name in types:
+            continue
+        if not 0 < each.datatype < len(_TYPES):
+            raise ValueError(f"field {name} has the datatype {each.datatype}, which is none")
+        kind = np.dtype(order + _TYPES[each.datatype])
+        if each.offset + kind.itemsize > step:
+            raise ValueError(f"field {name} at offset {each.offset} is outside of point_step {step}")
+        types[name] = kind, each.offset
+    if missing := [name for name in "xyz" if name not in types or types[name][0].kind != "f"]:
+        raise ValueError(f"field {missing[0]} is missing or no float")
+    layout = np.dtype(
+        {
+            "names": list(types),
+            "formats": [kind for kind, _ in types.values()],
+            "offsets": [offset for _, offset in types.values()],
+            "itemsize": step,
+        }
+    )
+    rows = np.frombuffer(data, np.uint8, height * row_bytes).reshape(height, row_bytes)[:, : width * step]
+    values = np.ascontiguousarray(rows).reshape(-1).view(layout)
+    points: FloatArray = np.stack([values[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    name = next((name for name in _TIMES if name in types), None)
+    if name is None:
+        return points, None
+    return points, values[name].astype(np.float64 if types[name][0].kind == "f" else np.int64)
+
+
+def _seconds(times: Any, stamp: float) -> FloatArray:
+    """Times of points after ``stamp``, from times of any usual unit and beginning; empty if they say nothing."""
+    if not len(times) or not np.isfinite(times).all():
+        return np.empty(0)
+    first = times.min()
+    after = (times - first).astype(np.float64)
+    for unit_s in _UNITS_S:
+        if _SHORTEST_CLOUD_S <= float(after.max()) * unit_s <= _LONGEST_CLOUD_S:
+            break
+    else:
+        return np.empty(0)
+    begin_s = min(float(first) * unit_s, float(first) * unit_s - stamp, key=abs)
+    if abs(begin_s) > _NEAR_STAMP_S:
+        begin_s = 0.0  # by another clock: the stamp is that of the first point
+    seconds: FloatArray = begin_s + after * unit_s
+    return seconds
+
+
+def _depth_points(content: Any, calibration: Calibration | None) -> FloatArray:
+    width, height, step = content.width, content.height, content.step
+    if content.encoding not in _DEPTHS:
+        raise ValueError(f"the encoding '{content.encoding}' is not that of a depth image, 16UC1 or 32FC1")
+    if calibration is None:
+        raise ValueError("no calibration (camera_info) of the depth image")
+    kind, unit_m = _DEPTHS[content.encoding]
+    pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * pixel.itemsize):
+        raise ValueError(f"width {width}, height {height} and step {step} are those of no depth image")
+    if len(content.data) != step * height:
+        raise ValueError("the pixels do not fill the image")
+    rows = np.frombuffer(content.data, np.uint8).reshape(height, step)[:, : width * pixel.itemsize]
+    depth_m = np.ascontiguousarray(rows).view(pixel).astype(np.float64) * unit_m
+    fx, fy = calibration.fx * width / calibration.width, calibration.fy * height / calibration.height
+    cx, cy = calibration.cx * width / calibration.width, calibration.cy * height / calibration.height
+    return depth_points(depth_m, fx, fy, cx, cy)

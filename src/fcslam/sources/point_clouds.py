@@ -1,0 +1,334 @@
+"""Turns the points of a 3D LiDAR or a depth camera into the ranges of a 2D scan.
+
+The points in a band of heights above the floor count. The nearest surface in each direction gives its range. The floor
+is a plane that is fitted to each cloud, so a robot that pitches or a sensor that leans sees no floor in the band.
+
+A scanner that turns measures its directions one after the other. The directions of a scan then begin where the turn
+begins, so that their times are linear; a return that was not measured when its direction was is left out.
+"""
+
+from math import cos, pi, radians, tau
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.records import Beams, FloatArray, Ranges, Sweep
+from fcslam.sources.pose import Pose
+from fcslam.sources.returns import is_apart
+
+DIRECTIONS: Final = 720
+"""In a full turn."""
+_SPACING_RAD: Final = tau / DIRECTIONS
+FARTHEST_M: Final = 100.0
+"""Farther returns are left out."""
+SAME_SURFACE_M: Final = 0.05
+"""Returns of a direction that are this much farther than the nearest one are of the same surface."""
+LARGEST_GAP: Final = 3
+"""Directions between two returns that may be neighbours on a surface."""
+GAP_M, GAP_PER_SPACING = 0.15, 3.0
+"""Such returns are on one surface if they are closer than this, or than this many spacings of their beams."""
+
+FLOOR_ERROR_M: Final = 0.3
+"""The floor is at most this far from where the mounting says."""
+FLOOR_TILT_RAD: Final = radians(12.0)
+"""The same for its inclination."""
+FLOOR_REACH_M: Final = 12.0
+"""The floor is fitted to points up to this distance."""
+FLOOR_NOISE_M: Final = 0.05
+_FLOOR_POINTS, _FLOOR_SAMPLES = 1500, 200
+"""Most points that a floor is sought in, and planes through three of them that are tried."""
+_FEWEST_ON_FLOOR = 30
+"""Least number of points that are on a floor, less those below it."""
+_GOOD_MOUNTING = 0.8
+"""A floor by the mounting that has this share of the points of the best one is kept, without the noise of a fit."""
+_FITS = 2
+_LEAST_EXTENT_M = 0.15
+"""Least standard deviation of the points of a floor in every direction."""
+
+LARGEST_BODY_M: Final = 1.5
+"""Farther returns are not of the robot."""
+_FEWEST_PLACES, _MOST_PLACES = 20, 200
+_STEADY = 0.95
+"""Share of the places at which a return of the robot has the same range."""
+
+_SLOTS = 90
+"""Parts of a turn in time whose directions show how the scanner turns."""
+_SHARPEST = 0.8
+"""Least length of the mean direction of the points in such a part."""
+_STRAY_RAD = 0.15
+"""Largest deviation of a direction from a turn of constant speed."""
+_SHORTEST_TURN_RAD = 0.5
+
+
+class CloudBand(NamedTuple):
+    """Which points of a cloud count."""
+
+    low_m: float = 0.1
+    """Least height above the floor."""
+    high_m: float = 0.6
+    body_radius_m: float = 0.4
+    """Points that are nearer to the origin of ``base`` are of the robot itself."""
+
+
+class PointCloud(NamedTuple):
+    """The returns of one message."""
+
+    points: FloatArray
+    """Shape (N, 3), metres, finite, in the frame of the sensor."""
+    times_s: FloatArray
+    """Shape (N,): time of each return after the stamp; shape (0,): not known."""
+
+
+class CloudMounting(NamedTuple):
+    """Where the sensor is in ``base``."""
+
+    rotation: FloatArray
+    """Shape (3, 3)."""
+    position_m: FloatArray
+    """Shape (3,)."""
+    heading_rad: float
+    """Heading of the level frame in which the scan is."""
+    is_height_known: bool = True
+
+
+class CloudScan(NamedTuple):
+    """The ranges in the level frame of the sensor."""
+
+    beams: Beams
+    ranges_m: Ranges
+    """Shape (DIRECTIONS,); NaN: nothing measured in the band."""
+    offset_s: float
+    """Stamp of the scan after that of the message."""
+    sweep: Sweep | None
+
+
+class Floor(NamedTuple):
+    """The plane ``normal @ p = distance_m``, with ``normal`` up."""
+
+    normal: FloatArray
+    distance_m: float
+
+
+def scan_of_cloud(cloud: PointCloud, mounting: CloudMounting, band: CloudBand) -> CloudScan:
+    """The nearest returns of a cloud in a band of heights.
+
+    Raises:
+        ValueError: the height of the sensor is not known, and no floor is seen.
+    """
+    in_base = cloud.points @ mounting.rotation.T + mounting.position_m
+    outside = np.hypot(in_base[:, 0], in_base[:, 1]) > band.body_radius_m
+    floor = floor_in(in_base[outside], mounting)
+    if floor is None and not mounting.is_height_known:
+        raise ValueError("no floor is seen, so the height of the sensor is not known; publish its pose in tf")
+    floor = floor or Floor(np.array([0.0, 0.0, 1.0]), 0.0)
+    heights_m = in_base @ floor.normal - floor.distance_m
+    xy = ((in_base - mounting.position_m) @ _levelling(floor.normal, mounting.heading_rad).T)[:, :2]
+    turn = _turn(xy, cloud.times_s)
+    kept = (heights_m > band.low_m) & (heights_m < band.high_m) & outside
+    kept &= np.hypot(xy[:, 0], xy[:, 1]) < FARTHEST_M
+    first, sweep, offset_s = -DIRECTIONS // 2, None, 0.0
+    angles = np.arctan2(xy[kept, 1], xy[kept, 0])
+    if turn is None:
+        index = np.rint(angles / _SPACING_RAD).astype(np.int64) - first
+        index[index == DIRECTIONS] = 0
+        offset_s = float(cloud.times_s.mean()) if len(cloud.times_s) else 0.0
+    else:
+        first, sweep = turn.directions()
+        expected = turn.angle_rad + turn.rate_rad_s * cloud.times_s[kept]
+        stray = np.remainder(angles - expected + pi, tau) - pi
+        index = np.rint((expected + stray) / _SPACING_RAD).astype(np.int64) - first
+        index[np.abs(stray) > _STRAY_RAD] = -1
+    ranges_m = _ranges(xy[kept], index, first)
+    first = (first + DIRECTIONS // 2) % DIRECTIONS - DIRECTIONS // 2
+    return CloudScan(Beams(DIRECTIONS, first * _SPACING_RAD, _SPACING_RAD), ranges_m, offset_s, sweep)
+
+
+def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+    """The points of a depth image in the optical frame of its camera (z forward, y down), shape (N, 3).
+
+    Pixels without a finite depth above 0 are left out, and so are rows closer together than a scan needs.
+    """
+    rows = np.arange(0, depth_m.shape[0], max(1, int(fy * _SPACING_RAD)))
+    columns = np.arange(depth_m.shape[1])
+    z = depth_m[rows]
+    x, y = (columns - cx) / fx * z, (rows[:, None] - cy) / fy * z
+    points: FloatArray = np.stack((x, y, z), axis=-1)[np.isfinite(z) & (z > 0.0)]
+    return points
+
+
+def floor_in(points: FloatArray, mounting: CloudMounting) -> Floor | None:
+    """The floor among the ``points`` in ``base``; None if none is seen, or if it is where the mounting has it."""
+    offset = points - mounting.position_m
+    distances_m = np.hypot(offset[:, 0], offset[:, 1])
+    slope = np.tan(FLOOR_TILT_RAD)
+    if mounting.is_height_known:
+        near = np.abs(points[:, 2]) < FLOOR_ERROR_M + slope * distances_m
+    else:
+        near = offset[:, 2] < slope * distances_m
+    near &= distances_m < FLOOR_REACH_M
+    chosen = np.flatnonzero(near)
+    chosen = chosen[:: 1 + len(chosen) // _FLOOR_POINTS]
+    lowest_first = np.argsort(offset[chosen, 2] / np.maximum(distances_m[chosen], 1e-3), kind="stable")
+    able = points[chosen[lowest_first]]
+    floor = _lowest_plane(able, mounting.is_height_known)
+    for _ in range(_FITS):
+        floor = floor and _fitted(floor, able)
+    if floor is None or floor.normal[2] < cos(FLOOR_TILT_RAD):
+        return None
+    height_m = float(floor.normal @ mounting.position_m) - floor.distance_m
+    is_off = mounting.is_height_known and abs(height_m - mounting.position_m[2]) > FLOOR_ERROR_M
+    return None if is_off or height_m < 0.0 else floor
+
+
+def _lowest_plane(points: FloatArray, is_height_known: bool) -> Floor | None:
+    """The plane with most points, less those below it (RANSAC); None if that of the mounting is nearly as good.
+
+    It goes through three of the first ``points``, the lowest as seen from the sensor.
+    """
+    if len(points) < _FEWEST_ON_FLOOR:
+        return None
+    triples = np.random.default_rng(0).integers(len(points) // 3, size=(_FLOOR_SAMPLES, 3))
+    corners = points[triples]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    level = np.abs(normals[:, 2]) > cos(FLOOR_TILT_RAD) * np.maximum(lengths, 1e-6)
+    normals = np.vstack(([0.0, 0.0, 1.0], normals[level] / normals[level, 2:]))
+    distances_m = np.append(0.0, np.sum(normals[1:] * corners[level, 0], axis=1))
+    heights_m = normals @ np.ascontiguousarray(points.T) - distances_m[:, None]
+    scores = np.sum(heights_m < FLOOR_NOISE_M, axis=1) - 2 * np.sum(heights_m < -FLOOR_NOISE_M, axis=1)
+    best = int(np.argmax(scores))
+    is_of_mounting = is_height_known and scores[0] > _GOOD_MOUNTING * scores[best]
+    if scores[best] < _FEWEST_ON_FLOOR or is_of_mounting:
+        return None
+    return Floor(normals[best], float(distances_m[best]))
+
+
+def _fitted(floor: Floor, points: FloatArray) -> Floor | None:
+    """The plane through the points of a floor, by least squares; None if they are few or on a line."""
+    own = points[np.abs(points @ floor.normal - floor.distance_m) < FLOOR_NOISE_M]
+    if len(own) < _FEWEST_ON_FLOOR:
+        return None
+    middle = own.mean(axis=0)
+    variances, axes = np.linalg.eigh((own - middle).T @ (own - middle) / len(own))
+    if variances[1] < _LEAST_EXTENT_M**2:
+        return None
+    normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
+    return Floor(normal, float(normal @ middle))
+
+
+class BodySample:
+    """Finds the robot in its scans: returns that stay where they are while the robot drives and turns."""
+
+    def __init__(self) -> None:
+        self._places: list[tuple[Pose, Ranges]] = []
+
+    def add(self, T_odom_base: Pose, beams: Beams, ranges_m: Ranges) -> None:
+        """Add a scan; only those at different places are kept."""
+        if len(self._places) < _MOST_PLACES and (not self._places or is_apart(self._places[-1][0], T_odom_base)):
+            first = round(beams.angle_min_rad / _SPACING_RAD)
+            self._places.append((T_odom_base, np.roll(ranges_m, first)))
+
+    def radius_m(self, T_base_laser: Pose) -> float:
+        """Distance of the farthest such return from the origin of ``base``; 0 without one."""
+        if len(self._places) < _FEWEST_PLACES:
+            return 0.0
+        headings = np.array([pose[2] for pose, _ in self._places])
+        if np.hypot(np.cos(headings).mean(), np.sin(headings).mean()) > _SHARPEST:
+            return 0.0
+        ranges_m = np.where(np.isfinite(ranges := np.stack([each for _, each in self._places])), ranges, FARTHEST_M)
+        middle_m = np.median(ranges_m, axis=0)
+        steady = np.mean(np.abs(ranges_m - middle_m) < SAME_SURFACE_M, axis=0) > _STEADY
+        body = np.flatnonzero(steady & (middle_m < LARGEST_BODY_M))
+        x, y, heading_rad = T_base_laser
+        angles = heading_rad + body * _SPACING_RAD
+        distances_m = np.hypot(x + middle_m[body] * np.cos(angles), y + middle_m[body] * np.sin(angles))
+        return float(distances_m.max(initial=0.0))
+
+
+def _levelling(normal: FloatArray, heading_rad: float) -> FloatArray:
+    """The rotation that takes ``normal`` to the vertical, and then a heading to the x axis, shape (3, 3)."""
+    x, y, z = normal
+    level = np.array([[1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), -x],
+                      [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), -y],
+                      [x, y, z]])  # fmt: skip
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    result: FloatArray = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ level
+    return result
+
+
+class _Turn(NamedTuple):
+    """A scanner looks along ``angle_rad + rate_rad_s * t`` at the time ``t`` after the stamp."""
+
+    angle_rad: float
+    rate_rad_s: float
+    begin_s: float
+    """When the turn begins."""
+
+    def directions(self) -> tuple[int, Sweep]:
+        """The first direction of the scan in spacings, and the times of the directions."""
+        begin = round((self.angle_rad + self.rate_rad_s * self.begin_s) / _SPACING_RAD)
+        first = begin if self.rate_rad_s > 0.0 else begin - DIRECTIONS + 1
+        ends = np.array([first, first + DIRECTIONS - 1]) * _SPACING_RAD
+        first_s, last_s = ((ends - self.angle_rad) / self.rate_rad_s).tolist()
+        return first, Sweep(first_s, last_s)
+
+
+def _turn(xy: FloatArray, times_s: FloatArray) -> _Turn | None:
+    """How the scanner turns; None if it measures its directions in another order, or all at once."""
+    if len(times_s) < _SLOTS or not times_s.max() > times_s.min():
+        return None
+    begin_s, end_s = float(times_s.min()), float(times_s.max())
+    slots = np.minimum(((times_s - begin_s) * (_SLOTS / (end_s - begin_s))).astype(np.int64), _SLOTS - 1)
+    unit = xy / np.maximum(np.hypot(xy[:, 0], xy[:, 1]), 1e-9)[:, None]
+    counts = np.bincount(slots, minlength=_SLOTS)
+    seen = counts > 0
+    x, y, times = (np.bincount(slots, each, _SLOTS)[seen] / counts[seen] for each in (unit[:, 0], unit[:, 1], times_s))
+    if np.mean(np.hypot(x, y) > _SHARPEST) < _SHARPEST or len(times) < 3:
+        return None
+    angles = np.unwrap(np.arctan2(y, x))
+    rate, angle = np.polyfit(times, angles, 1)
+    turned_rad = abs(rate) * (end_s - begin_s)
+    deviation_rad = float(np.sqrt(np.mean((angles - angle - rate * times) ** 2)))
+    if not _SHORTEST_TURN_RAD < turned_rad < 1.2 * tau or deviation_rad > _STRAY_RAD:
+        return None
+    return _Turn(float(angle), float(rate), begin_s)
+
+
+def _ranges(xy: FloatArray, index: NDArray[np.int64], first: int) -> Ranges:
+    """Range of the nearest surface along each direction, shape (DIRECTIONS,)."""
+    used = (index >= 0) & (index < DIRECTIONS)
+    xy, index = xy[used], index[used]
+    distances_m = np.hypot(xy[:, 0], xy[:, 1])
+    nearest_m = np.full(DIRECTIONS, np.inf)
+    np.minimum.at(nearest_m, index, distances_m)
+    same = distances_m < nearest_m[index] + SAME_SURFACE_M
+    counts = np.bincount(index[same], minlength=DIRECTIONS)
+    seen = np.flatnonzero(counts)
+    points = np.stack([np.bincount(index[same], axis, DIRECTIONS)[seen] / counts[seen] for axis in xy[same].T], axis=1)
+    ranges_m = np.full(DIRECTIONS, np.nan, np.float32)
+    ranges_m[seen] = np.hypot(points[:, 0], points[:, 1])
+    directions = (np.arange(DIRECTIONS) + first) * _SPACING_RAD
+    rays = np.stack((np.cos(directions), np.sin(directions)), axis=1)
+    if len(seen) < 2:
+        return ranges_m
+    # The returns on both sides of each direction: the range is where its ray meets the surface between them.
+    right_of = _cross(rays[seen], points) < 0.0  # a return clockwise of its direction
+    left = np.searchsorted(seen, np.arange(DIRECTIONS), side="left")
+    is_seen = counts > 0
+    left[is_seen] += right_of
+    inside = (left > 0) & (left < len(seen))
+    a, b = points[left[inside] - 1], points[left[inside]]
+    gap = seen[left[inside]] - seen[left[inside] - 1]
+    spacing_m = gap * _SPACING_RAD * np.minimum(np.hypot(a[:, 0], a[:, 1]), np.hypot(b[:, 0], b[:, 1]))
+    apart_m = np.hypot(*(b - a).T)
+    joined = (gap <= LARGEST_GAP) & (apart_m < np.maximum(GAP_M, GAP_PER_SPACING * spacing_m))
+    across = _cross(rays[inside], b - a)
+    joined &= across > 1e-9
+    ranges_m[np.flatnonzero(inside)[joined]] = (_cross(a, b) / np.where(joined, across, 1.0))[joined]
+    return ranges_m
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    result: FloatArray = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return result

@@ -1,0 +1,220 @@
+"""Bags whose scans come as point clouds, depth images or sectors, or with a range_max of their own."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.geometry import se2
+from fcslam.records import LaserScan
+from fcslam.sources import BagOptions, open_source
+from fcslam.sources.inspection import inspect
+from tests.sources.bag_messages import ROS2, odom, quaternion, save, scan, tf
+from tests.sources.clouds import (
+    IMAGE,
+    INFO,
+    OUSTER,
+    REALSENSE,
+    VELODYNE,
+    Measured,
+    cloud,
+    depth_image,
+    header,
+    plan_ranges,
+    rotation,
+    said,
+    spinning,
+)
+
+START = 1_700_000_000.0
+LIDAR, YAW = (0.1, 0.05, 0.4), 0.3
+
+
+def pose_at(times):
+    """A circle in the room that the robot drives, shape (N, 3)."""
+    turn = 0.8 * np.asarray(times)
+    return np.stack((0.5 * np.sin(turn), 1.5 - 0.5 * np.cos(turn), turn), axis=1)
+
+
+@cache
+def seen(stamp):
+    """The cloud of the turn that begins ``stamp`` seconds after the start."""
+    R = rotation(yaw=YAW)
+    return spinning(lambda times: pose_at(stamp + times), LIDAR, R, rings=6, columns=480)
+
+
+def drive(seconds=2.0, every_s=0.1, layout=VELODYNE, body=None, ros1=False):
+    """Odometry at 50 Hz and clouds of a turning scanner at 10 Hz; ``body``: points that it always sees, too."""
+    messages = [tf(START, "base_link", "lidar", LIDAR, quaternion(YAW), topic="/tf_static")]
+    for t in np.arange(0.0, seconds + 0.5, 0.02):
+        messages.append(odom(START + t, pose_at([t])[0], bag_time=START + t))
+    for t in np.arange(0.1, seconds, every_s).round(3).tolist():
+        measured = seen(t)
+        if body is not None:
+            points, times = np.vstack((measured.points, body)), np.append(measured.times, np.zeros(len(body)))
+            measured = Measured(points, times)
+        messages.append(said("/points", START + t, cloud(START + t, measured, layout, ros1=ros1), ros1=ros1))
+    return messages
+
+
+def misfit_m(records):
+    """Median distance of the returns from the walls, each placed where the robot was at its time."""
+    errors = []
+    for record in (each for each in records if isinstance(each, LaserScan)):
+        beams, sweep = record.laser.beams, record.sweep
+        times = np.linspace(sweep.first_s, sweep.last_s, beams.beam_count)
+        angles = beams.angle_min_rad + beams.angle_increment_rad * np.arange(beams.beam_count)
+        poses = np.array(
+            [se2.compose(pose, np.array(record.laser.T_base_laser)) for pose in pose_at(record.stamp - START + times)]
+        )
+        errors.append(record.ranges_m - plan_ranges(poses[:, 0], poses[:, 1], poses[:, 2] + angles))
+    return np.nanmedian(np.abs(errors))
+
+
+@pytest.mark.parametrize(("suffix", "layout"), [(".mcap", VELODYNE), (".db3", OUSTER), (".bag", VELODYNE)])
+def test_a_cloud_is_the_scan_of_a_laser_in_its_place(tmp_path, suffix, layout):
+    path = save(tmp_path / f"drive{suffix}", drive(ros1=suffix == ".bag", layout=layout))
+    source = open_source(path)
+    records = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert len(records) == 19
+    assert source.survey().lasers[0].T_base_laser == pytest.approx((0.1, 0.05, 0.3))
+    assert all(record.sweep.velocity[2] == pytest.approx(0.8, abs=0.01) for record in records)
+    assert misfit_m(records) < 0.01
+
+
+def test_laser_scans_are_preferred_unless_the_cloud_is_named(tmp_path):
+    ranges = np.full(90, 3.0)
+    scans = [scan(START + t, ranges, angle_increment=math.pi / 90) for t in np.arange(0.1, 2.0, 0.1)]
+    laser = tf(START, "base_link", "laser", topic="/tf_static")
+    path = save(tmp_path / "both.mcap", [*drive(), laser, *scans])
+    chosen, named = inspect(path), inspect(path, BagOptions(scan_topics=("/points",)))
+    assert chosen.lasers[0].model.beam_count == 90
+    assert any("reads laser scans from /scan, not from /points" in note for note in chosen.notes)
+    assert named.lasers[0].model.beam_count == 720
+    assert any("the scans of /points are its nearest points from 0.1 m to 0.6 m" in note for note in named.notes)
+
+
+def test_a_cloud_without_a_mounting_is_refused_in_one_line(tmp_path):
+    path = save(tmp_path / "bare.mcap", [each for each in drive() if each.topic != "/tf_static"])
+    with pytest.raises(SourceError, match=r"no transform from 'base_link' to 'lidar'.*--laser-pose") as refused:
+        open_source(path).survey()
+    assert "\n" not in str(refused.value)
+    by_hand = open_source(path, BagOptions(laser_poses=((0.1, 0.05, 0.3),)))
+    assert misfit_m(by_hand.records()) < 0.01
+
+
+def test_invalid_clouds_are_refused_by_their_field(tmp_path):
+    messages = [each for each in drive() if each.topic != "/points"]
+    measured = spinning(pose_at, rings=2, columns=90)
+    broken = cloud(START, measured, VELODYNE, point_step=9)
+    messages += [said("/points", START + t, broken) for t in (0.1, 0.2, 0.3)]
+    with pytest.raises(SourceError, match=r"none of the 3 scans in /points can be read \(field .* point_step 9\)"):
+        open_source(save(tmp_path / "broken.mcap", messages)).survey()
+
+
+def test_a_body_that_is_wider_than_usual_is_left_out_with_a_note(tmp_path):
+    angles = np.linspace(-2.5, 2.5, 400)
+    deck = np.stack((0.7 * np.cos(angles), 0.7 * np.sin(angles), np.full(400, -0.1)), axis=1)
+    source = open_source(save(tmp_path / "deck.mcap", drive(8.6, 0.4, REALSENSE, deck)))
+    assert any("from the base are of the robot and left out" in note for note in source.survey().notes)
+    nearest = min(np.nanmin(each.ranges_m) for each in source.records() if isinstance(each, LaserScan))
+    assert nearest > 0.75
+
+
+def test_depth_images_are_scans(tmp_path):
+    # z forward, x right, y down: a turn of -90 degrees about z after one of -90 degrees about x
+    mounting = tf(
+        START, "base_link", "depth_optical_frame", (0.0, 0.0, 0.3), (-0.5, 0.5, -0.5, 0.5), topic="/tf_static"
+    )
+    messages = [mounting, *(odom(START + t, (0.0, 0.0, 0.0), bag_time=START + t) for t in np.arange(0.0, 1.5, 0.1))]
+    image, info = depth_image(START, "16UC1")
+    for t in np.arange(0.2, 1.0, 0.1):
+        image.header = info.header = header(ROS2, START + t, "depth_optical_frame")
+        messages.append(said("/camera/depth/image_rect_raw", START + t, image, IMAGE))
+        messages.append(said("/camera/depth/camera_info", START + t, info, INFO))
+    found = inspect(save(tmp_path / "depth.mcap", messages))
+    assert found.problem is None
+    assert (found.scans, found.camera) == (8, None)
+    record = next(each for each in open_source(tmp_path / "depth.mcap").records() if isinstance(each, LaserScan))
+    beams, heading = record.laser.beams, record.laser.T_base_laser[2]
+    angles = beams.angle_min_rad + beams.angle_increment_rad * np.arange(beams.beam_count) + heading
+    errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, angles))
+    assert np.nanmedian(errors) < 0.005
+    assert np.isfinite(errors).mean() == pytest.approx(2 * math.atan(80 / 95) / math.tau, abs=0.02)
+
+
+BEAMS, TURN_S = 180, 0.2
+SPACING_RAD = math.tau / BEAMS
+
+
+def sectors(count, clockwise=False, skipped=(), turns=12):
+    """Sectors of turns of ``BEAMS`` beams, each measured at its own time while the robot drives."""
+    messages = [tf(START, "base_link", "laser", (0.0, 0.0, 0.3), topic="/tf_static")]
+    messages += [
+        odom(START + t, pose_at([t])[0], bag_time=START + t) for t in np.arange(0.0, turns * TURN_S + 0.5, 0.02)
+    ]
+    size, sign = BEAMS // count, -1.0 if clockwise else 1.0
+    for number in range(turns * count):
+        if number in skipped:
+            continue
+        first_s = number * TURN_S / count
+        times = first_s + np.arange(size) * TURN_S / BEAMS
+        angles = sign * (-math.pi + (number % count * size + np.arange(size)) * SPACING_RAD)
+        poses = pose_at(times)
+        ranges = plan_ranges(poses[:, 0], poses[:, 1], poses[:, 2] + angles)
+        message = scan(
+            START + first_s, ranges, angle_min=angles[0], angle_increment=sign * SPACING_RAD,
+            time_increment=TURN_S / BEAMS, bag_time=START + first_s + TURN_S / count,
+        )  # fmt: skip
+        messages.append(message)
+    return messages
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("count", [2, 12])
+def test_sectors_of_a_turn_are_one_scan(tmp_path, count, clockwise):
+    source = open_source(save(tmp_path / "sectors.mcap", sectors(count, clockwise)))
+    survey = source.survey()
+    assert any("/scan are sectors of a turn" in note for note in survey.notes)
+    records = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert len(records) == 12
+    assert all(np.isfinite(record.ranges_m).all() for record in records)
+    assert [record.stamp - START for record in records] == pytest.approx([TURN_S * k for k in range(12)], abs=1e-5)
+    assert {round(record.sweep.duration_s, 5) for record in records} == {round(TURN_S * (1 - 1 / BEAMS), 5)}
+    assert misfit_m(records) < 1e-4
+
+
+def test_a_sector_that_is_missing_is_invalid(tmp_path):
+    source = open_source(save(tmp_path / "lost.mcap", sectors(12, skipped=(40, 59))))
+    records = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert len(records) == 12
+    assert sorted(np.isnan(record.ranges_m).sum() for record in records) == [0] * 10 + [15, 15]
+    assert misfit_m(records) < 1e-4
+
+
+def test_scans_of_half_a_turn_are_no_sectors(tmp_path):
+    messages = [tf(START, "base_link", "laser", topic="/tf_static")]
+    for k in range(30):
+        messages += [odom(START + 0.1 * k, (0.05 * k, 0.0, 0.0)), scan(START + 0.1 * k, np.linspace(1, 2, 180),
+                     angle_increment=math.pi / 180)]  # fmt: skip
+    source = open_source(save(tmp_path / "half.mcap", messages))
+    assert sum(isinstance(record, LaserScan) for record in source.records()) == 30
+
+
+def test_each_scan_has_its_own_limits(tmp_path):
+    messages = [tf(START, "base_link", "laser", topic="/tf_static")]
+    for k in range(30):
+        far = 2.0 if k < 20 else 12.0
+        ranges = np.array([0.3, 1.0, 1.9, 5.0, 11.0, 12.0, 1.0, 1.0])
+        messages += [
+            odom(START + 0.2 * k, (0.1 * k, 0.0, 0.0)),
+            scan(START + 0.2 * k, ranges, range_max=far, range_min=0.1 if k < 20 else 0.5),
+        ]
+    source = open_source(save(tmp_path / "limits.mcap", messages))
+    records = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert source.survey().lasers[0].max_range_m == 12.0
+    inf, nan = np.inf, np.nan
+    assert np.array_equal(records[0].ranges_m[:6], np.float32([0.3, 1.0, 1.9, inf, inf, inf]))
+    assert np.array_equal(records[-1].ranges_m[:6], np.float32([nan, 1.0, 1.9, 5.0, 11.0, inf]), equal_nan=True)
