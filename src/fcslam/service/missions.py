@@ -111,7 +111,7 @@ def check_words(name: str, settings: FleetConfig) -> None:
 
 
 def _check_file(folder: MissionFolder) -> None:
-    """Refuse to begin a mission anew because its file is gone.
+    """Refuse a mission whose file is gone: no new one takes its place.
 
     Raises:
         StoreError: it is gone or empty.
