@@ -122,6 +122,14 @@ def test_a_cut_mission_is_refused(missions, tmp_path, share):
     assert_refused(path, "damaged or cut off .*; put its backup in its place")
 
 
+def test_a_mission_that_lost_its_tables_is_not_a_new_one(missions, tmp_path):
+    path, whole = tmp_path / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
+    path.write_bytes(whole[:103] + bytes(2) + whole[105:])  # the number of rows in the schema's page
+    damaged = path.read_bytes()
+    assert_refused(path, "damaged or cut off .*; put its backup in its place")
+    assert path.read_bytes() == damaged
+
+
 def test_a_text_that_cannot_be_decoded_is_damage(missions, tmp_path):
     path, whole = tmp_path / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
     path.write_bytes(whole.replace(b"boss", b"b\xffss"))

@@ -78,6 +78,7 @@ class Database:
         try:
             with self.transaction() as connection:
                 if not _shape(connection)[1]:
+                    _check_content(connection)  # its tables may be lost
                     _make(connection, schema, version)
             with translate_errors(path):
                 _check(path, self._reading, schema, version)
