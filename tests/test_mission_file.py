@@ -200,7 +200,7 @@ def test_reading_is_the_inverse_of_writing(begun, tmp_path):
         assert again.tracks[name].T_keyscan_base.tobytes() == track.T_keyscan_base.tobytes()
 
 
-GOLDEN = Path(__file__).parent / "golden" / "mission_6.fcslam"
+GOLDEN = Path(__file__).parent / "golden" / "mission_7.fcslam"
 
 
 def test_the_golden_mission_means_what_it_says():
@@ -221,13 +221,13 @@ def test_a_mission_is_mapped_again_with_its_edits():
     assert b"Room 1" in run.map_files["map_areas.geojson"]
 
 
-@pytest.mark.parametrize("version", [5, 7])
+@pytest.mark.parametrize("version", [6, 8])
 def test_a_mission_file_of_another_version_is_refused(tmp_path, version):
     other = tmp_path / "mission.fcslam"
     shutil.copy(GOLDEN, other)
     with closing(sqlite3.connect(other)) as connection:
         connection.execute(f"PRAGMA user_version={version}")
-    with pytest.raises(SourceError, match=f"a file of version {version}; this fcslam reads version 6"):
+    with pytest.raises(SourceError, match=f"a file of version {version}; this fcslam reads version 7"):
         read_mission(other)
 
 

@@ -17,8 +17,7 @@ from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, froze
 from fcslam.service.mission_store import EDITS, FACTS, PACKETS, MissionStore, StoredPacket, check_mission
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import Registry
-from fcslam.storage.database import SealedConnection
-from fcslam.storage.seals import seal
+from fcslam.storage.database import SealedConnection, seal
 from fcslam.wire.messages import PacketKind
 
 NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))

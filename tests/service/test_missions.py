@@ -52,6 +52,37 @@ def test_a_mission_that_cannot_be_opened_leaves_no_worker_and_the_other_one_open
     assert [worker.stopped for worker in workers] == [True, True, False]
 
 
+def test_a_damaged_mission_is_refused_and_the_other_one_stays_open(service):
+    missions, workers = service
+    missions.create("next")
+    missions.open("mission")
+    path = missions.folder("next").store
+    content = path.read_bytes()
+    path.write_bytes(content[:-1000] + bytes(1000))
+    for use in (missions.open, lambda name: missions.export(name, missions.root / "backup.sqlite")):
+        with pytest.raises(StoreError, match=r"next/mission\.sqlite: damaged .*; put its backup in its place"):
+            use("next")
+        assert missions.open_mission.folder.name == "mission"
+    assert [worker.stopped for worker in workers] == [True, True, False]
+    path.write_bytes(content)
+    missions.open("next")
+    assert missions.open_mission.folder.name == "next"
+
+
+@pytest.mark.parametrize("harm", ["gone", "empty"])
+def test_a_mission_without_its_file_is_not_a_new_one(service, harm):
+    missions, _ = service
+    missions.create("next")
+    folder = missions.folder("mission")
+    folder.worker_lock.touch()
+    folder.store.unlink()
+    if harm == "empty":
+        folder.store.touch()
+    with pytest.raises(StoreError, match="is gone or empty; put its backup in its place"):
+        missions._opened("mission")
+    assert missions.open_mission.folder.name == "next"
+
+
 @pytest.mark.parametrize("kind", ["missing", "pipe", "folder"])
 def test_a_mission_whose_vocabulary_is_no_file_is_refused_by_name(tmp_path, kind):
     path = tmp_path / "building.words"

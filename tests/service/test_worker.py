@@ -545,19 +545,6 @@ def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, tmp
     assert cloud.store.applied() == len(packets)
 
 
-def test_an_edit_that_a_repaired_mission_lacks_holds_up_nothing(cloud, monkeypatch):
-    cloud.put(two_robots())
-    for change in (Veto("a", "b", (1.0, 2.0)), Removal("b")):
-        cloud.store.edit(change, "boss", 0.0)
-    every = cloud.store.edits
-    monkeypatch.setattr(cloud.store, "edits", lambda after=0: [e for e in every(after) if e.number != 1])
-    steps = sum(cloud.worker.step() for _ in range(1000))
-    assert steps < 1000, "it comes to an end"
-    assert set(cloud.finalize().trajectories) == {"a"}
-    cloud.restart()
-    assert set(cloud.finalize().trajectories) == {"a"}
-
-
 def test_a_result_waits_for_the_packets_that_were_there_when_it_was_asked_for(cloud):
     packets = two_robots()
     cloud.put(packets)

@@ -7,7 +7,6 @@ the digests it checks that a recording that is read again produces the same pack
 """
 
 import hashlib
-import logging
 import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,14 +17,10 @@ from typing import Any, NamedTuple
 from fcslam.errors import PacketError, StateError, StoreError
 from fcslam.records import Channel, DetectorFile, Place, WordPlace
 from fcslam.storage.database import Database
-from fcslam.storage.log_repair import mend_log
-from fcslam.storage.recovery import mend_pages
 from fcslam.wire.batches import LENGTH
 from fcslam.wire.limits import MAXIMUM_EPOCH
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, readdress
-
-_log = logging.getLogger(__name__)
 
 PLACES_SHARE = 0.75
 """Share of the outbox up to which places are accepted; the rest is for packets that the map cannot do without."""
@@ -82,8 +77,8 @@ class Outbox:
         """Open the file at ``path``, or create it.
 
         Raises:
-            StateError: the file belongs to another robot, is open in another process, is not an outbox, cannot be
-                written, or holds a damaged packet that waits.
+            StateError: the file belongs to another robot, is open in another process, is not an outbox, is damaged, or
+                cannot be written.
         """
         self._path = path
         self._limit_bytes = limit_bytes
@@ -92,7 +87,6 @@ class Outbox:
         self._first = -1
         """Epoch of the first part of this start."""
         with self._state_errors():
-            self._mend()
             self._database = Database(path, _SCHEMA, _VERSION, exclusive=True)
         try:
             self.agent = self._agent_of(robot)
@@ -105,36 +99,18 @@ class Outbox:
             self.close()
             raise
 
-    def _mend(self) -> None:
-        try:
-            kept = mend_pages(self._path) or mend_log(self._path)
-        except StoreError as error:
-            raise StateError(f"{error}; give another --state, or a copy of this one") from error
-        if kept is not None:
-            _log.warning("%s: a damaged byte is mended; the file as it was found is in %s", self._path, kept)
-
     def _check_waiting(self) -> None:
-        """Compare the waiting packets with their digests, and mend those in which one bit is wrong.
-
-        After a kill, the file has no seals of its pages.
-        """
+        """Compare the waiting packets with their digests."""
         question = (
             "SELECT epoch, part, ordinal, sequence, digest, data FROM packets JOIN sessions USING (epoch) "
             f"WHERE {_IS_WAITING} ORDER BY epoch, sequence"
         )
         for epoch, part, ordinal, sequence, digest, data in self._rows(question):
-            if _is_whole(data, part, ordinal, digest):
-                continue
-            mended = next((tried for tried in _bit_flips(data) if _is_whole(tried, part, ordinal, digest)), None)
-            if mended is None:
+            if not _is_whole(data, part, ordinal, digest):
                 raise StateError(
                     f"{self._path}: packet {sequence} of epoch {epoch} is damaged; the cloud has what was sent before "
                     "it, and what waits after it needs it: give another --state"
                 )
-            with self._transaction() as connection:
-                which = "WHERE epoch = ? AND ordinal = ?"
-                connection.execute(f"UPDATE packets SET data = ? {which}", (mended, epoch, ordinal))
-            _log.warning("%s: a bit of packet %d of epoch %d was damaged, and is mended", self._path, sequence, epoch)
 
     def close(self) -> None:
         """Close the file; waiting packets stay in it."""
@@ -387,9 +363,9 @@ class Outbox:
         except StoreError as error:
             if error.__cause__ is None:
                 raise StateError(f"{self._path}: is of another version of fcslam; give another --state") from error
-            reason = str(error.__cause__)
+            reason = " ".join(str(error.__cause__).split())
             reason = "another process runs on it" if reason == "database is locked" else reason
-            raise StateError(f"{self._path}: cannot be used: {reason}") from error
+            raise StateError(f"{self._path}: cannot be used: {reason}; give another --state") from error
 
 
 def _digest(data: bytes) -> bytes:
@@ -402,16 +378,6 @@ def _is_whole(data: bytes, part: int, ordinal: int, digest: bytes) -> bool:
         return _digest(readdress(data, part, ordinal)) == digest
     except PacketError:
         return False
-
-
-def _bit_flips(data: bytes) -> Iterator[bytes]:
-    """All that differ from ``data`` by one bit."""
-    tried = bytearray(data)
-    for at in range(len(tried)):
-        for bit in range(8):
-            tried[at] ^= 1 << bit
-            yield bytes(tried)
-            tried[at] ^= 1 << bit
 
 
 def _insert(

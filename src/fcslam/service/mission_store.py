@@ -23,7 +23,6 @@ from fcslam.config import one_line
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
-from fcslam.storage.recovery import fault
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
@@ -33,11 +32,7 @@ APPLIED = "applied"
 """A fact: how many packets took effect."""
 CONFIG = "config"
 """A fact: the mission's configuration."""
-
-CONFIG_COPY = "config copy"
-"""A fact: the same again, because nothing else can tell it."""
-
-VERSION = 6
+VERSION = 7
 """Version of the schema and of the packets."""
 MOST_PACKETS = 2**53
 """No mission has as many."""
@@ -351,7 +346,6 @@ class MissionStore:
             stored = database.execute("SELECT value FROM facts WHERE name = ?", (CONFIG,)).fetchone()
             if stored is None:
                 _remember(database, CONFIG, text)
-                _remember(database, CONFIG_COPY, text)
         return config if stored is None else CloudConfig.model_validate_json(stored[0])
 
     def put_track(self, robot: str, epoch: int, track: Track) -> None:
@@ -423,9 +417,6 @@ def check_mission(path: Path) -> None:
         StoreError: it is not what ``MissionStore.export`` writes.
     """
     check_file(path, SCHEMA, VERSION)
-    found = fault(path, SCHEMA, VERSION)
-    if found is not None:
-        raise StoreError(f"{path}: {found}")
     with (
         translate_errors(path),
         closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as opened,

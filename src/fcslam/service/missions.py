@@ -1,7 +1,6 @@
 """The missions of one service, of which one is open."""
 
 import fcntl
-import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,6 @@ from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_recovery import recover_mission
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.supervisor import RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
@@ -26,8 +24,6 @@ FIRST = "mission"
 """Name of a new service's first mission."""
 IMPORT, EXPORT = ".import", ".export"
 """Prefixes of temporary folders of imported and exported missions."""
-
-_log = logging.getLogger(__name__)
 
 Launch = Callable[[MissionFolder], RunningWorker]
 """Starts the worker of a mission."""
@@ -115,22 +111,16 @@ def check_words(name: str, settings: FleetConfig) -> None:
 
 
 def _check_file(folder: MissionFolder) -> None:
-    """Recover a damaged file; refuse a mission whose file is gone.
+    """Refuse a mission whose file is gone: no new one takes its place.
 
     Raises:
-        StoreError: it is gone, or what determines the map is lost.
+        StoreError: it is gone or empty.
     """
-    has_begun = folder.worker_lock.exists()
-    if has_begun and not folder.store.exists():
+    if folder.worker_lock.exists() and not (folder.store.exists() and folder.store.stat().st_size):
         raise StoreError(
-            f"{folder.store}: the mission's file is gone; put a copy in its place, or move {folder.path} away to begin "
-            "a new mission"
+            f"{folder.store}: the mission's file is gone or empty; put its backup in its place, or move {folder.path} "
+            "away to begin a new mission"
         )
-    if not has_begun and folder.store.exists() and not folder.store.stat().st_size:
-        folder.store.unlink()  # the service was killed while it created the file
-    told = recover_mission(folder.store)
-    if told is not None:
-        _log.error("%s", told)
 
 
 class ServedMissions(Protocol):

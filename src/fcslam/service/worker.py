@@ -162,7 +162,7 @@ class Worker:
 
     @property
     def _newest_edit(self) -> int:
-        """Number of the last edit that was read; a repaired mission may lack some before it."""
+        """Number of the last edit that was read."""
         return self._edits[-1].number if self._edits else 0
 
     def _start_over(self) -> None:

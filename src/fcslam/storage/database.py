@@ -4,21 +4,21 @@ import os
 import sqlite3
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 from fcslam.errors import StoreError
 from fcslam.storage.group_commit import GroupCommit
 from fcslam.storage.row_store import Result, StoreTable
-from fcslam.storage.seals import PAGE_BYTES, seal, seal_pages, seals_file
 
 BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
 
 
 class SealedConnection(sqlite3.Connection):
-    """A connection to a database whose rows end with a seal (``storage.seals``)."""
+    """A connection to a database whose rows end with a ``seal``."""
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """Insert rows; ``replaces``: in place of those with the same key.
@@ -60,13 +60,12 @@ class Database:
                 transaction costs no wait for the disk.
 
         Raises:
-            StoreError: the file was made by something else, or cannot be used.
+            StoreError: the file is damaged, was made by something else, or cannot be used.
         """
         self._path = path
         self._lock, self._reading_lock = threading.Lock(), threading.Lock()
         self._group = GroupCommit(self.transaction)
         with translate_errors(path):
-            seals_file(path).unlink(missing_ok=True)  # they are of a file that nobody writes
             if exclusive:
                 pragmas = ("locking_mode=EXCLUSIVE", "journal_mode=WAL", "synchronous=NORMAL")
                 self._connection = self._reading = _connected(path, *pragmas, timeout_s=0.0)
@@ -76,23 +75,23 @@ class Database:
                 self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
                 # A commit takes as long as the disk does. A second connection lets readers see the state before it.
                 self._reading = _connected(path, "query_only=ON")
-        with self.transaction() as connection:
-            is_new = not shape(connection)[1]
-            if is_new:
-                _make(connection, schema, version)
-            _check_shape(path, connection, schema, version)
-        if is_new:
-            with translate_errors(path):  # a damaged log is repaired from the pages of the file
-                self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        try:
+            with self.transaction() as connection:
+                if not _shape(connection)[1]:
+                    _check_content(connection)  # its tables may be lost
+                    _make(connection, schema, version)
+            with translate_errors(path):
+                _check(path, self._reading, schema, version)
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
-        """Close the file, and seal its pages if no other process has it open."""
+        """Close the file."""
         with self._lock:
             self._connection.close()
         with self._reading_lock:
             self._reading.close()
-        with suppress(OSError):  # the seals of the rows are still there
-            seal_pages(self._path)
 
     @contextmanager
     def transaction(self) -> Iterator[SealedConnection]:
@@ -126,7 +125,7 @@ class Database:
         """Write a snapshot of the database as one new file, atomically.
 
         Raises:
-            StoreError: there is a file already, or it cannot be written.
+            StoreError: there is a file already, it cannot be written, or the database is damaged.
         """
         staging = path.with_name(f".{path.name}.partial")
         # A separate connection: in write-ahead mode a long read blocks no writer.
@@ -138,6 +137,8 @@ class Database:
             staging.unlink(missing_ok=True)
             try:
                 connection.execute("VACUUM INTO ?", (str(staging),))
+                with closing(sqlite3.connect(staging)) as written, translate_errors(self._path):
+                    _check_content(written)
                 os.link(staging, path)
             finally:
                 staging.unlink(missing_ok=True)
@@ -147,16 +148,23 @@ def check_file(path: Path, schema: str, version: int) -> None:
     """Refuse a file of unknown origin that ``Database`` did not create; it is not changed and none of its code runs.
 
     Raises:
-        StoreError: it is broken, or has other tables than those of ``schema``, or anything else.
+        StoreError: it is damaged, or has other tables than those of ``schema``, or anything else.
     """
     with (
         translate_errors(path),
         closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
     ):
         found.execute("PRAGMA trusted_schema=OFF")
-        _check_shape(path, found, schema, version)
-        if found.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
-            raise StoreError(f"{path}: broken")
+        _check(path, found, schema, version)
+
+
+def seal(*values: Any) -> bytes:
+    """Checksum of a row: a BLAKE2b hash of the table's name and the row's values."""
+    # SQLite stores -0.0 as 0.0.
+    plain = [value + 0.0 if isinstance(value, float) else value for value in values]
+    blobs = [value for value in plain if isinstance(value, bytes)]
+    sizes = [len(value) if isinstance(value, bytes) else value for value in plain]
+    return blake2b(b"".join((repr(sizes).encode(), *blobs)), digest_size=16).digest()
 
 
 def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> SealedConnection:
@@ -164,20 +172,40 @@ def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> SealedCo
     connection = sqlite3.connect(
         path, timeout=timeout_s, isolation_level=None, check_same_thread=False, factory=SealedConnection
     )
-    for pragma in ("trusted_schema=OFF", f"page_size={PAGE_BYTES}", *pragmas):
+    for pragma in ("trusted_schema=OFF", *pragmas):
         connection.execute(f"PRAGMA {pragma}")
     connection.create_function("seal", -1, seal, deterministic=True)
     return connection
 
 
-def _check_shape(path: Path, connection: sqlite3.Connection, schema: str, version: int) -> None:
-    """Refuse a database of another version, or with other tables than those of ``schema``, or anything else."""
-    found, parts = shape(connection)
-    if (found, parts) == expected_shape(schema, version):
-        return
-    if found not in (0, version):
-        raise StoreError(f"{path}: a file of version {found}; this fcslam reads version {version}")
-    raise StoreError(f"{path}: no file of this kind")
+def _check(path: Path, connection: sqlite3.Connection, schema: str, version: int) -> None:
+    """Refuse a database of another version, with other tables than those of ``schema`` or anything else, or damaged."""
+    with closing(sqlite3.connect(":memory:")) as new:
+        _make(new, schema, version)
+        expected = _shape(new)
+    found = _shape(connection)
+    if found[0] not in (0, version):
+        raise StoreError(f"{path}: a file of version {found[0]}; this fcslam reads version {version}")
+    if found != expected:
+        raise StoreError(f"{path}: no file of this kind, or its schema is damaged; put its backup in its place")
+    _check_content(connection)
+
+
+def _check_content(connection: sqlite3.Connection) -> None:
+    """Read all of a database.
+
+    Raises:
+        DatabaseError: it is damaged.
+    """
+    (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if found != "ok":
+        raise sqlite3.DatabaseError(found)
+    for (table,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchall():
+        rows = connection.execute(f"SELECT * FROM {table}")
+        if rows.description[-1][0] == "seal":
+            wrong = sum(row[-1] != seal(table, *row[:-1]) for row in rows)
+            if wrong:
+                raise sqlite3.DatabaseError(f"{wrong} rows of {table} have a wrong checksum")
 
 
 def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
@@ -186,17 +214,10 @@ def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
     connection.execute(f"PRAGMA user_version={version}")
 
 
-def shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
+def _shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
     """Version and schema."""
     parts = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchall()
     return connection.execute("PRAGMA user_version").fetchone()[0], parts
-
-
-def expected_shape(schema: str, version: int) -> tuple[int, list[tuple[Any, ...]]]:
-    """The ``shape`` of a new file."""
-    with closing(sqlite3.connect(":memory:")) as connection:
-        _make(connection, schema, version)
-        return shape(connection)
 
 
 @contextmanager
@@ -204,9 +225,16 @@ def translate_errors(path: Path) -> Iterator[None]:
     """Raise errors of the disk and of SQLite as a ``StoreError`` of one line."""
     try:
         yield
-    except UnicodeDecodeError as error:  # in the names of tables, which SQLite does not check
-        raise StoreError(f"{path}: broken") from error
-    except (OSError, sqlite3.DatabaseError) as error:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-            raise StoreError(f"{path}: damaged or cut off ({error}); use a copy of it") from error
-        raise StoreError(f"{path}: cannot be read or written ({error}); is the disk full?") from error
+    except (OSError, sqlite3.DatabaseError, UnicodeDecodeError) as error:
+        told = " ".join(str(error).split())
+        if _is_damage(error):
+            raise StoreError(f"{path}: damaged or cut off ({told}); put its backup in its place") from error
+        raise StoreError(f"{path}: cannot be read or written ({told}); is the disk full?") from error
+
+
+def _is_damage(error: Exception) -> bool:
+    if isinstance(error, OSError | sqlite3.ProgrammingError):
+        return False
+    # Without a code: ``_check_content`` found it, or a text cannot be decoded.
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    return code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
