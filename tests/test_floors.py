@@ -1,5 +1,6 @@
 """Floors: places of different floors are never compared, even if the floors look the same."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -76,7 +77,8 @@ def mapped(logs, tmp_path_factory):
     """Two robots of one floor, and the first of them again under another name on another floor, at once."""
     folder = tmp_path_factory.mktemp("floors")
     first, second = logs[:2]
-    recordings = {"a": first, "b": second, "c": first}
+    again = shutil.copy(first, folder / first.name)
+    recordings = {"a": first, "b": second, "c": again}
     fcslam.map_recordings(recordings, output=folder / "whole", floors={"a": "1", "b": "1", "c": "2"})
     return folder / "whole", recordings
 

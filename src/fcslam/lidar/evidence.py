@@ -34,9 +34,9 @@ CORRELATED = 10.0
 As points count fully in the matcher, odometry's information is raised instead."""
 SURFACE_NATS = 4.0
 """Largest log-likelihood that one surface adds or takes: beyond it, the surface itself may have moved."""
-CLEAR_GAIN = 2.0
+CLEAR_GAIN = 3.0
 """Log-probability that a clear match against odometry has beforehand over one that trusts odometry: it is wrong only
-where a single surface, as the ground, lies across the whole path."""
+where a single surface, as the ground, lies across the whole path. So it is less than that of a surface."""
 GAP_M = 1.0
 """Neighbouring returns farther apart than this lie on two surfaces."""
 CORNER: Final = float(np.cos(np.radians(35.0)))
