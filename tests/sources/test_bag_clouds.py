@@ -25,6 +25,7 @@ from tests.sources.clouds import (
     plan_ranges,
     rotation,
     said,
+    scattered,
     spinning,
 )
 
@@ -64,7 +65,7 @@ def misfit_m(records):
     errors = []
     for record in (each for each in records if isinstance(each, LaserScan)):
         beams, sweep = record.laser.beams, record.sweep
-        times = np.linspace(sweep.first_s, sweep.last_s, beams.beam_count)
+        times = np.linspace(sweep.first_s, sweep.last_s, beams.beam_count) if sweep else np.zeros(beams.beam_count)
         angles = beams.angle_min_rad + beams.angle_increment_rad * np.arange(beams.beam_count)
         poses = np.array(
             [se2.compose(pose, np.array(record.laser.T_base_laser)) for pose in pose_at(record.stamp - START + times)]
@@ -81,6 +82,19 @@ def test_a_cloud_is_the_scan_of_a_laser_in_its_place(tmp_path, suffix, layout):
     assert len(records) == 19
     assert source.survey().lasers[0].T_base_laser == pytest.approx((0.1, 0.05, 0.3))
     assert all(record.sweep.velocity[2] == pytest.approx(0.8, abs=0.01) for record in records)
+    assert misfit_m(records) < 0.01
+
+
+def test_points_in_no_order_are_moved_to_where_they_are_seen_at_one_time(tmp_path):
+    messages = [each for each in drive() if each.topic != "/points"]
+    for t in np.arange(0.1, 1.5, 0.1).round(3).tolist():
+        measured = scattered(lambda times, t=t: pose_at(t + times), 8000, LIDAR, rotation(yaw=YAW))
+        messages.append(said("/livox", START + t, cloud(START + t, measured, VELODYNE)))
+    records = [
+        each for each in open_source(save(tmp_path / "livox.mcap", messages)).records() if isinstance(each, LaserScan)
+    ]
+    assert all(record.sweep is None for record in records)
+    assert [record.stamp - START for record in records] == pytest.approx(0.15 + 0.1 * np.arange(14), abs=1e-3)
     assert misfit_m(records) < 0.01
 
 
