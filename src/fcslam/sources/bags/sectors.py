@@ -16,11 +16,13 @@ WIDEST_RAD: Final = 0.75 * tau
 WIDEST_HALF_RAD: Final = 3.0
 """Sectors of half a turn follow each other in either direction; they are taken to be counter-clockwise."""
 LONGEST_TURN_S: Final = 1.0
+LEAST_SHARE: Final = 1.0 / 3.0
+"""Share of the scans that go on with a sector; it is a half for two sectors that leave a part of the turn out."""
 
 
 def are_sectors(scans: Sequence[ScanMessage]) -> bool:
-    """Whether most of these successive scans go on where the one before them ends."""
-    return 2 * sum(_follows(a, b) for a, b in pairwise(scans)) > len(scans)
+    """Whether many of these successive scans go on where the one before them ends."""
+    return sum(_follows(a, b) for a, b in pairwise(scans)) > LEAST_SHARE * len(scans)
 
 
 class SectorJoiner:
