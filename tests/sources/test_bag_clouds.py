@@ -25,10 +25,13 @@ from tests.sources.clouds import (
     plan_ranges,
     rotation,
     said,
+    scattered,
     spinning,
 )
 
 START = 1_700_000_000.0
+OPTICAL_XYZW = (-0.5, 0.5, -0.5, 0.5)
+"""z forward, x right, y down: a turn of -90 degrees about z after one of -90 degrees about x."""
 LIDAR, YAW = (0.1, 0.05, 0.4), 0.3
 
 
@@ -64,7 +67,7 @@ def misfit_m(records):
     errors = []
     for record in (each for each in records if isinstance(each, LaserScan)):
         beams, sweep = record.laser.beams, record.sweep
-        times = np.linspace(sweep.first_s, sweep.last_s, beams.beam_count)
+        times = np.linspace(sweep.first_s, sweep.last_s, beams.beam_count) if sweep else np.zeros(beams.beam_count)
         angles = beams.angle_min_rad + beams.angle_increment_rad * np.arange(beams.beam_count)
         poses = np.array(
             [se2.compose(pose, np.array(record.laser.T_base_laser)) for pose in pose_at(record.stamp - START + times)]
@@ -84,6 +87,19 @@ def test_a_cloud_is_the_scan_of_a_laser_in_its_place(tmp_path, suffix, layout):
     assert misfit_m(records) < 0.01
 
 
+def test_points_in_no_order_are_moved_to_where_they_are_seen_at_one_time(tmp_path):
+    messages = [each for each in drive() if each.topic != "/points"]
+    for t in np.arange(0.1, 1.5, 0.1).round(3).tolist():
+        measured = scattered(lambda times, t=t: pose_at(t + times), 8000, LIDAR, rotation(yaw=YAW))
+        messages.append(said("/livox", START + t, cloud(START + t, measured, VELODYNE)))
+    records = [
+        each for each in open_source(save(tmp_path / "livox.mcap", messages)).records() if isinstance(each, LaserScan)
+    ]
+    assert all(record.sweep is None for record in records)
+    assert [record.stamp - START for record in records] == pytest.approx(0.15 + 0.1 * np.arange(14), abs=1e-3)
+    assert misfit_m(records) < 0.01
+
+
 def test_laser_scans_are_preferred_unless_the_cloud_is_named(tmp_path):
     ranges = np.full(90, 3.0)
     scans = [scan(START + t, ranges, angle_increment=math.pi / 90) for t in np.arange(0.1, 2.0, 0.1)]
@@ -94,6 +110,22 @@ def test_laser_scans_are_preferred_unless_the_cloud_is_named(tmp_path):
     assert any("reads laser scans from /scan, not from /points" in note for note in chosen.notes)
     assert named.lasers[0].model.beam_count == 720
     assert any("the scans of /points are its nearest points from 0.1 m to 0.6 m" in note for note in named.notes)
+
+
+def test_a_robot_may_carry_one_of_each(tmp_path):
+    laser = tf(START, "base_link", "laser", (0.2, 0.0, 0.3), topic="/tf_static")
+    optical = tf(START, "base_link", "depth_optical_frame", (0.0, 0.0, 0.3), OPTICAL_XYZW, topic="/tf_static")
+    image, info = depth_image(START, "32FC1")
+    messages = [*drive(), laser, optical, said("/depth/camera_info", START, info, INFO)]
+    for t in np.arange(0.1, 2.0, 0.1):
+        image.header = header(ROS2, START + t, "depth_optical_frame")
+        messages += [said("/depth/image", START + t, image, IMAGE), scan(START + t, np.full(8, 2.0))]
+    path = save(tmp_path / "each.mcap", messages)
+    source = open_source(path, BagOptions(scan_topics=("/points", "/scan", "/depth/image")))
+    assert [laser.beam_count for laser in source.survey().lasers] == [720, 8, 720]
+    assert [laser.T_base_laser[0] for laser in source.survey().lasers] == pytest.approx([0.1, 0.2, 0.0])
+    mountings = [record.laser.T_base_laser for record in source.records() if isinstance(record, LaserScan)]
+    assert [mountings.count(laser.T_base_laser) for laser in source.survey().lasers] == [19, 19, 19]
 
 
 def test_a_cloud_without_a_mounting_is_refused_in_one_line(tmp_path):
@@ -149,7 +181,7 @@ BEAMS, TURN_S = 180, 0.2
 SPACING_RAD = math.tau / BEAMS
 
 
-def sectors(count, clockwise=False, skipped=(), turns=12):
+def sectors(count, clockwise=False, skipped=(), turns=12, blind=()):
     """Sectors of turns of ``BEAMS`` beams, each measured at its own time while the robot drives."""
     messages = [tf(START, "base_link", "laser", (0.0, 0.0, 0.3), topic="/tf_static")]
     messages += [
@@ -157,7 +189,7 @@ def sectors(count, clockwise=False, skipped=(), turns=12):
     ]
     size, sign = BEAMS // count, -1.0 if clockwise else 1.0
     for number in range(turns * count):
-        if number in skipped:
+        if number in skipped or number % count in blind:
             continue
         first_s = number * TURN_S / count
         times = first_s + np.arange(size) * TURN_S / BEAMS
@@ -191,6 +223,15 @@ def test_a_sector_that_is_missing_is_invalid(tmp_path):
     records = [record for record in source.records() if isinstance(record, LaserScan)]
     assert len(records) == 12
     assert sorted(np.isnan(record.ranges_m).sum() for record in records) == [0] * 10 + [15, 15]
+    assert misfit_m(records) < 1e-4
+
+
+@pytest.mark.parametrize("blind", [(0,), (0, 3)])
+def test_sectors_may_leave_a_part_of_the_turn_out(tmp_path, blind):
+    source = open_source(save(tmp_path / "blind.mcap", sectors(4, blind=blind)))
+    records = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert len(records) == 12
+    assert {np.isnan(record.ranges_m).sum() for record in records} == {len(blind) * BEAMS // 4}
     assert misfit_m(records) < 1e-4
 
 

@@ -118,8 +118,11 @@ def _laser_pose(text: str) -> "GivenPose":
 def _cloud_band(text: str | None) -> "CloudBand":
     from fcslam.sources.point_clouds import CloudBand
 
+    if text is None:
+        return CloudBand()
     try:
-        band = CloudBand(*map(float, text.split(","))) if text else CloudBand()
+        low_m, high_m, *body_m = map(float, text.split(","))
+        band = CloudBand(low_m, high_m, *body_m)
     except (TypeError, ValueError):
         band = CloudBand(math.nan)
     if not (band.low_m < band.high_m and 0.0 <= band.body_radius_m < math.inf):  # false for NaN

@@ -4,7 +4,8 @@ The points in a band of heights above the floor count. The nearest surface in ea
 is a plane that is fitted to each cloud, so a robot that pitches or a sensor that leans sees no floor in the band.
 
 A scanner that turns measures its directions one after the other. The directions of a scan then begin where the turn
-begins, so that their times are linear; a return that was not measured when its direction was is left out.
+begins, so that their times are linear; a return that was not measured when its direction was is left out. The points of
+other scanners are moved to where they are seen at the mean time of all.
 """
 
 from math import cos, pi, radians, tau
@@ -101,6 +102,9 @@ class CloudScan(NamedTuple):
     offset_s: float
     """Stamp of the scan after that of the message."""
     sweep: Sweep | None
+    """When the directions were measured; None: at the stamp, or nothing is known."""
+    is_turn: bool
+    """Whether they were measured one after the other."""
 
 
 class Floor(NamedTuple):
@@ -110,13 +114,25 @@ class Floor(NamedTuple):
     distance_m: float
 
 
-def scan_of_cloud(cloud: PointCloud, mounting: CloudMounting, band: CloudBand) -> CloudScan:
+def scan_of_cloud(
+    cloud: PointCloud, mounting: CloudMounting, band: CloudBand, motion: Sweep | None = None
+) -> CloudScan:
     """The nearest returns of a cloud in a band of heights.
+
+    Args:
+        cloud: the points.
+        mounting: where the sensor is.
+        band: the heights that count.
+        motion: of ``base`` around the stamp of the scan, for a cloud whose directions are in no order; each point is
+            moved to where it is seen at the stamp.
 
     Raises:
         ValueError: the height of the sensor is not known, and no floor is seen.
     """
     in_base = cloud.points @ mounting.rotation.T + mounting.position_m
+    offset_s = float(cloud.times_s.mean()) if len(cloud.times_s) else 0.0
+    if motion is not None:
+        in_base = _moved(in_base, cloud.times_s - offset_s, motion)
     outside = np.hypot(in_base[:, 0], in_base[:, 1]) > band.body_radius_m
     floor = floor_in(in_base[outside], mounting)
     if floor is None and not mounting.is_height_known:
@@ -124,24 +140,26 @@ def scan_of_cloud(cloud: PointCloud, mounting: CloudMounting, band: CloudBand) -
     floor = floor or Floor(np.array([0.0, 0.0, 1.0]), 0.0)
     heights_m = in_base @ floor.normal - floor.distance_m
     xy = ((in_base - mounting.position_m) @ _levelling(floor.normal, mounting.heading_rad).T)[:, :2]
-    turn = _turn(xy, cloud.times_s)
+    turn = _turn(xy, cloud.times_s) if motion is None else None
     kept = (heights_m > band.low_m) & (heights_m < band.high_m) & outside
     kept &= np.hypot(xy[:, 0], xy[:, 1]) < FARTHEST_M
-    first, sweep, offset_s = -DIRECTIONS // 2, None, 0.0
+    first, sweep = -DIRECTIONS // 2, None
     angles = np.arctan2(xy[kept, 1], xy[kept, 0])
     if turn is None:
         index = np.rint(angles / _SPACING_RAD).astype(np.int64) - first
         index[index == DIRECTIONS] = 0
-        offset_s = float(cloud.times_s.mean()) if len(cloud.times_s) else 0.0
+        if len(cloud.times_s):
+            sweep = Sweep(float(cloud.times_s.min()) - offset_s, float(cloud.times_s.max()) - offset_s)
     else:
-        first, sweep = turn.directions()
+        offset_s, (first, sweep) = 0.0, turn.directions()
         expected = turn.angle_rad + turn.rate_rad_s * cloud.times_s[kept]
         stray = np.remainder(angles - expected + pi, tau) - pi
         index = np.rint((expected + stray) / _SPACING_RAD).astype(np.int64) - first
         index[np.abs(stray) > _STRAY_RAD] = -1
     ranges_m = _ranges(xy[kept], index, first)
     first = (first + DIRECTIONS // 2) % DIRECTIONS - DIRECTIONS // 2
-    return CloudScan(Beams(DIRECTIONS, first * _SPACING_RAD, _SPACING_RAD), ranges_m, offset_s, sweep)
+    beams = Beams(DIRECTIONS, first * _SPACING_RAD, _SPACING_RAD)
+    return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None)
 
 
 def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
@@ -244,6 +262,17 @@ class BodySample:
         angles = heading_rad + body * _SPACING_RAD
         distances_m = np.hypot(x + middle_m[body] * np.cos(angles), y + middle_m[body] * np.sin(angles))
         return float(distances_m.max(initial=0.0))
+
+
+def _moved(points: FloatArray, times_s: FloatArray, motion: Sweep) -> FloatArray:
+    """The points in ``base`` at their times, shape (N, 3), in ``base`` at the stamp."""
+    t = times_s[:, None]
+    x, y, theta = (t * np.array(motion.velocity) + 0.5 * t**2 * np.array(motion.acceleration)).T
+    c, s = np.cos(theta), np.sin(theta)
+    result: FloatArray = np.stack(
+        (x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1], points[:, 2]), axis=1
+    )
+    return result
 
 
 def _levelling(normal: FloatArray, heading_rad: float) -> FloatArray:

@@ -50,8 +50,13 @@ class CloudMessage(NamedTuple):
         Raises:
             ValueError: the height of the sensor is not known.
         """
-        beams, ranges_m, offset_s, sweep = scan_of_cloud(self.cloud, mounting, band)
-        return ScanMessage(self.stamp + offset_s, self.frame, beams, 0.0, FARTHEST_M, ranges_m, sweep=sweep)
+        found = scan_of_cloud(self.cloud, mounting, band)
+        scan = ScanMessage(
+            self.stamp + found.offset_s, self.frame, found.beams, 0.0, FARTHEST_M, found.ranges_m, sweep=found.sweep
+        )
+        if found.is_turn or found.sweep is None:
+            return scan
+        return scan._replace(ranges_at_stamp=lambda motion: scan_of_cloud(self.cloud, mounting, band, motion).ranges_m)
 
 
 def cloud_mounting(T_base_sensor: Transform) -> CloudMounting:

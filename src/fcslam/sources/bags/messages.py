@@ -1,6 +1,6 @@
 """Converts the messages of a bag and checks them; invalid messages raise ValueError."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import degrees, inf, isfinite, nan, radians, remainder
 from typing import Any, NamedTuple
 
@@ -44,6 +44,8 @@ class ScanMessage(NamedTuple):
     """Index of its topic among those of laser scans."""
     sweep: Sweep | None = None
     """Times of the beams, without a motion; None: all were measured at the stamp, or nothing is known."""
+    ranges_at_stamp: Callable[[Sweep], Ranges] | None = None
+    """The ranges from where the robot is at the stamp, if the beams were measured in no order, given the motion."""
 
     @property
     def end(self) -> float:

@@ -37,6 +37,8 @@ class Rig(NamedTuple):
     def scan(self, posed: PosedScan) -> LaserScan:
         """The record of a scan."""
         scan, upside_down = posed.scan, self.upside_down[posed.scan.laser]
+        if scan.ranges_at_stamp is not None and scan.sweep is not None:
+            scan = scan._replace(raw_ranges_m=scan.ranges_at_stamp(scan.sweep), sweep=None)
         ranges_m = _turned(measured_ranges(scan), upside_down)
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep

@@ -11,16 +11,18 @@ from fcslam.geometry.beams import ROUNDING, SAME_VIEW_BEAMS
 from fcslam.records import Beams, Sweep
 from fcslam.sources.bags.messages import SHORTEST_SWEEP_S, ScanMessage, measured_ranges, reversed_sweep
 
-WIDEST_RAD: Final = 0.75 * tau
-"""Largest field of view of a sector."""
+NARROWEST_RAD, WIDEST_RAD = 0.01 * tau, 0.75 * tau
+"""Field of view of a sector."""
 WIDEST_HALF_RAD: Final = 3.0
 """Sectors of half a turn follow each other in either direction; they are taken to be counter-clockwise."""
 LONGEST_TURN_S: Final = 1.0
+LEAST_SHARE: Final = 1.0 / 3.0
+"""Share of the scans that go on with a sector; it is a half for two sectors that leave a part of the turn out."""
 
 
 def are_sectors(scans: Sequence[ScanMessage]) -> bool:
-    """Whether most of these successive scans go on where the one before them ends."""
-    return 2 * sum(_follows(a, b) for a, b in pairwise(scans)) > len(scans)
+    """Whether many of these successive scans go on where the one before them ends."""
+    return sum(_follows(a, b) for a, b in pairwise(scans)) > LEAST_SHARE * len(scans)
 
 
 class SectorJoiner:
@@ -107,8 +109,8 @@ def _follows(a: ScanMessage, b: ScanMessage) -> bool:
 def _is_alike(a: ScanMessage, b: ScanMessage) -> bool:
     """Whether two scans can be sectors of one laser."""
     increment_rad, other_rad = a.beams.angle_increment_rad, b.beams.angle_increment_rad
-    is_narrow = max(a.beams.span_rad, b.beams.span_rad) < WIDEST_RAD
-    return a.frame == b.frame and is_narrow and abs(other_rad - increment_rad) <= ROUNDING * increment_rad
+    is_sector = all(NARROWEST_RAD < each.beams.span_rad < WIDEST_RAD for each in (a, b))
+    return a.frame == b.frame and is_sector and abs(other_rad - increment_rad) <= ROUNDING * increment_rad
 
 
 def _is_clockwise(a: ScanMessage, b: ScanMessage) -> bool:

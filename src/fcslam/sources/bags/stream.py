@@ -286,12 +286,15 @@ class BagStream:
     def _corrected(self, scan: ScanMessage) -> ScanMessage:
         """The scan with the times of its beams as they were found."""
         times = self._options.correction.sweep
-        return scan if times is None else scan._replace(sweep=Sweep(*times) if times[0] != times[1] else None)
+        if times is None or scan.ranges_at_stamp is not None:
+            return scan
+        return scan._replace(sweep=Sweep(*times) if times[0] != times[1] else None)
 
     @property
     def states_sweep(self) -> bool:
         """Whether the messages of the first laser say when the beams are measured."""
-        return self.lasers[0].first.sweep is not None
+        first = self.lasers[0].first
+        return first.sweep is not None and first.ranges_at_stamp is None
 
     @cached_property
     def odometry(self) -> "OdometryInput | None":
