@@ -81,6 +81,19 @@ def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
     assert max(abs(keyscan.sweep.velocity[2]) for keyscan in keyscans) > 1.0
 
 
+def test_a_drive_along_one_circle_fixes_no_mounting(tmp_path, monkeypatch):
+    def circle(stamps):
+        turn = 0.8 * np.asarray(stamps, float)
+        return np.stack((0.5 * np.sin(turn), 0.5 - 0.5 * np.cos(turn), turn), axis=-1)
+
+    monkeypatch.setattr(spinning, "pose_at", circle)
+    readings = [Odometry(t, frozen(circle(t))) for t in READINGS.tolist()]
+    items = sorted([*readings, *spinning.drive()], key=lambda item: item.stamp)
+    write_bag(tmp_path / "r.mcap", [replace(item, stamp=item.stamp + spinning.BEGIN_S) for item in items])
+    frontend, _ = mapped(calibrated(open_source(tmp_path / "r.mcap"), LidarConfig()).records())
+    assert spinning.error_m(frontend.tracks[0]) < 0.02
+
+
 @pytest.mark.parametrize("at", [2.0, 3.0, 6.0, 8.0, 12.0])
 def test_odometry_of_scans_that_starts_at_zero_again_bends_nothing(at):
     """The jump is 0.5 to 2.4 m and 0.7 to 2.9 rad, so a robot might have made it."""

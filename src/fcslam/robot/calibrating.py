@@ -32,6 +32,8 @@ LONGEST_PERIOD_S: Final = 0.12
 LEAST_DELAY_S: Final = 0.004
 LEAST_YAW_RAD: Final = 0.005
 LEAST_OFFSET_M: Final = 0.02
+LARGEST_OFFSET_M: Final = 1.0
+"""A laser is not farther from where tf says. A drive along one circle fixes no mounting, and its estimate may be."""
 LEAST_SCALE: Final = 0.01
 LEAST_SHARE: Final = 0.1
 """Smaller differences from what the bag says are not corrected."""
@@ -277,6 +279,8 @@ def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: l
     if calibration.mounting is None:
         return Calibrated(calibration, correction, tuple(lines))
     x, y, yaw = calibration.mounting
+    if math.hypot(x.value, y.value) > LARGEST_OFFSET_M:
+        return Calibrated(calibration, correction, tuple(lines))
     moved = [0.0, 0.0, 0.0]
     if yaw.differs(0.0, LEAST_YAW_RAD):
         side = "left" if yaw.value > 0.0 else "right"
