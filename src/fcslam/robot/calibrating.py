@@ -33,7 +33,8 @@ LEAST_DELAY_S: Final = 0.004
 LEAST_YAW_RAD: Final = 0.005
 LEAST_OFFSET_M: Final = 0.02
 LARGEST_OFFSET_M: Final = 1.0
-"""A laser is not farther from where tf says. A drive along one circle fixes no mounting, and its estimate may be."""
+"""A laser is not farther from where tf says. A drive along one circle fixes neither mounting nor times; then nothing is
+corrected."""
 LEAST_SCALE: Final = 0.01
 LEAST_SHARE: Final = 0.1
 """Smaller differences from what the bag says are not corrected."""
@@ -228,6 +229,10 @@ def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], sta
         assumed: times of the first and the last beam after the stamp with which the scans were tracked, seconds.
         states_sweep: whether the bag says these times; otherwise it says that all beams are measured at once.
     """
+    if calibration.mounting is not None:
+        x, y, _ = calibration.mounting
+        if math.hypot(x.value, y.value) > LARGEST_OFFSET_M:
+            return Calibrated(calibration, BagCorrection(), ())
     share, nominal = _share(calibration), 1.0 if states_sweep else 0.0
     is_late = calibration.delay is not None and calibration.delay.differs(0.0, LEAST_DELAY_S)
     is_other = share is not None and share.differs(nominal, LEAST_SHARE)
@@ -279,8 +284,6 @@ def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: l
     if calibration.mounting is None:
         return Calibrated(calibration, correction, tuple(lines))
     x, y, yaw = calibration.mounting
-    if math.hypot(x.value, y.value) > LARGEST_OFFSET_M:
-        return Calibrated(calibration, correction, tuple(lines))
     moved = [0.0, 0.0, 0.0]
     if yaw.differs(0.0, LEAST_YAW_RAD):
         side = "left" if yaw.value > 0.0 else "right"
