@@ -160,21 +160,14 @@ def check_drive(played, scans, output, folder):
 
 
 @needs_rclpy
-def test_a_robot_of_ros_2(folder, scans, tmp_path):
-    environment = ros2(41)
+@pytest.mark.parametrize(("prefix", "domain"), [("", 41), ("spinning_", 45)], ids=["at once", "spinning"])
+def test_a_robot_of_ros_2(request, prefix, domain, tmp_path):
+    folder, scans = request.getfixturevalue(f"{prefix}folder"), request.getfixturevalue(f"{prefix}scans")
+    environment = ros2(domain)
     robot = fcslam("robot", "ros2:/robot1", mounting(scans), "-o", tmp_path / "run", **environment)
     played = play(RCLPY, "rclpy_player.py", folder, **environment)
     ended(robot)
     check_drive(played, scans, tmp_path / "run", folder)
-
-
-@needs_rclpy
-def test_a_robot_of_ros_2_with_a_scanner_that_spins(spinning_folder, spinning_scans, tmp_path):
-    environment = ros2(45)
-    robot = fcslam("robot", "ros2:/robot1", mounting(spinning_scans), "-o", tmp_path / "run", **environment)
-    played = play(RCLPY, "rclpy_player.py", spinning_folder, **environment)
-    ended(robot)
-    check_drive(played, spinning_scans, tmp_path / "run", spinning_folder)
 
 
 @needs_rclpy
@@ -194,6 +187,7 @@ def test_a_robot_that_nobody_knows_on_ros_2():
     _, error = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 2
     assert "no laser scans (sensor_msgs/LaserScan)" in error
+    assert " in /nobody; " in error
     assert "Traceback" not in error
 
 
