@@ -113,8 +113,11 @@ class Sweep(NamedTuple):
         """Time between the first and the last beam."""
         return abs(self.last_s - self.first_s)
 
-    def displacement(self, t_s: float) -> FloatArray:
-        """Pose of ``base`` at ``t_s`` after the stamp in ``base`` at the stamp, shape (3,), metres and radians."""
+    def displacement(self, t_s: float | FloatArray) -> FloatArray:
+        """Pose of ``base`` at ``t_s`` after the stamp in ``base`` at the stamp, shape (3,), metres and radians.
+
+        ``t_s`` of shape (N, 1) gives N poses, shape (N, 3).
+        """
         return t_s * (np.array(self.velocity) + 0.5 * t_s * np.array(self.acceleration))
 
     def steps(self) -> tuple[int, ...]:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.geometry import se2
 from fcslam.records import Beams, FloatArray, Ranges, Sweep
 from fcslam.sources.pose import Pose
 from fcslam.sources.returns import is_apart
@@ -266,13 +267,9 @@ class BodySample:
 
 def _moved(points: FloatArray, times_s: FloatArray, motion: Sweep) -> FloatArray:
     """The points in ``base`` at their times, shape (N, 3), in ``base`` at the stamp."""
-    t = times_s[:, None]
-    x, y, theta = (t * np.array(motion.velocity) + 0.5 * t**2 * np.array(motion.acceleration)).T
-    c, s = np.cos(theta), np.sin(theta)
-    result: FloatArray = np.stack(
-        (x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1], points[:, 2]), axis=1
-    )
-    return result
+    flat = np.column_stack((points[:, :2], np.zeros(len(points))))
+    moved = se2.compose(motion.displacement(times_s[:, None]), flat)
+    return np.column_stack((moved[:, :2], points[:, 2]))
 
 
 def _levelling(normal: FloatArray, heading_rad: float) -> FloatArray:
