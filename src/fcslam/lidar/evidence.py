@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import FIXED, INLIER_SIGMA_M, MatchingConfig, ScanMatch, match_scan
+from fcslam.lidar.matching import FIXED, MatchingConfig, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
-CLEAR, UNCLEAR, LEAST_KNOWN = 0.8, 0.5, 0.5
-"""Shares of the points in known area that a clear match explains at least, and an unclear one at most; least share of
-all points in known area. The part that an unclear match does not explain may be the only one that stands still."""
-FAR = 4.0
-"""A match farther than this from odometry contradicts it, in standard deviations of odometry's learned error."""
+CLEAR, LEAST_KNOWN = 0.8, 0.5
+"""Least share of the points in known area that a clear match explains; least share of all points in known area. The
+part that an unclear match does not explain may be the only one that stands still."""
+NEAR, FAR = 2.0, 4.0
+"""A match agrees with odometry up to the first distance and contradicts it from the second on, in standard deviations
+of odometry's learned error."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
 """Least standard deviations of odometry that a match is judged by, metres and radians, and their growth per radian of
 turn. Matches have an error of their own, and the learned error is mostly that of small turns."""
@@ -85,17 +86,16 @@ def resolve(
         max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
     )
     innovation = se2.between(T_field_guess, match.T_field_base)
-    is_far = error.mahalanobis2(innovation) >= FAR**2
-    # Odometry that is less exact than points lie on surfaces corrects only unclear matches near it.
-    share = CLEAR if error.position_m <= INLIER_SIGMA_M else UNCLEAR
-    is_seen = match.known >= LEAST_KNOWN
-    if not is_far and is_seen and match.explained >= share * match.known:
+    distance2 = error.mahalanobis2(innovation)
+    is_far, is_seen = distance2 >= FAR**2, match.known >= LEAST_KNOWN
+    is_clear = is_seen and match.explained >= CLEAR * match.known
+    if distance2 < NEAR**2 or (is_clear and not is_far):
         return match, False
     trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
     gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
-    gain += CLEAR_GAIN * (is_seen and match.explained >= CLEAR * match.known)
+    gain += CLEAR_GAIN * is_clear
     return (match, False) if gain > 0.0 and (is_seen or not is_far) else (trusting, is_far)
 
 
