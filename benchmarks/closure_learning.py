@@ -87,7 +87,7 @@ from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission import MissionConfig
 from fcslam.places.hypotheses import rigid_hypotheses
-from fcslam.places.motions import MotionConfig
+from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan
 from fcslam.robot.frontend import RobotConfig
 from fcslam.simulation.options import Lighting
@@ -561,13 +561,12 @@ def keypoint_counts(first: Keyframe, second: Keyframe, T_first_second: FloatArra
 
 def inliers(first: Keyframe, second: Keyframe) -> int:
     """Keypoints that the best motion explains, as the cloud proposes it; 0 without a motion."""
-    config = MotionConfig()
     a, b = points_of(first, np.zeros(3)), points_of(second, np.zeros(3))
-    matches = mutual_matches(a.codes, b.codes, config.hamming_limit)
+    matches = mutual_matches(a.codes, b.codes, LARGEST_HAMMING)
     rows = matches.pairs
-    level = np.abs(a.positions[rows[:, 0], 2] - b.positions[rows[:, 1], 2]) <= config.level_m
+    level = np.abs(a.positions[rows[:, 0], 2] - b.positions[rows[:, 1], 2]) <= LARGEST_LEVEL_M
     kept = Matches(rows[level], matches.distances[level])
-    best = rigid_hypotheses(a.positions[:, :2], b.positions[:, :2], kept, config.hypotheses)
+    best = rigid_hypotheses(a.positions[:, :2], b.positions[:, :2], kept)
     return max((hypothesis.inlier_count for hypothesis in best), default=0)
 
 

@@ -40,7 +40,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.consistency import PROBABILITY, ConsistencySettings
 from fcslam.graph.factors import FactorCache, from_values, to_values
 from fcslam.graph.g2o import read_g2o
 from fcslam.graph.initialization import initialize, initialize_robust
@@ -301,7 +301,7 @@ def gtsam_gnc(graph: PoseGraph, start: FloatArray) -> Solution:
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setKnownInliers(known)
     solver = gtsam.GncLMOptimizer(problem, to_values(start), parameters)
-    solver.setInlierCostThresholdsAtProbability(ConsistencySettings().probability)
+    solver.setInlierCostThresholdsAtProbability(PROBABILITY)
     poses = from_values(solver.optimize())
     weights = np.ones(len(robust))
     weights[robust] = np.asarray(solver.getWeights())[trusted : trusted + int(robust.sum())]

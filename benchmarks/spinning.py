@@ -4,7 +4,8 @@
     python benchmarks/spinning.py --logs --seeds 1 --path-length 10
 
 One simulated robot drives in a building of each seed (`fcslam simulate --scanner --turn-rate --odometry`). Scanners
-that spin measure each beam at its own time. The error is that of the positions at all scans after a rigid alignment.
+that spin measure each beam at its own time. The drive is written as a ROS 2 bag and mapped as `fcslam map` does. The
+error is that of the positions at all scans after a rigid alignment.
 
 Three logs of the SLAM benchmark are mapped without their odometry. Errors follow Kuemmerle et al. 2009 over all
 relations.
@@ -13,6 +14,8 @@ relations.
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import common
 import numpy as np
@@ -23,11 +26,13 @@ from fcslam.metrics.relations import read_relations, relation_errors
 from fcslam.metrics.trajectory import PositionErrors, align, position_errors
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan, frozen
+from fcslam.robot.calibrating import calibrated
 from fcslam.simulation.noise import SCANNERS
 from fcslam.simulation.odometry import KINDS
 from fcslam.simulation.options import OdometryKind, Scanner
 from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources import open_source
+from fcslam.sources.bags.writer import write_bag
 
 SLOW_RAD_S, FAST_RAD_S = 0.9, 2.0
 COLUMNS = {"scanner": "", "turn rate, rad/s": ".1f", "odometry": "", "seed": "", "scans": "", "ATE (RMSE), m": ".4f",
@@ -59,7 +64,11 @@ def simulate(seeds, path_m: float) -> Iterator[tuple]:
             drift=KINDS[kind],
         )  # fmt: skip
         (robot,) = simulate_fleet(settings, seed).robots
-        run = run_mission([Recording(robot.name, list(robot.scans()))], MissionConfig())
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / f"{robot.name}.mcap"
+            write_bag(path, robot.scans())
+            source = calibrated(open_source(path), MissionConfig().robot.lidar)
+            run = run_mission([source], MissionConfig())
         found, truth = run.trajectories[robot.name], robot.T_building_base
         errors = PositionErrors.of(position_errors(align(truth, found.T_map_base), truth, found.T_map_base))
         yield scanner, turn_rate, kind, seed, len(truth), errors.rmse_m, errors.max_m

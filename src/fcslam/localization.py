@@ -136,7 +136,7 @@ def run_localization(
     Raises:
         SourceError: the map or the recording cannot be used.
     """
-    localizer = MapLocalizer(frozen_map(occupancy, "the map"), config.robot.localization, config.robot.lidar, initial)
+    localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
     robot = RobotFrontend(source.name, config.robot, localizer)
     drive = LocalizedDrive()
     for record in source.records():

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.cloud import claims
 from fcslam.cloud.claims import ClaimLimits, with_least_noise
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
 from fcslam.lidar.frontend import motion_information
-from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.odometry import WHEELS
 from fcslam.lidar.tracker import TrackedScan
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Channel, ConstraintKind, LaserModel, frozen
@@ -33,9 +34,9 @@ def drive(steps):
     return bodies
 
 
-def refusals(bodies, **claims):
+def refusals(bodies, **limits):
     """Why the cloud refuses the packets, by their numbers."""
-    cloud, found = Cloud(FleetConfig(claims=ClaimLimits(**claims)), 0), {}
+    cloud, found = Cloud(FleetConfig(claims=ClaimLimits(**limits)), 0), {}
     for packet in sent(bodies):
         try:
             cloud.receive(encode(packet))
@@ -65,9 +66,10 @@ def test_a_submap_wider_than_any_is_refused():
     assert "keyscan 120 m away, at most 100 m" in reason
 
 
-def test_a_submap_of_too_many_keyscans_is_refused():
+def test_a_submap_of_too_many_keyscans_is_refused(monkeypatch):
+    monkeypatch.setattr(claims, "MOST_SUBMAP_KEYSCANS", 9)
     bodies = [*drive([AHEAD] * 12), place("a", 4, first=0, last=12), place("a", 8, first=4, last=12)]
-    (reason,) = refusals(bodies, submap_keyscans=9).values()
+    (reason,) = refusals(bodies).values()
     assert "has 13 keyscans, at most 9" in reason
 
 
@@ -127,6 +129,6 @@ def test_what_robots_state_is_within_the_least_noise():
     for information in (np.zeros((3, 3)), np.diag((1e4, 1e4, 1e5)), 1e12 * np.eye(3)):
         for step in ((0.25, 0.0, 0.0), (0.0, 0.0, 0.25), (1.0, 0.3, -1.2)):
             tracked = TrackedScan(np.array((1.0, 2.0, 0.7)), information, None)
-            stated = motion_information(np.array(step), tracked, OdometryConfig())
+            stated = motion_information(np.array(step), tracked, WHEELS)
             claim = replace(motion("a", 0, 1, np.array(step)), information=frozen(stated))
             assert with_least_noise(claim, VerificationConfig()) is claim

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fcslam.config import dump
 from fcslam.features.birdseye import BirdseyeConfig, describe, likelihood_picture, pixels_to_metres
 from fcslam.features.codes import mutual_matches
 from fcslam.geometry import se2
@@ -101,8 +100,3 @@ def test_features_are_read_only():
     features = describe(asymmetric_room(np.random.default_rng(4)), CONFIG)
     assert not features.keypoints_m.flags.writeable
     assert not features.descriptors.flags.writeable
-
-
-def test_every_setting_is_described():
-    text = dump(CONFIG)
-    assert text.count("# ") == len(BirdseyeConfig.model_fields)

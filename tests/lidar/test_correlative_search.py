@@ -6,11 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.geometry import se2
-from fcslam.lidar.correlative import SearchConfig, SearchWindow, likelihood_pyramid, search, search_pyramid
+from fcslam.lidar.correlative import CELL_M, SearchWindow, likelihood_pyramid, search, search_pyramid
 from fcslam.lidar.field import field_of
 from tests.lidar.worlds import bare_scan, ring, ring_drive, room, scan_at
-
-CONFIG = SearchConfig()
 
 
 def random_scan(rng, count, reach):
@@ -25,7 +23,7 @@ def steps(scan, window, cell_m):
     return step_rad, int(np.ceil(window.angle_rad / step_rad)), int(np.ceil(window.radius_m / cell_m))
 
 
-def exhaustive(scan, pyramid, guess, window, config):
+def exhaustive(scan, pyramid, guess, window):
     """Best penalised score over every shift and turn of the window."""
     grid, cell = pyramid.levels[0].astype(float), pyramid.cell_m
     step, turns, shifts = steps(scan, window, cell)
@@ -39,19 +37,19 @@ def exhaustive(scan, pyramid, guess, window, config):
             rows, columns = y + moves, x + moves
             inside = ((rows >= 0) & (rows < len(grid)))[:, None] & ((columns >= 0) & (columns < len(grid)))[None]
             raw += np.where(inside, grid[np.ix_(rows.clip(0, len(grid) - 1), columns.clip(0, len(grid) - 1))], 0.0)
-        away = config.distance_penalty * np.minimum(1, (moves[:, None] ** 2 + moves**2) / max(1, shifts**2))
-        penalty = (1 - away) * (1 - config.angle_penalty * (turn / max(1, turns)) ** 2)
+        away = window.distance_penalty * np.minimum(1, (moves[:, None] ** 2 + moves**2) / max(1, shifts**2))
+        penalty = (1 - away) * (1 - window.angle_penalty * (turn / max(1, turns)) ** 2)
         best = max(best, float((raw / (255 * len(points)) * penalty).max()))
     return best
 
 
-def penalised(result, guess, window, scan, config):
+def penalised(result, guess, window, scan):
     """The score of a result with the penalty of where it lies."""
-    step, turns, shifts = steps(scan, window, config.cell_m)
-    move = np.round((result.T_field_base[:2] - guess[:2]) / config.cell_m)
+    step, turns, shifts = steps(scan, window, CELL_M)
+    move = np.round((result.T_field_base[:2] - guess[:2]) / CELL_M)
     turn = np.round(se2.wrap_angle(result.T_field_base[2] - guess[2]) / step)
-    away = config.distance_penalty * min(1, float(move @ move) / max(1, shifts**2))
-    return result.score * (1 - away) * (1 - config.angle_penalty * (turn / max(1, turns)) ** 2)
+    away = window.distance_penalty * min(1, float(move @ move) / max(1, shifts**2))
+    return result.score * (1 - away) * (1 - window.angle_penalty * (turn / max(1, turns)) ** 2)
 
 
 @pytest.mark.slow
@@ -66,14 +64,13 @@ def penalised(result, guess, window, scan, config):
 def test_the_best_score_is_that_of_exhaustive_search(seed, radius, angle, levels, half_side):
     """On random worlds; with the small grid, points leave it on every side."""
     rng = np.random.default_rng(seed)
-    config = SearchConfig(levels=levels)
     field = field_of([(random_scan(rng, 40, 3.0), np.zeros(3))])
     scan, guess = random_scan(rng, 25, 3.0), rng.uniform(-1, 1, 3)
-    window = SearchWindow(radius, angle)
-    pyramid = likelihood_pyramid(field, guess, half_side, config)
-    found = search_pyramid(scan, pyramid, guess, window, config)
-    best = exhaustive(scan, pyramid, guess, window, config)
-    assert penalised(found, guess, window, scan, config) == pytest.approx(best, abs=1e-9)
+    window = SearchWindow(radius, angle, 0.2, 0.1)
+    pyramid = likelihood_pyramid(field, guess, half_side, levels=levels)
+    found = search_pyramid(scan, pyramid, guess, window)
+    best = exhaustive(scan, pyramid, guess, window)
+    assert penalised(found, guess, window, scan) == pytest.approx(best, abs=1e-9)
 
 
 def test_the_result_lies_in_the_window():
@@ -83,7 +80,7 @@ def test_the_result_lies_in_the_window():
     window = SearchWindow(1.0, 0.1)
     for away in ((1.3, 0.0), (-1.3, 0.0), (0.0, 1.3), (0.0, -1.3)):
         guess = np.array([*away, 0.0])
-        found = search(scan, field, guess, window, CONFIG)
+        found = search(scan, field, guess, window)
         assert np.abs(found.T_field_base[:2] - guess[:2]).max() <= window.radius_m + 1e-9
 
 
@@ -92,7 +89,7 @@ def test_the_result_lies_in_the_window():
 def test_every_level_bounds_the_cells_it_covers(seed):
     rng = np.random.default_rng(seed)
     field = field_of([(random_scan(rng, 60, 2.5), np.zeros(3))])
-    levels = likelihood_pyramid(field, np.zeros(3), 3.0, CONFIG).levels
+    levels = likelihood_pyramid(field, np.zeros(3), 3.0).levels
     size = levels.shape[1]
     for h, level in enumerate(levels):
         for y, x in rng.integers(0, size, (40, 2)):
@@ -107,7 +104,7 @@ def test_a_near_offset_is_recovered(offset):
     rng = np.random.default_rng(0)
     field = field_of([(scan_at(pose, ring(), noise_m=0.015, rng=rng), pose) for pose in ring_drive()[30:90:6]])
     found = search(
-        scan_at(truth, ring(), noise_m=0.015, rng=rng), field, truth + np.array(offset), SearchWindow(1.1, 0.5), CONFIG
+        scan_at(truth, ring(), noise_m=0.015, rng=rng), field, truth + np.array(offset), SearchWindow(1.1, 0.5)
     )
     rest = se2.between(truth, found.T_field_base)
     assert np.hypot(rest[0], rest[1]) < 0.15
@@ -123,7 +120,7 @@ def test_a_far_offset_is_recovered_in_a_wide_window(offset):
     field = field_of([(scan_at(pose, walls, noise_m=0.015, rng=rng), pose) for pose in poses])
     truth = np.array([0.4, 0.2, 0.1])
     scan = scan_at(truth, walls, noise_m=0.015, rng=rng)
-    found = search(scan, field, truth + np.array(offset), SearchWindow(8.5, 0.75), CONFIG)
+    found = search(scan, field, truth + np.array(offset), SearchWindow(8.5, 0.75))
     rest = se2.between(truth, found.T_field_base)
     assert np.hypot(rest[0], rest[1]) < 0.15
     assert abs(rest[2]) < np.deg2rad(2)
@@ -139,7 +136,7 @@ def test_nothing_to_see_answers_with_the_guess():
         (scan_at((0, 0, 0), room()), field_of([]), guess),
         (nothing, field, far),
     ):
-        found = search(scan, where, there, SearchWindow(1.0, 0.3), CONFIG)
+        found = search(scan, where, there, SearchWindow(1.0, 0.3))
         np.testing.assert_array_equal(found.T_field_base, there)
         assert found.score == 0.0
 
@@ -151,8 +148,8 @@ def test_returns_beyond_the_grid_do_not_break_the_bound():
     field = field_of([(bare_scan(wall), np.zeros(3))])
     scan = bare_scan(seen)
     window = SearchWindow(1.5, 0.0)
-    pyramid = likelihood_pyramid(field, np.zeros(3), 3.0, CONFIG)
-    found = search_pyramid(scan, pyramid, np.zeros(3), window, CONFIG)
-    best = exhaustive(scan, pyramid, np.zeros(3), window, CONFIG)
+    pyramid = likelihood_pyramid(field, np.zeros(3), 3.0)
+    found = search_pyramid(scan, pyramid, np.zeros(3), window)
+    best = exhaustive(scan, pyramid, np.zeros(3), window)
     assert best > 0.5
-    assert penalised(found, np.zeros(3), window, scan, CONFIG) == pytest.approx(best, abs=1e-9)
+    assert penalised(found, np.zeros(3), window, scan) == pytest.approx(best, abs=1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.lidar.evidence import SURFACE_NATS, over_steps, resolve, surface_gain, surfaces
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import OdometryError
 from fcslam.lidar.scan import point_scan
 from tests.lidar.worlds import LASER, path, ranges, room
@@ -37,9 +37,8 @@ def ramp(ground_m, at_x=0.0):
 
 def resolved(walls_before, walls_now, T_field_guess, pose=HERE, learned=RIGHT):
     field, scan = field_of(points(walls_before)), points(walls_now, pose)
-    config = MatchingConfig()
-    match = match_scan(scan, field, T_field_guess, np.diag((100.0, 100.0, 400.0)), config)
-    return match, *resolve(scan, field, T_field_guess, match, learned, 0.0, config)
+    match = match_scan(scan, field, T_field_guess, np.diag((100.0, 100.0, 400.0)))
+    return match, *resolve(scan, field, T_field_guess, match, learned, 0.0)
 
 
 def test_ground_that_travels_along_does_not_hold_the_robot_back():
@@ -68,7 +67,7 @@ def test_odometry_that_was_wrong_before_does_not_overrule_a_single_surface():
 def test_a_surface_counts_once_whatever_its_number_of_points():
     scan = points(path((5.0, -4.0), (5.0, 4.0)))
     field = field_of(scan)
-    here, off = (match_scan(scan, field, np.array((x, 0.0, 0.0)), HELD, MatchingConfig()) for x in (0.0, 0.3))
+    here, off = (match_scan(scan, field, np.array((x, 0.0, 0.0)), HELD) for x in (0.0, 0.3))
     gains = here.log_likelihoods - off.log_likelihoods
     assert gains.sum() > 2.0 * SURFACE_NATS
     assert surface_gain(scan, gains) == pytest.approx(SURFACE_NATS)
@@ -94,9 +93,9 @@ def test_errors_of_many_steps_grow_with_the_root():
 def test_odometry_corrects_a_match_near_it_only_if_it_is_exact_and_the_match_unclear(sigma_m, explained, is_kept):
     step = np.array((0.1, 0.0, 0.0))
     field, scan = field_of(points(ramp(25.0))), points(ramp(25.0, at_x=0.1), step)
-    match = match_scan(scan, field, step, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    match = match_scan(scan, field, step, np.diag((100.0, 100.0, 400.0)))
     match = replace(match, explained=explained * match.known)
-    chosen, contradicts = resolve(scan, field, step, match, OdometryError(sigma_m, 0.02), 0.0, MatchingConfig())
+    chosen, contradicts = resolve(scan, field, step, match, OdometryError(sigma_m, 0.02), 0.0)
     assert (chosen is match) == is_kept
     assert chosen.T_field_base[0] == pytest.approx(0.0 if is_kept else 0.1, abs=0.03)
     assert not contradicts
@@ -105,18 +104,18 @@ def test_odometry_corrects_a_match_near_it_only_if_it_is_exact_and_the_match_unc
 def test_near_odometry_a_match_of_more_surfaces_is_kept():
     off = np.array((0.1, 0.0, 0.0))
     field, scan = field_of(points(room())), points(room())
-    match = match_scan(scan, field, off, np.diag((100.0, 100.0, 400.0)), MatchingConfig())
+    match = match_scan(scan, field, off, np.diag((100.0, 100.0, 400.0)))
     match = replace(match, explained=0.7 * match.known)
-    chosen, _ = resolve(scan, field, off, match, OdometryError(0.03, 0.02), 0.0, MatchingConfig())
+    chosen, _ = resolve(scan, field, off, match, OdometryError(0.03, 0.02), 0.0)
     assert chosen.T_field_base[0] == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.parametrize(("sigma_m", "explained", "is_kept"), [(0.03, 0.7, False), (0.03, 0.9, True), (0.1, 0.4, True)])
 def test_unclear_match_is_kept_only_if_it_agrees_with_odometry(sigma_m, explained, is_kept):
     field, scan = field_of(points(room())), points(room())
-    off = match_scan(scan, field, np.array((0.1, 0.0, 0.0)), HELD, MatchingConfig())
+    off = match_scan(scan, field, np.array((0.1, 0.0, 0.0)), HELD)
     match = replace(off, explained=explained * off.known)
-    chosen, _ = resolve(scan, field, HERE, match, OdometryError(sigma_m, 0.02), 0.0, MatchingConfig())
+    chosen, _ = resolve(scan, field, HERE, match, OdometryError(sigma_m, 0.02), 0.0)
     assert (chosen is match) == is_kept
 
 

@@ -10,7 +10,7 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.backend import LidarBackend, chained
 from fcslam.lidar.closing import ClosingConfig, _shortest_paths
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, motion_information
-from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.odometry import WHEELS
 from fcslam.lidar.tracker import TrackedScan
 from fcslam.records import Constraint, ConstraintKind
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
@@ -140,7 +140,7 @@ def test_information_of_a_motion_turns_with_the_robot():
     information = np.diag((1e6, 1e1, 1e6))
     for heading in (0.0, np.pi / 2, 0.7):
         tracked = TrackedScan(np.array([1.0, 2.0, heading]), information, None)
-        found = motion_information(np.array([0.3, 0.0, 0.1]), tracked, OdometryConfig())
+        found = motion_information(np.array([0.3, 0.0, 0.1]), tracked, WHEELS)
         _, vectors = np.linalg.eigh(found[:2, :2])
         loose = np.array([np.sin(heading), np.cos(heading)])  # local y in the robot's base
         assert abs(vectors[:, 0] @ loose) > 0.999

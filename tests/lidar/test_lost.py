@@ -7,10 +7,19 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.lidar.lost import LostConfig, can_decide, drove_on, is_doubtful, is_lost
+from fcslam.lidar.lost import (
+    FEWEST_SCANS,
+    MOST_SCANS,
+    SETTLED_M,
+    LostConfig,
+    can_decide,
+    drove_on,
+    is_doubtful,
+    is_lost,
+)
 from fcslam.lidar.odometry import OdometryTrust
 from fcslam.records import frozen
-from fcslam.robot.motion_prediction import without_odometry
+from fcslam.robot.motion_prediction import PREDICTED
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
 pytestmark = pytest.mark.slow
@@ -50,7 +59,7 @@ def elsewhere():
 
 def judged(frontend, scans):
     tracking = frontend.localize(scans[0])
-    return is_lost(scans, tracking.tracked.T_local_base, frontend, CONFIG)
+    return is_lost(scans, tracking.tracked.T_local_base, frontend)
 
 
 def test_looking_leaves_no_trace(around):
@@ -120,7 +129,7 @@ def test_scans_that_share_little_or_disagree_do_not_show_one_place(around, farth
 
 
 def test_a_robot_without_wheels_never_drove_on_by_odometry(around):
-    frontend = LidarFrontend("r", without_odometry(LidarConfig()))
+    frontend = LidarFrontend("r", LidarConfig(), PREDICTED)
     for scan in around[:60]:
         frontend.process(scan)
     frontend._tracker._trust = OdometryTrust(0.5, 0.5, 200)
@@ -159,17 +168,17 @@ def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
 def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):
     before = around[:15]
     frontend = mapped(before)
-    assert 0.0 < frontend.travel_m < CONFIG.settled_m
+    assert 0.0 < frontend.travel_m < SETTLED_M
     assert not is_doubtful(frontend.localize(moved_on(elsewhere, before)[0]), frontend, CONFIG)
 
 
 def test_it_takes_a_way_and_several_scans_or_very_many(around):
-    still = [around[0]] * CONFIG.most_scans
-    far = [replace(around[0], T_odom_base=frozen(np.array([0.3 * k, 0.0, 0.0]))) for k in range(CONFIG.fewest_scans)]
-    assert can_decide(still, CONFIG)
-    assert not can_decide(still[:-1], CONFIG)
-    assert can_decide(far, CONFIG)
-    assert not can_decide(far[:-1], CONFIG)
+    still = [around[0]] * MOST_SCANS
+    far = [replace(around[0], T_odom_base=frozen(np.array([0.3 * k, 0.0, 0.0]))) for k in range(FEWEST_SCANS)]
+    assert can_decide(still)
+    assert not can_decide(still[:-1])
+    assert can_decide(far)
+    assert not can_decide(far[:-1])
 
 
 def test_what_was_not_matched_is_not_doubted(around):

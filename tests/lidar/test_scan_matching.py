@@ -5,11 +5,10 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
-from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.matching import POINT_SIGMA_M, match_scan
 from tests.lidar.worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 NO_PRIOR = np.zeros((3, 3))
-CONFIG = MatchingConfig()
 OFFSET = np.array([0.04, 0.03, 0.02])
 OFFSETS = [np.array([x, y, np.deg2rad(t)]) for x in (-0.2, 0.0, 0.2) for y in (-0.2, 0.0, 0.2) for t in (-5, 0, 5)]
 
@@ -35,7 +34,7 @@ def test_a_moved_scan_matches_where_it_was_taken(field, noise_m):
     worst = np.zeros(2)
     for offset in OFFSETS:
         scan = scan_at(truth, room(), noise_m=noise_m, rng=rng)
-        found = match_scan(scan, field, truth + offset, NO_PRIOR, CONFIG)
+        found = match_scan(scan, field, truth + offset, NO_PRIOR)
         assert found.explained > 0.9
         worst = np.maximum(worst, error(found.T_field_base, truth))
     assert worst[0] < 0.01
@@ -45,7 +44,7 @@ def test_a_moved_scan_matches_where_it_was_taken(field, noise_m):
 def test_the_guess_is_left_alone(field):
     guess = np.array([0.1, 0.1, 0.1])
     guess.setflags(write=False)
-    match_scan(scan_at((0, 0, 0), room()), field, guess, NO_PRIOR, CONFIG)
+    match_scan(scan_at((0, 0, 0), room()), field, guess, NO_PRIOR)
     np.testing.assert_array_equal(guess, (0.1, 0.1, 0.1))
 
 
@@ -53,7 +52,7 @@ def test_headings_across_the_cut_are_near(field):
     truth = np.array([0.1, 0.0, np.pi - 0.01])
     scan = scan_at(truth, room())
     prior = np.diag((1e2, 1e2, 1e4))
-    found = match_scan(scan, field, np.array([0.1, 0.0, -np.pi + 0.02]), prior, CONFIG)
+    found = match_scan(scan, field, np.array([0.1, 0.0, -np.pi + 0.02]), prior)
     assert error(found.T_field_base, truth)[1] < 0.3
     assert -np.pi <= found.T_field_base[2] < np.pi
 
@@ -69,7 +68,7 @@ def test_a_corridor_is_fixed_across_and_held_by_the_prior_along(heading):
     truth = np.array([0.0, 0.0, heading])
     guess = truth + np.array([*(0.1 * along + 0.1 * across), 0.03])
     prior = np.diag((0.05**-2, 0.05**-2, 0.05**-2))  # a tracker's, after a step of 0.1 m
-    found = match_scan(scan_at(truth, walls, noise_m=0.01, rng=rng), field, guess, prior, CONFIG)
+    found = match_scan(scan_at(truth, walls, noise_m=0.01, rng=rng), field, guess, prior)
     assert abs((found.T_field_base[:2] - truth[:2]) @ across) < 0.005
     assert abs((found.T_field_base[:2] - guess[:2]) @ along) < 0.05
     values, vectors = np.linalg.eigh(found.information[:2, :2])
@@ -83,14 +82,14 @@ def test_the_information_predicts_the_cost():
     truth = np.array([0.2, 0.1, 0.7])
     scan = scan_at(truth, walls)
     field = field_of([(scan, truth)])
-    found = match_scan(scan, field, truth, NO_PRIOR, CONFIG)
+    found = match_scan(scan, field, truth, NO_PRIOR)
     labels = field.nearest(se2.transform(truth, scan.points))
     anchors, normals = field.points[labels], field.normals[labels]
     flat = np.hypot(*normals.T) > 0
 
     def cost(pose):
         rest = np.einsum("nk,nk->n", se2.transform(pose, scan.points) - anchors, normals)[flat]
-        return np.sum(rest**2) / CONFIG.point_sigma_m**2
+        return np.sum(rest**2) / POINT_SIGMA_M**2
 
     rng = np.random.default_rng(0)
     for _ in range(10):
@@ -105,7 +104,7 @@ def test_the_two_sides_of_a_thin_wall_do_not_attract_each_other(offset_m):
     near, far = path((0, -3), (0, 3)), path((0.1, -3), (0.1, 3))
     field = field_of([(scan_at((-2, 0, 0), near), np.array([-2.0, 0.0, 0.0]))])
     pose = np.array([2.0 + offset_m, 0.0, 3.0])
-    found = match_scan(scan_at(pose, far), field, pose, NO_PRIOR, CONFIG)
+    found = match_scan(scan_at(pose, far), field, pose, NO_PRIOR)
     np.testing.assert_allclose(found.T_field_base, pose, atol=1e-9)
     assert found.explained == 0.0
     np.testing.assert_array_equal(found.information, NO_PRIOR)
@@ -118,7 +117,7 @@ def test_a_wall_seen_from_both_sides_keeps_its_thickness():
     field = field_of([(scan_at(pose, wall, noise_m=0.01, rng=rng), pose) for pose in sides])
     for x in (-1.8, 1.8):
         truth = np.array([x, 0.2, 0.1])
-        found = match_scan(scan_at(truth, wall, noise_m=0.01, rng=rng), field, truth + OFFSET, NO_PRIOR, CONFIG)
+        found = match_scan(scan_at(truth, wall, noise_m=0.01, rng=rng), field, truth + OFFSET, NO_PRIOR)
         assert error(found.T_field_base, truth)[0] < 0.01
 
 
@@ -128,10 +127,10 @@ def test_moving_field_and_guess_moves_the_result():
     scans = [scan_at(pose, ring(), noise_m=0.01, rng=rng) for pose in poses]
     truth = ring_drive()[30]
     scan, guess = scan_at(truth, ring(), noise_m=0.01, rng=rng), truth + np.array([0.08, -0.05, 0.03])
-    here = match_scan(scan, field_of(list(zip(scans, poses, strict=True))), guess, NO_PRIOR, CONFIG)
+    here = match_scan(scan, field_of(list(zip(scans, poses, strict=True))), guess, NO_PRIOR)
     for move in (np.array([3.0, -7.0, 0.9]), np.array([-11.3, 4.02, -2.5])):
         moved = field_of([(s, se2.compose(move, pose)) for s, pose in zip(scans, poses, strict=True)])
-        there = match_scan(scan, moved, se2.compose(move, guess), NO_PRIOR, CONFIG)
+        there = match_scan(scan, moved, se2.compose(move, guess), NO_PRIOR)
         shift, turn = error(there.T_field_base, se2.compose(move, here.T_field_base))
         assert shift < 0.003  # the cells fall differently
         assert turn < 0.06
@@ -146,6 +145,6 @@ def test_nothing_known_leaves_the_guess(field):
     nothing = bare_scan([])
     guess = np.array([1.0, 2.0, 0.5])
     for scan, other in ((nothing, field), (scan_at((0, 0, 0), room()), field_of([]))):
-        found = match_scan(scan, other, guess, NO_PRIOR, CONFIG)
+        found = match_scan(scan, other, guess, NO_PRIOR)
         np.testing.assert_allclose(found.T_field_base, guess, atol=1e-12)
         assert found.explained == 0.0

@@ -8,8 +8,8 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import TABLE
-from fcslam.lidar.odometry import OdometryConfig, odometry_error
-from fcslam.lidar.tracker import ScanTracker, TrackerConfig
+from fcslam.lidar.odometry import WHEELS, odometry_error
+from fcslam.lidar.tracker import BUFFER_KEYSCANS, ScanTracker
 from fcslam.records import LaserModel, frozen
 from tests.lidar.worlds import (
     LASER,
@@ -28,9 +28,9 @@ from tests.lidar.worlds import (
 KEYSCAN_M, KEYSCAN_RAD = 0.25, 0.25
 
 
-def track(scans, config=None):
+def track(scans):
     """Poses of every scan; what moved on enough goes into the buffer, as the mapper does it."""
-    tracker = ScanTracker(config or TrackerConfig())
+    tracker = ScanTracker(WHEELS)
     poses, last = [], None
     for scan in scans:
         tracked = tracker.track(scan)
@@ -203,7 +203,7 @@ def test_the_buffer_does_not_grow_with_the_drive(truth):
         _, tracker = track(recording(poses, se2.between(poses[0], poses), ring(), noise_m=0.005))
         fields = [field for field, _ in tracker._fields]
         assert len(fields) <= 2
-        assert all(count <= TrackerConfig().buffer_keyscans for _, count in tracker._fields)
+        assert all(count <= BUFFER_KEYSCANS for _, count in tracker._fields)
         assert all(field.arrays.table.shape == (TABLE, TABLE) for field in fields)
         return max(len(field.points) for field in fields), max(field.arrays.labels.nbytes for field in fields)
 
@@ -217,7 +217,7 @@ def test_the_learned_error_of_odometry_is_its_true_error(truth, share):
     """The normalised innovation is about 1: trust is neither too high nor too low."""
     poses = truth[:250]
     rng, steps = np.random.default_rng(4), se2.relative(poses)
-    model = [odometry_error(np.hypot(x, y), abs(turn), OdometryConfig()) for x, y, turn in steps.tolist()]
+    model = [odometry_error(np.hypot(x, y), abs(turn), WHEELS) for x, y, turn in steps.tolist()]
     sigmas = np.array([(error.position_m, error.position_m, error.heading_rad) for error in model])
     errors = share * sigmas * rng.standard_normal(steps.shape)
     odometry = list(accumulate(se2.compose(steps, errors), se2.compose, initial=np.zeros(3)))

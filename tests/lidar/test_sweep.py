@@ -8,7 +8,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
-from fcslam.lidar.matching import FIXED, MatchingConfig, match_scan
+from fcslam.lidar.matching import FIXED, match_scan
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
 from fcslam.lidar.scan import point_scan, rays_of
 from fcslam.records import LaserModel, Sweep
@@ -17,7 +17,6 @@ LASER = LaserModel(360, -np.pi, 2.0 * np.pi / 360, 20.0, (0.12, -0.05, 0.2))
 HALF_M = np.array((3.0, 2.2))
 """Half the sides of the room around the origin."""
 SWEEP = Sweep(0.0, 0.14, (0.5, -0.05, 1.3), (0.8, 0.2, -4.0))
-CONFIG = MatchingConfig()
 NO_PRIOR = np.zeros((3, 3))
 
 
@@ -78,10 +77,10 @@ def test_a_match_finds_pose_and_velocity():
     sweep, guess = Sweep(0.0, 0.14, (0.5, 0.0, 1.3)), truth + np.array((0.02, -0.02, 0.02))
     assumed = sweep._replace(velocity=(0.5, 0.0, 0.5))
     scan = point_scan(ranges_in_room(truth, sweep), LASER, assumed)
-    loose = match_scan(scan, field, guess, NO_PRIOR, CONFIG, np.array((4.0, 4.0, 1.0)))
+    loose = match_scan(scan, field, guess, NO_PRIOR, np.array((4.0, 4.0, 1.0)))
     assert loose.velocity[2] == pytest.approx(0.8, abs=0.05)
     np.testing.assert_allclose(loose.T_field_base, truth, atol=0.02)
-    fixed = match_scan(scan, field, guess, NO_PRIOR, CONFIG, FIXED)
+    fixed = match_scan(scan, field, guess, NO_PRIOR, FIXED)
     assert np.abs(fixed.velocity).max() < 1e-6
     assert abs(fixed.T_field_base[2] - truth[2]) > 5.0 * abs(loose.T_field_base[2] - truth[2])
 
@@ -89,9 +88,7 @@ def test_a_match_finds_pose_and_velocity():
 def test_an_open_velocity_costs_information():
     field = field_of([(point_scan(ranges_in_room(np.zeros(3), None), LASER), np.zeros(3))])
     scan = point_scan(ranges_in_room(np.zeros(3), SWEEP), LASER, SWEEP)
-    matches = [
-        match_scan(scan, field, np.zeros(3), NO_PRIOR, CONFIG, np.full(3, known)).information for known in (1.0, 1e12)
-    ]
+    matches = [match_scan(scan, field, np.zeros(3), NO_PRIOR, np.full(3, known)).information for known in (1.0, 1e12)]
     assert np.linalg.eigvalsh(matches[1] - matches[0]).min() > -1e-3
     assert np.trace(matches[1]) > 1.5 * np.trace(matches[0])
 

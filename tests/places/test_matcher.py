@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from fcslam.features.birdseye import BirdseyeConfig, describe
+from fcslam.features.birdseye import BIRDSEYE, describe
 from fcslam.geometry import se2
 from fcslam.lidar.submap import build_submap
+from fcslam.places import motions
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
-from fcslam.places.motions import MotionConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
 from tests.lidar.worlds import corridor, other_room, room, scan_at
@@ -29,7 +29,7 @@ class Visits:
         poses = se2.compose(np.array(pose), steps)
         scans = [(scan_at(p, world, noise_m=0.01, rng=rng), s) for p, s in zip(poses, steps, strict=True)]
         submap = build_submap(scans)
-        features = describe(submap.surface.points, BirdseyeConfig())
+        features = describe(submap.surface.points, BIRDSEYE)
         place = Place(
             KeyscanId(robot, number), Channel.LIDAR, "v", number, number, features.keypoints_m, features.descriptors
         )
@@ -63,8 +63,9 @@ def test_the_same_room_from_another_pose_is_the_same_place(visits):
     assert len(matcher) == 2
 
 
-def test_another_room_is_another_place(visits):
-    matcher = visits.matcher(motions=MotionConfig(inliers=4))
+def test_another_room_is_another_place(visits, monkeypatch):
+    monkeypatch.setattr(motions, "LEAST_INLIERS", 4)
+    matcher = visits.matcher()
     matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
     matches = matcher.match(visits.visit("b", 0, other_room(), (0.5, 0.5, 1.0)), {}, STRANGERS)
     assert not any(match.M for match in matches)

@@ -8,12 +8,12 @@ import pytest
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.lidar_depth import LidarView, locate_keypoints
 from fcslam.geometry import se2
-from fcslam.places.motions import MotionConfig, propose_motions
+from fcslam.places import motions
+from fcslam.places.motions import propose_motions
 from fcslam.records import Channel, KeyscanId, Place, frozen
 from tests.features.pictures import CAMERA, picture
 from tests.lidar.worlds import LASER, room, scan_at
 
-CONFIG = MotionConfig()
 T_A_B = np.array([0.7, -0.4, 0.5])
 
 
@@ -44,42 +44,40 @@ def viewed(robot, pose):
 
 @pytest.mark.parametrize("channel", Channel)
 def test_planted_motions_are_found(channel):
-    first = propose_motions(*planted(channel=channel), CONFIG)[0]
+    first = propose_motions(*planted(channel=channel))[0]
     assert np.allclose(first.T_a_b, T_A_B, atol=1e-5)
     assert first.share == 1.0
 
 
-def test_keypoints_at_other_heights_do_not_match():
+def test_keypoints_at_other_heights_do_not_match(monkeypatch):
     a, b = planted()
     lifted = replace(b, keypoints=frozen(b.keypoints + np.array([0.0, 0.0, 0.3]), np.float32))
-    assert propose_motions(a, lifted, CONFIG) == []
-    assert len(propose_motions(a, lifted, MotionConfig(level_m=0.4))) == 1
+    assert propose_motions(a, lifted) == []
+    monkeypatch.setattr(motions, "LARGEST_LEVEL_M", 0.4)
+    assert len(propose_motions(a, lifted)) == 1
 
 
 def test_too_few_keypoints_say_nothing():
-    assert propose_motions(*planted(count=CONFIG.inliers - 1), CONFIG) == []
+    assert propose_motions(*planted(count=motions.LEAST_INLIERS - 1)) == []
 
 
 @pytest.mark.parametrize("pose_b", [(-1.0, -0.6, 0.45), (-0.6, -1.2, 0.1), (-1.9, -1.1, 0.0)])
 def test_pictures_of_one_room_tell_how_their_robots_stood(pose_b):
     pose_a = np.array([-1.5, -1.0, 0.2])
-    first = propose_motions(viewed("a", pose_a), viewed("b", np.array(pose_b)), CONFIG)[0]
+    first = propose_motions(viewed("a", pose_a), viewed("b", np.array(pose_b)))[0]
     off = se2.between(se2.between(pose_a, np.array(pose_b)), first.T_a_b)
     assert np.hypot(off[0], off[1]) < 0.06
     assert abs(off[2]) < 0.02
 
 
 def test_pictures_of_two_walls_tell_nothing():
-    assert (
-        propose_motions(viewed("a", np.array([-1.5, -1.0, 0.2])), viewed("b", np.array([-1.5, -1.0, 2.9])), CONFIG)
-        == []
-    )
+    assert propose_motions(viewed("a", np.array([-1.5, -1.0, 0.2])), viewed("b", np.array([-1.5, -1.0, 2.9]))) == []
 
 
 def test_information_is_that_of_the_keypoints():
     """Against the second derivative of half the squared distances, and no more than of ten keypoints."""
     a, b = planted(count=10)
-    (first, *_) = propose_motions(a, b, CONFIG)
+    (first, *_) = propose_motions(a, b)
 
     def cost(pose):
         return 0.5 * np.sum((se2.transform(pose, b.keypoints[:, :2]) - a.keypoints[:, :2]) ** 2)
@@ -89,10 +87,10 @@ def test_information_is_that_of_the_keypoints():
         for c, dc in enumerate(step * np.eye(3)):
             signs = [cost(T_A_B + s * dr + t * dc) * s * t for s in (1, -1) for t in (1, -1)]
             numeric[r, c] = sum(signs) / (4 * step**2)
-    assert np.allclose(first.information, numeric / CONFIG.keypoint_sigma_m**2, rtol=1e-3, atol=1.0)
-    many = propose_motions(*planted(count=80), CONFIG)[0]
+    assert np.allclose(first.information, numeric / motions.KEYPOINT_SIGMA_M**2, rtol=1e-3, atol=1.0)
+    many = propose_motions(*planted(count=80))[0]
     assert many.information[0, 0] == pytest.approx(first.information[0, 0])
 
 
 def test_lidar_keypoints_add_no_information():
-    assert not propose_motions(*planted(channel=Channel.LIDAR), CONFIG)[0].information.any()
+    assert not propose_motions(*planted(channel=Channel.LIDAR))[0].information.any()

@@ -138,7 +138,7 @@ def test_quality_falls_with_the_first_keyscan_that_shows_other_walls(fleet, buil
     for scan in robot.scans():
         frontend.process(scan)
     start = small_fleet.truth_at(robot, [robot.stamps[0]])[0]
-    localizer = MapLocalizer(frozen_map(building, "building"), config.localization, config.lidar, start)
+    localizer = MapLocalizer(frozen_map(building, "building"), start)
     qualities = []
     for new in kept.inputs[:8]:
         localizer.submit(new)

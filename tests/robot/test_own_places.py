@@ -6,17 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fcslam.features.birdseye import BirdseyeConfig
 from fcslam.geometry import se2
+from fcslam.lidar import closing
 from fcslam.lidar.backend import LidarBackend
 from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LoopCloser
-from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.tracker import OdometryConfig, TrackedScan
+from fcslam.lidar.tracker import TrackedScan
 from fcslam.lidar.verification import VerificationConfig
-from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
+from fcslam.robot.own_places import OwnPlaces
 from tests.lidar.worlds import box, path, recording, scan_at, shifted
 
 STEP_M = 1.0
@@ -76,14 +75,14 @@ def submaps_of(world, length_m):
 
 
 def closures(submaps, poses, recognizer, config=None):
-    closer = LoopCloser(config or ClosingConfig(), SearchConfig(), VerificationConfig(), recognizer)
+    closer = LoopCloser(config or ClosingConfig(), VerificationConfig(), recognizer)
     anchors = np.array([poses[anchored.keyscan] for anchored, _ in submaps])
     found = [closer.add(anchored, submap, anchors[: k + 1]) for k, (anchored, submap) in enumerate(submaps)]
     return [(2 * c.earlier, 2 * c.later, c) for closures in found for c in closures]
 
 
 def own_places():
-    return OwnPlaces(OwnPlacesConfig(), BirdseyeConfig())
+    return OwnPlaces()
 
 
 def test_a_loop_whose_drift_is_beyond_the_search_is_closed():
@@ -112,11 +111,12 @@ def test_what_is_forgotten_is_not_recognised():
     assert keyscans[8] not in places.most_similar(keyscans[9], keyscans, 10)
 
 
-@pytest.mark.parametrize("drift", [ClosingConfig().recognized_drift, 2.0])
-def test_places_that_look_alike_do_not_close_a_loop(drift):
+@pytest.mark.parametrize("drift", [closing.RECOGNIZED_DRIFT, 2.0])
+def test_places_that_look_alike_do_not_close_a_loop(drift, monkeypatch):
     """With the default, and with so much drift allowed for that nothing but the looks speaks against it."""
+    monkeypatch.setattr(closing, "RECOGNIZED_DRIFT", drift)
     truth, submaps = submaps_of(equal_doors, 180.0)
-    assert closures(submaps, list(truth), own_places(), ClosingConfig(recognized_drift=drift)) == []
+    assert closures(submaps, list(truth), own_places()) == []
 
 
 class VeeringTracker:
@@ -145,7 +145,6 @@ def test_the_map_closes_with_its_loop(recognizes):
     frontend = LidarFrontend("r", LidarConfig())
     backend = LidarBackend("r", LidarConfig(), own_places() if recognizes else None)
     frontend._tracker = VeeringTracker(poses)
-    frontend._tracker.config = SimpleNamespace(odometry=OdometryConfig())
     segments = blocks()
     for k, pose in enumerate(poses):
         backend.add(frontend.process(*recording(truth[k : k + 1], [pose], segments, seed=k)).keyscan)

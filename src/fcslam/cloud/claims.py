@@ -17,32 +17,27 @@ from fcslam.wire.limits import TILE_CELLS
 
 _ROUNDING = 1.01
 """Information is sent in single precision, and standard deviations are compared by its diagonal."""
+LONGEST_MOTION_M = 20.0
+"""Largest motion between two consecutive keyscans, metres."""
+LONGEST_CLOSURE_M = 50.0
+"""Largest distance between two keyscans that a robot's own closure connects, metres."""
+WIDEST_SUBMAP_M = 100.0
+"""Largest distance of a keyscan from the anchor of its submap, metres."""
+MOST_SUBMAP_KEYSCANS = 2000
+"""Largest number of keyscans in a submap."""
+MOST_MAP_TILES = 1200
+"""Largest number of tiles, 256 by 256 cells each, of the box around a session's own map."""
+LEAST_SIGMA_M = 0.001
+"""Least standard deviation of a position that a robot measures, metres."""
+LEAST_SIGMA_RAD = 0.0002
+"""Least standard deviation of a heading that a robot measures, radians."""
 
 
 class ClaimLimits(Settings):
     """Bounds on the packets of a robot; a packet beyond one is refused with the reason."""
 
-    motion_m: float = Field(default=20.0, gt=0, description="largest motion between two consecutive keyscans [m]")
-    closure_m: float = Field(
-        default=50.0, gt=0, description="largest distance between two keyscans that a robot's own closure connects [m]"
-    )
     distance_m: float = Field(
         default=20_000.0, gt=0, description="largest distance of a robot from its start, by its motions [m]"
-    )
-    submap_m: float = Field(
-        default=100.0, gt=0, description="largest distance of a keyscan from the anchor of its submap [m]"
-    )
-    submap_keyscans: int = Field(default=2000, gt=0, description="largest number of keyscans in a submap")
-    map_tiles: int = Field(
-        default=1200,
-        gt=0,
-        description="largest number of tiles, 256 by 256 cells each, of the box around a session's own map",
-    )
-    sigma_m: float = Field(
-        default=0.001, gt=0, description="least standard deviation of a position that a robot measures [m]"
-    )
-    sigma_rad: float = Field(
-        default=0.0002, gt=0, description="least standard deviation of a heading that a robot measures [rad]"
     )
     packets_per_s: float = Field(
         default=1000.0,
@@ -56,7 +51,7 @@ class ClaimLimits(Settings):
     )
 
 
-def check_constraint(constraint: Constraint, largest_m: float, limits: ClaimLimits) -> None:
+def check_constraint(constraint: Constraint, largest_m: float) -> None:
     """Check a constraint, whose length is at most ``largest_m``.
 
     Raises:
@@ -65,12 +60,12 @@ def check_constraint(constraint: Constraint, largest_m: float, limits: ClaimLimi
     name = f"{constraint.robot}: constraint {constraint.i} to {constraint.j}"
     length_m = math.hypot(constraint.T_i_j[0], constraint.T_i_j[1])
     if not length_m <= largest_m:
-        raise PacketError(f"{name} is {length_m:.4g} m long, at most {largest_m:g} m (fleet.claims)")
+        raise PacketError(f"{name} is {length_m:.4g} m long, at most {largest_m:g} m")
     x, y, theta = (constraint.information.diagonal() / _ROUNDING).tolist()
-    if max(x, y) > limits.sigma_m**-2 or theta > limits.sigma_rad**-2:
+    if max(x, y) > LEAST_SIGMA_M**-2 or theta > LEAST_SIGMA_RAD**-2:
         raise PacketError(
             f"{name} claims a standard deviation of {max(x, y) ** -0.5:.3g} m and {theta**-0.5:.3g} rad, at least "
-            f"{limits.sigma_m:g} m and {limits.sigma_rad:g} rad (fleet.claims)"
+            f"{LEAST_SIGMA_M:g} m and {LEAST_SIGMA_RAD:g} rad"
         )
 
 
@@ -125,25 +120,23 @@ def check_tile(tile: MapTile, earlier: Mapping[tuple[int, int], MapTile], limits
     if any(other.resolution_m != tile.resolution_m for other in earlier.values()):
         raise PacketError(f"{name} has another resolution than those before")
     columns, rows = np.ptp([(tile.column, tile.row), *earlier], axis=0) + 1
-    if columns * rows > limits.map_tiles:
-        raise PacketError(
-            f"{name} makes the map {columns} by {rows} tiles large, at most {limits.map_tiles} tiles (fleet.claims)"
-        )
+    if columns * rows > MOST_MAP_TILES:
+        raise PacketError(f"{name} makes the map {columns} by {rows} tiles large, at most {MOST_MAP_TILES} tiles")
     distance_m = math.hypot(tile.column, tile.row) * TILE_CELLS * tile.resolution_m
     if not distance_m <= limits.distance_m:
         raise PacketError(f"{name} is {distance_m:.4g} m off, at most {limits.distance_m:g} m (fleet.claims)")
 
 
-def check_submap(place: Place, poses: FloatArray, limits: ClaimLimits) -> None:
+def check_submap(place: Place, poses: FloatArray) -> None:
     """Check the submap of a place, whose keyscans have these poses (N, 3) by the robot's motions alone.
 
     Raises:
         PacketError: it has too many keyscans, or one is too far from the anchor.
     """
     name = f"{place.id.robot}: {place.channel} place {place.id.number}"
-    if len(poses) > limits.submap_keyscans:
-        raise PacketError(f"{name} has {len(poses)} keyscans, at most {limits.submap_keyscans} (fleet.claims)")
+    if len(poses) > MOST_SUBMAP_KEYSCANS:
+        raise PacketError(f"{name} has {len(poses)} keyscans, at most {MOST_SUBMAP_KEYSCANS}")
     anchor = poses[place.id.number - place.first]
     reach_m = float(np.hypot(*se2.between(anchor, poses)[:, :2].T).max())
-    if not reach_m <= limits.submap_m:
-        raise PacketError(f"{name} has a keyscan {reach_m:.4g} m away, at most {limits.submap_m:g} m (fleet.claims)")
+    if not reach_m <= WIDEST_SUBMAP_M:
+        raise PacketError(f"{name} has a keyscan {reach_m:.4g} m away, at most {WIDEST_SUBMAP_M:g} m")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureLog
-from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import KeyscanId, Place
 from fcslam.storage.state_file import State
@@ -35,10 +35,8 @@ class _Comparison(NamedTuple):
 class CorrectionQuality:
     """Keeps the newest comparison of every session with another session of its map."""
 
-    def __init__(self, graph: JointGraph, off_m: float, off_rad: float) -> None:
-        """A comparison supports the map if it differs from it by at most ``off_m`` metres and ``off_rad`` radians."""
+    def __init__(self, graph: JointGraph) -> None:
         self._graph = graph
-        self._off_m, self._off_rad = off_m, off_rad
         self._newest: dict[str, _Comparison] = {}
 
     def update(self, place: Place, matches: Iterable[PlaceMatch], robots: Collection[str]) -> None:
@@ -88,4 +86,4 @@ class CorrectionQuality:
 
     def _fits(self, match: PlaceMatch) -> bool:
         off = self._graph.innovation(match.i, match.j, match.T_i_j)
-        return bool(np.hypot(off[0], off[1]) <= self._off_m and abs(off[2]) <= self._off_rad)
+        return bool(np.hypot(off[0], off[1]) <= SURPRISE_M and abs(off[2]) <= SURPRISE_RAD)

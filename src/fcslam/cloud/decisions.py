@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
-from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.cloud.map_comparison import MapComparison
 from fcslam.cloud.reevaluation import reevaluate
 from fcslam.cloud.result import Fusion
@@ -257,8 +257,8 @@ class ClosureDecisions:
         if closure.i.robot in self.map_of(closure.j.robot):
             off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
             off_m = float(np.hypot(off[0], off[1]))
-            if off_m < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
-                fits = Reason(ReasonCode.FITS_JOINT_MAP, off_m, self._config.surprise_m, "fleet.surprise_m")
+            if off_m < SURPRISE_M and abs(off[2]) < SURPRISE_RAD:
+                fits = Reason(ReasonCode.FITS_JOINT_MAP, off_m, SURPRISE_M)
                 self._accept(entry, fits)
                 return True
         entry.independent = True  # the joint map did not predict this closure

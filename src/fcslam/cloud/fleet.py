@@ -7,7 +7,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Self
 
-from fcslam.cloud.claims import check_constraint, check_submap, with_least_noise
+from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
 from fcslam.cloud.edits import floors, is_removed, needs_new_fleet
@@ -81,7 +81,7 @@ class Fleet:
         self._recognition = PlaceRecognition(
             config, seed, self._sessions, self._graph, self._decisions.closures, self._timed(verify_pairs)
         )
-        self._quality = CorrectionQuality(self._graph, config.surprise_m, config.surprise_rad)
+        self._quality = CorrectionQuality(self._graph)
         self._needs_replay = False
         """Whether something besides the packets changed the graph: an edit."""
         self._replayed: _Replayed | None = None
@@ -110,7 +110,7 @@ class Fleet:
                 self._graph.extend(with_least_noise(motion, self._config.matcher.verification))
             case Constraint() as closure:
                 self._sessions.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
-                check_constraint(closure, self._config.claims.closure_m, self._config.claims)
+                check_constraint(closure, LONGEST_CLOSURE_M)
                 self._decisions.add_local(with_least_noise(closure, self._config.matcher.verification))
             case Place() as place:
                 self._place(place)
@@ -290,7 +290,7 @@ class Fleet:
     def _check_submap(self, place: Place) -> None:
         robot = place.id.robot
         self._sessions.require(place.id, KeyscanId(robot, place.last))
-        check_submap(place, self._graph.chain(robot, place.first, place.last), self._config.claims)
+        check_submap(place, self._graph.chain(robot, place.first, place.last))
 
     def _add_place(self, place: Place) -> None:
         """Match a place (Algorithm 1), decide about its closures, join maps, optimise."""

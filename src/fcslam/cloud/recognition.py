@@ -13,7 +13,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import robot_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.submaps import SubmapCache
-from fcslam.cloud.visits import NEWEST_PLACES, Visit, visits_near, worth_comparing
+from fcslam.cloud.visits import NEAR_VISITS, NEWEST_PLACES, Visit, visits_near, worth_comparing
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import places_of_old_sessions, surplus_places
 from fcslam.lidar.pair_verification import VerifyPairs
@@ -160,7 +160,7 @@ class PlaceRecognition:
             found = visits_near(session, numbers, poses, pose[:2], self._config.sight_m)
             if found:
                 visits.setdefault(robot_of(session), []).extend(found)
-        chosen = worth_comparing(visits, self._closures_near(visits), self._config.near_visits)
+        chosen = worth_comparing(visits, self._closures_near(visits), NEAR_VISITS)
         return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
 
     def _closures_near(self, visits: Mapping[str, Sequence[Visit]]) -> Counter[frozenset[str]]:

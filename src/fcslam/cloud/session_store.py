@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from fcslam.cloud.claims import ClaimLimits, check_constraint, check_distance, check_tile
+from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint, check_distance, check_tile
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
@@ -113,7 +113,7 @@ class SessionStore:
         robot, connected = motion.robot, self._connected.get(motion.robot, 0)
         if connected == len(self._stamps.get(robot, ())) or (motion.i, motion.j) != (connected - 1, connected):
             raise PacketError(f"{robot}: motion {motion.i} to {motion.j} does not lead to a new keyscan")
-        check_constraint(motion, self._limits.motion_m, self._limits)
+        check_constraint(motion, LONGEST_MOTION_M)
         before = self._T_odom_base.get(robot)
         T_odom_base = motion.T_i_j if before is None else se2.compose(before, motion.T_i_j)
         check_distance(T_odom_base, robot, self._limits)

@@ -26,22 +26,6 @@ class FleetConfig(Settings):
     sight_m: float = Field(
         default=6.0, gt=0, description="largest distance, in metres, at which places in the same map are compared"
     )
-    near_visits: int = Field(
-        default=2,
-        ge=0,
-        description="number of earlier visits of each robot that are compared with a new place; of robots that "
-        "closures nearby tie together, two count",
-    )
-    surprise_m: float = Field(
-        default=0.5,
-        gt=0,
-        description="a closure that differs from the joint map by this much, in metres, needs a cluster of closures",
-    )
-    surprise_rad: float = Field(
-        default=0.1,
-        gt=0,
-        description="a closure that differs from the joint map by this much, in radians, needs a cluster of closures",
-    )
     solve_every: int = Field(
         default=40,
         gt=0,

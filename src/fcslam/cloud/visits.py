@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from fcslam.records import FloatArray, KeyscanId
 
+NEAR_VISITS = 2
+"""Earlier visits of each robot that are compared with a new place; of robots that closures nearby tie together, two
+count."""
 TIED_CLOSURES = 3
 """Closures near a place after which the relative pose of two groups of robots is well determined there: together they
 are more certain than one more closure, which therefore adds little."""

@@ -15,10 +15,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from fcslam.compiled import njit
-from fcslam.config import Settings
 from fcslam.features.codes import CODE_BITS
 from fcslam.records import CODE_BYTES, Codes, FloatArray, frozen
 
@@ -37,33 +35,33 @@ _PAIR_LENGTHS = (0.15, 0.75)
 Picture = NDArray[np.uint8]
 
 
-class BirdseyeConfig(Settings):
-    """Bird's-eye features of LiDAR submaps. Places from different settings cannot be compared."""
+@dataclass(frozen=True, slots=True)
+class BirdseyeConfig:
+    """Bird's-eye features of LiDAR submaps."""
 
-    side_m: float = Field(
-        default=30.0, gt=4.0, le=200.0, description="side of the bird's-eye picture around the keyscan [m]"
-    )
-    cell_m: float = Field(default=0.1, ge=0.02, le=1.0, description="side of a cell of the bird's-eye picture [m]")
-    field_sigma_m: float = Field(
-        default=0.35, gt=0.0, le=5.0, description="standard deviation of the likelihood field around a wall [m]"
-    )
-    most_features: int = Field(
-        default=400, ge=1, le=5000, description="most features of a submap, the strongest corners first"
-    )
-    corner_quality: float = Field(
-        default=0.003, gt=0.0, lt=1.0, description="weakest corner response, as a share of the strongest one"
-    )
-    patch_radius_m: float = Field(
-        default=1.5, gt=0.0, le=20.0, description="radius of the patch that a descriptor describes [m]"
-    )
-    orientation_radius_m: float = Field(
-        default=0.8, gt=0.0, le=20.0, description="radius of the disc whose centroid orients a descriptor [m]"
-    )
+    side_m: float = 30.0
+    """Side of the bird's-eye picture around the keyscan, metres."""
+    cell_m: float = 0.1
+    """Side of a cell of the bird's-eye picture, metres."""
+    field_sigma_m: float = 0.35
+    """Standard deviation of the likelihood field around a wall, metres."""
+    most_features: int = 400
+    """Most features of a submap, the strongest corners first."""
+    corner_quality: float = 0.003
+    """Weakest corner response, as a share of the strongest one."""
+    patch_radius_m: float = 1.5
+    """Radius of the patch that a descriptor describes, metres."""
+    orientation_radius_m: float = 0.8
+    """Radius of the disc whose centroid orients a descriptor, metres."""
 
     @property
     def side_cells(self) -> int:
         """Cells along one side of the picture."""
         return round(self.side_m / self.cell_m)
+
+
+BIRDSEYE = BirdseyeConfig()
+"""Of all robots: places with other values cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True)

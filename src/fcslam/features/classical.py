@@ -26,6 +26,8 @@ _SIFT_NUMBERS: Final = 128
 """Dimension of a SIFT descriptor."""
 _PYRAMID_STEP: Final = 1.2
 """Scale factor between two levels of ORB's pyramid, OpenCV's default."""
+PYRAMID_LEVELS = 8
+"""Levels of ORB's image pyramid, each 1.2 times coarser than the one before."""
 
 
 class OrbConfig(Settings):
@@ -40,9 +42,6 @@ class OrbConfig(Settings):
         le=100,
         description="smallest contrast of a FAST corner, low for dim light [grey levels of 255]",
     )
-    pyramid_levels: int = Field(
-        default=8, ge=1, le=16, description="levels of ORB's image pyramid, each 1.2 times coarser than the one before"
-    )
 
 
 class Orb:
@@ -52,7 +51,7 @@ class Orb:
         self._orb = cv2.ORB.create(
             nfeatures=config.most_features,
             scaleFactor=_PYRAMID_STEP,
-            nlevels=config.pyramid_levels,
+            nlevels=PYRAMID_LEVELS,
             fastThreshold=config.fast_threshold,
         )
 

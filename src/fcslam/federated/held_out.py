@@ -20,7 +20,7 @@ from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
 from fcslam.places.hypotheses import rigid_hypotheses
-from fcslam.places.motions import MotionConfig
+from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
 from fcslam.records import FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")
@@ -132,10 +132,9 @@ def _inliers(a: Keyframe, b: Keyframe) -> int:
 
 def inliers(first: PlacePoints, second: PlacePoints) -> int:
     """Keypoints that the best motion between two places explains, as the cloud compares camera places."""
-    config = MotionConfig()
-    matches = mutual_matches(first.codes, second.codes, config.hamming_limit)
+    matches = mutual_matches(first.codes, second.codes, LARGEST_HAMMING)
     a, b, rows = first.positions, second.positions, matches.pairs
-    level = np.abs(a[rows[:, 0], 2] - b[rows[:, 1], 2]) <= config.level_m
+    level = np.abs(a[rows[:, 0], 2] - b[rows[:, 1], 2]) <= LARGEST_LEVEL_M
     kept = Matches(rows[level], matches.distances[level])
     flat = a[:, :2].astype(np.float32), b[:, :2].astype(np.float32)
-    return max((each.inlier_count for each in rigid_hypotheses(*flat, kept, config.hypotheses)), default=0)
+    return max((each.inlier_count for each in rigid_hypotheses(*flat, kept)), default=0)

@@ -19,31 +19,24 @@ from fcslam.records import FloatArray
 
 _PAIRS_AT_ONCE = 100_000
 """Pairs of closures tested in one go: memory must not grow with the square of the number of closures."""
+PROBABILITY = 0.99
+"""Probability with which two true closures pass the chi-square test of consistency."""
+SUPPORT_M = 10.0
+"""Largest path length between the ends of two closures, on both trajectories, at which consistent closures support
+each other, metres."""
 
 
 class ConsistencySettings(EvidenceSettings, DriftSettings):
     """When closures between two trajectories are consistent, and when they are enough to join two maps."""
 
-    probability: float = Field(
-        default=0.99,
-        gt=0.0,
-        lt=1.0,
-        description="probability with which two true closures pass the chi-square test of consistency",
-    )
     separation_m: float = Field(
         default=3.0, ge=0.0, description="least distance between two separate places, in the maps of both robots [m]"
-    )
-    support_m: float = Field(
-        default=10.0,
-        ge=0.0,
-        description="largest path length between the ends of two closures, on both trajectories, "
-        "at which consistent closures support each other [m]",
     )
 
     @property
     def limit(self) -> float:
-        """The chi-square quantile of ``probability`` for the three degrees of freedom of a loop."""
-        return float(2.0 * gammaincinv(1.5, self.probability))
+        """The chi-square quantile of ``PROBABILITY`` for the three degrees of freedom of a loop."""
+        return float(2.0 * gammaincinv(1.5, PROBABILITY))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +107,7 @@ def count_supporting_closures(
     Args:
         a, b: trajectories; the same object for closures within one robot.
         closures: K closures from a to b.
-        settings: drift, probability of the test, and ``support_m``.
+        settings: drift, probability of the test, and distance of separate places.
 
     Returns:
         Number of supporting closures of each closure, shape (K,).
@@ -124,7 +117,7 @@ def count_supporting_closures(
     near = np.ones((len(closures), len(closures)), dtype=bool)
     for path, end in ((a, closures.i), (b, closures.j)):
         travel_m = path.travel_m[end]
-        near &= np.abs(travel_m[:, None] - travel_m[None]) <= settings.support_m
+        near &= np.abs(travel_m[:, None] - travel_m[None]) <= SUPPORT_M
     k, m = np.nonzero(np.triu(near, 1))
     consistent = loop_chi2(a, b, closures, k, m) <= settings.limit
     return np.bincount(np.concatenate((k[consistent], m[consistent])), minlength=len(closures))

@@ -19,7 +19,7 @@ from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
-from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import Verification, VerificationConfig, verify
 from fcslam.records import FloatArray
@@ -28,6 +28,9 @@ SURPRISE_M, SURPRISE_RAD = 0.15, 0.03
 """A closure farther than this from its prediction contradicts the estimate, and the graph is solved at once."""
 NARROW_M = 0.8
 """Up to this drift allowance the prediction itself starts the alignment, and the loose gate is enough."""
+DISTANCE_PENALTY, ANGLE_PENALTY = 0.2, 0.1
+"""Shares of a search's score that are lost at the edges of its window: of equal poses, the one near the prediction
+counts."""
 PENDING_M = 60.0
 """Travel after which a pending closure without enough support is dropped, metres."""
 
@@ -55,39 +58,31 @@ KNOWN_CANDIDATES = 1
 well-known area."""
 SIMILAR_PLACES = 24
 """Most similar earlier submaps among which the places to compare are chosen."""
+LEAST_GAP_M = 12.0
+"""Least travel between the anchors of two submaps that are compared, metres."""
+SIGHT_M = 8.0
+"""Largest distance between the anchors of two submaps that are compared, besides the drift allowance; farther ones
+overlap too little, metres."""
+MOST_CANDIDATES = 4
+"""Largest number of earlier visits that a submap is compared with."""
+DRIFT_RAD_M = 0.006
+"""Drift of the heading allowed for, per metre of path through the graph, radians per metre."""
+WIDEST_M = 15.0
+"""Largest half side of the search window, metres."""
+WIDEST_RAD = 0.7
+"""Largest half angle of the search window, radians."""
+LEAST_SCORE = 0.5
+"""Least mean likelihood of the points that a search must reach."""
+RECOGNIZED_DRIFT = 0.25
+"""Largest drift of the position, metres per metre of path through the graph, at which place recognition closes a loop
+out of the search's reach."""
 
 
 class ClosingConfig(Settings):
     """Loop closing inside one robot."""
 
-    gap_m: float = Field(
-        default=12.0, gt=0, description="least travel between the anchors of two submaps that are compared [m]"
-    )
-    sight_m: float = Field(
-        default=8.0,
-        gt=0,
-        description="largest distance between the anchors of two submaps that are compared, besides the drift "
-        "allowance; farther ones overlap too little [m]",
-    )
-    candidates: int = Field(
-        default=4, gt=0, description="largest number of earlier visits that a submap is compared with"
-    )
     drift: float = Field(
         default=0.03, gt=0, description="drift of the position allowed for, per metre of path through the graph [m/m]"
-    )
-    drift_rad_m: float = Field(
-        default=0.006, gt=0, description="drift of the heading allowed for, per metre of path through the graph [rad/m]"
-    )
-    widest_m: float = Field(default=15.0, gt=0, description="largest half side of the search window [m]")
-    widest_rad: float = Field(default=0.7, gt=0, description="largest half angle of the search window [rad]")
-    least_score: float = Field(
-        default=0.5, ge=0, le=1, description="least mean likelihood of the points that a search must reach"
-    )
-    recognized_drift: float = Field(
-        default=0.25,
-        ge=0,
-        description="largest drift of the position, per metre of path through the graph, at which place recognition "
-        "still closes a loop that is out of the search's reach; 0 turns it off [m/m]",
     )
     most_nearby: int = Field(
         default=10,
@@ -157,13 +152,11 @@ class LoopCloser:
     def __init__(
         self,
         config: ClosingConfig,
-        search_config: SearchConfig,
         verification: VerificationConfig,
         recognizer: PlaceRecognizer | None = None,
     ) -> None:
         self._config = config
         self._recognizer = recognizer
-        self._search = search_config
         self._verification = verification
         self.submaps: list[AnchoredSubmap] = []
         """All submaps so far."""
@@ -200,7 +193,7 @@ class LoopCloser:
         candidates = self._candidates(later, anchors, paths)
         found = [
             closure
-            for earlier in candidates[: KNOWN_CANDIDATES if is_known else self._config.candidates]
+            for earlier in candidates[: KNOWN_CANDIDATES if is_known else MOST_CANDIDATES]
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
         return self._accept(found, self._recognized(later, anchors, paths), anchors)
@@ -231,15 +224,15 @@ class LoopCloser:
     def _drift_allowance(self, path_m: ArrayLike) -> FloatArray:
         """Error of the estimate allowed for after paths (...) through the graph: metres and radians, (..., 2)."""
         config, path = self._config, np.asarray(path_m)[..., None]
-        allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((config.drift, config.drift_rad_m)) * path
-        return np.asarray(np.minimum((config.widest_m, config.widest_rad), allowed))
+        allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((config.drift, DRIFT_RAD_M)) * path
+        return np.asarray(np.minimum((WIDEST_M, WIDEST_RAD), allowed))
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         """The nearest submap of each earlier visit to the neighbourhood, nearest visits first."""
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
         drift = self._drift_allowance(paths)[:, 0]
-        near = (travel[later] - travel > self._config.gap_m) & (distance < self._config.sight_m + drift)
+        near = (travel[later] - travel > LEAST_GAP_M) & (distance < SIGHT_M + drift)
         indices = np.flatnonzero(near & self._is_held())
         if not len(indices):
             return []
@@ -255,9 +248,9 @@ class LoopCloser:
         radius, angle = self._drift_allowance(path_m).tolist()
         guess = predicted
         if radius > NARROW_M:
-            window = SearchWindow(radius, angle)
-            result = search(b.surface, a.field, predicted, window, self._search)
-            if result.score < self._config.least_score:
+            window = SearchWindow(radius, angle, DISTANCE_PENALTY, ANGLE_PENALTY)
+            result = search(b.surface, a.field, predicted, window)
+            if result.score < LEAST_SCORE:
                 return None
             guess = result.T_field_base
         check = verify(a, b, guess, self._verification)
@@ -290,22 +283,21 @@ class LoopCloser:
         return sorted(found, key=lambda c: (c.check.support, c.check.worse.overlap))[-1:]
 
     def _lookalikes(self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
-        """The most similar places beyond the search's reach, ``sight_m`` of travel apart from each other."""
-        config = self._config
+        """The most similar places beyond the search's reach, ``SIGHT_M`` of travel apart from each other."""
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
         drift = self._drift_allowance(paths)
-        capped = (drift >= (config.widest_m, config.widest_rad)).any(axis=1)
-        unsure = capped | (distance > config.sight_m + drift[:, 0])
-        possible = distance < config.sight_m + config.recognized_drift * paths
-        eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > config.gap_m) & self._is_held())
+        capped = (drift >= (WIDEST_M, WIDEST_RAD)).any(axis=1)
+        unsure = capped | (distance > SIGHT_M + drift[:, 0])
+        possible = distance < SIGHT_M + RECOGNIZED_DRIFT * paths
+        eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > LEAST_GAP_M) & self._is_held())
         number = {self.submaps[k].keyscan: int(k) for k in eligible}
         chosen: list[int] = []
         for keyscan in recognizer.most_similar(self.submaps[later].keyscan, number, SIMILAR_PLACES) if number else ():
             k = number[keyscan]
-            if all(abs(travel[k] - travel[other]) > config.sight_m for other in chosen):
+            if all(abs(travel[k] - travel[other]) > SIGHT_M for other in chosen):
                 chosen.append(k)
-        return chosen[: config.candidates]
+        return chosen[:MOST_CANDIDATES]
 
     def _check(
         self, earlier: int, later: int, anchors: FloatArray, path_m: float, guess: FloatArray
@@ -314,7 +306,7 @@ class LoopCloser:
         check = verify(self._held[earlier], self._held[later], guess, self._verification)
         innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
         off_m = float(np.hypot(innovation[0], innovation[1]))
-        if not (check.loose or check.support) or off_m > self._config.recognized_drift * path_m:
+        if not (check.loose or check.support) or off_m > RECOGNIZED_DRIFT * path_m:
             return None
         radius, angle = self._drift_allowance(path_m).tolist()
         beyond = off_m > radius or abs(innovation[2]) > angle

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from fcslam.compiled import njit
-from fcslam.config import Settings
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
@@ -20,23 +18,14 @@ MAXIMUM_REACH_M = 25.0
 """Points farther than this do not enlarge the likelihood grid."""
 REACH_QUANTILE = 0.9
 """The angle step moves a point at this quantile of the distances by one cell."""
-
-
-class SearchConfig(Settings):
-    """Correlative search by branch and bound."""
-
-    cell_m: float = Field(default=0.1, gt=0, description="side of a cell of the likelihood grid [m]")
-    smear_m: float = Field(default=0.1, gt=0, description="standard deviation of the likelihood around a surface [m]")
-    levels: int = Field(
-        default=6, ge=1, le=10, description="levels of the pyramid; a step on the coarsest one is 2^(levels - 1) cells"
-    )
-    points: int = Field(default=120, gt=0, description="largest number of points that are scored")
-    distance_penalty: float = Field(
-        default=0.2, ge=0, lt=1, description="share of the score lost at the edge of the window, as in Karto"
-    )
-    angle_penalty: float = Field(
-        default=0.1, ge=0, lt=1, description="share of the score lost at the largest turn, as in Karto"
-    )
+CELL_M = 0.1
+"""Side of a cell of the likelihood grid, metres."""
+SMEAR_M = 0.1
+"""Standard deviation of the likelihood around a surface, metres."""
+MOST_LEVELS = 6
+"""Most levels of the pyramid; a step on the coarsest one of them is 2^5 cells."""
+MOST_POINTS = 120
+"""Largest number of points that are scored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +34,10 @@ class SearchWindow:
 
     radius_m: float
     angle_rad: float
+    distance_penalty: float = 0.0
+    """Share of the score lost at its edge, as in Karto."""
+    angle_penalty: float = 0.0
+    """Share of the score lost at the largest turn, as in Karto."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +65,6 @@ def likelihood_pyramid(
     field: SurfelField,
     T_field_guess: FloatArray,
     half_side_m: float,
-    config: SearchConfig,
     visible_only: bool = False,
     levels: int | None = None,
 ) -> LikelihoodPyramid:
@@ -82,19 +74,18 @@ def likelihood_pyramid(
         field: surfaces.
         T_field_guess: centre of the grid, shape (3,), metres and radians in the field's coordinates.
         half_side_m: half side of the grid, metres.
-        config: cell, smear and levels.
         visible_only: draw only surfaces that face the guess (Karto's visibility filter), for one scan near the guess.
-        levels: number of levels, if fewer than those of ``config`` are of use.
+        levels: number of levels, if fewer than ``MOST_LEVELS`` are of use.
 
     Returns:
         The pyramid, shape (levels, H, W).
     """
-    size = int(np.ceil(2.0 * half_side_m / config.cell_m)) + 1
+    size = int(np.ceil(2.0 * half_side_m / CELL_M)) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
     surfels, count = field.arrays.surfels, int(field.arrays.used[1])
     viewpoint = np.array(T_field_guess[:2]) if visible_only else np.full(2, np.nan)
-    base = _draw(surfels, count, viewpoint, corner, size, config.cell_m, config.smear_m)
-    return LikelihoodPyramid(_pyramid(base, config.levels if levels is None else levels), corner, config.cell_m)
+    base = _draw(surfels, count, viewpoint, corner, size, CELL_M, SMEAR_M)
+    return LikelihoodPyramid(_pyramid(base, MOST_LEVELS if levels is None else levels), corner, CELL_M)
 
 
 def search(
@@ -102,7 +93,6 @@ def search(
     field: SurfelField,
     T_field_guess: FloatArray,
     window: SearchWindow,
-    config: SearchConfig,
     visible_only: bool = False,
     better_than: FloatArray | None = None,
 ) -> SearchResult:
@@ -112,8 +102,7 @@ def search(
         scan: points in ``base``.
         field: surfaces.
         T_field_guess: centre of the window, shape (3,), metres and radians in the field's coordinates.
-        window: half side and half angle.
-        config: grid and penalties.
+        window: half side, half angle and penalties.
         visible_only: match only surfaces that face the guess.
         better_than: a pose in the window, shape (3,), whose score the result must exceed; it prunes the search.
 
@@ -121,13 +110,13 @@ def search(
         The best pose; ``better_than`` if none exceeds its score; the guess itself, with score 0, if no pose of the
         window puts a point on a surface.
     """
-    thinned = scan.thinned(config.cell_m, config.points)
+    thinned = scan.thinned(CELL_M, MOST_POINTS)
     reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
-    half_side = min(reach, MAXIMUM_REACH_M) + window.radius_m + config.cell_m
-    usable = int(np.log2(window.radius_m / config.cell_m + 1.0)) + 1  # the levels that the window can use
-    levels = min(config.levels, max(1, usable))
-    pyramid = likelihood_pyramid(field, T_field_guess, half_side, config, visible_only, levels)
-    return search_pyramid(thinned, pyramid, T_field_guess, window, config, better_than)
+    half_side = min(reach, MAXIMUM_REACH_M) + window.radius_m + CELL_M
+    usable = int(np.log2(window.radius_m / CELL_M + 1.0)) + 1  # the levels that the window can use
+    levels = min(MOST_LEVELS, max(1, usable))
+    pyramid = likelihood_pyramid(field, T_field_guess, half_side, visible_only, levels)
+    return search_pyramid(thinned, pyramid, T_field_guess, window, better_than)
 
 
 def search_pyramid(
@@ -135,7 +124,6 @@ def search_pyramid(
     pyramid: LikelihoodPyramid,
     T_field_guess: FloatArray,
     window: SearchWindow,
-    config: SearchConfig,
     better_than: FloatArray | None = None,
 ) -> SearchResult:
     """As ``search``, on a pyramid that was built before; poses have shape (3,)."""
@@ -147,7 +135,7 @@ def search_pyramid(
     start = np.full(3, np.nan) if better_than is None else np.array(better_than)
     pose, score = _branch_and_bound(
         scan.points, pyramid.levels, pyramid.corner, pyramid.cell_m, guess, start,
-        shifts, turns, step_rad, config.distance_penalty, config.angle_penalty,
+        shifts, turns, step_rad, window.distance_penalty, window.angle_penalty,
     )  # fmt: skip
     return SearchResult(pose, score)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import FIXED, MatchingConfig, ScanMatch, match_scan
+from fcslam.lidar.matching import FIXED, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
@@ -63,7 +63,6 @@ def resolve(
     match: ScanMatch,
     learned: OdometryError,
     turned_rad: float,
-    config: MatchingConfig,
     velocity_information: FloatArray = FIXED,
 ) -> tuple[ScanMatch, bool]:
     """Choose between a match and one that trusts odometry as far as it was right so far.
@@ -75,7 +74,6 @@ def resolve(
         match: the match that hardly trusts odometry.
         learned: the error of odometry as learned from earlier matches.
         turned_rad: turn that odometry measured, radians.
-        config: settings of the second match.
         velocity_information: as in ``match_scan``.
 
     Returns:
@@ -91,7 +89,7 @@ def resolve(
     is_clear = is_seen and match.explained >= CLEAR * match.known
     if distance2 < NEAR**2 or (is_clear and not is_far):
         return match, False
-    trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, config, velocity_information)
+    trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, velocity_information)
     gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))

@@ -13,12 +13,11 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
-from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.lasers import Lasers
-from fcslam.lidar.odometry import OdometryConfig, OdometryTrust, odometry_error
+from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackerConfig, TrackingResult
+from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackingResult
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import (
     Constraint,
@@ -39,7 +38,7 @@ POINT_INFORMATION_SHARE = 0.1
 """Share of the points' information that counts: errors of neighbouring points are correlated, ten count as one."""
 ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_PER_TRAVEL = 0.01, 0.1
 """Standard deviation of odometry's position between two keyscans that were matched, in metres and per metre of travel.
-It fixes what the points leave open, as along a corridor. It is smaller than in the tracker (``OdometryConfig``):
+It fixes what the points leave open, as along a corridor. It is smaller than in the tracker (``OdometryModel``):
 the match has shown that the wheels did not slip."""
 ODOMETRY_SIGMA_RAD, ODOMETRY_SIGMA_PER_TURN = 0.005, 0.1
 """The same for the heading, in radians and per radian of turn."""
@@ -76,9 +75,7 @@ class LidarConfig(Settings):
         "programs, as bags and ROS messages say it; 0: all beams are measured at once [s]",
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
-    tracker: TrackerConfig = Field(default=TrackerConfig(), description="scan-to-submap tracking")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
-    search: SearchConfig = Field(default=SearchConfig(), description="correlative search of loop closing")
     verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
 
 
@@ -120,10 +117,11 @@ class Step:
 class LidarFrontend:
     """Tracks one robot scan by scan and selects keyscans."""
 
-    def __init__(self, robot: str, config: LidarConfig) -> None:
+    def __init__(self, robot: str, config: LidarConfig, odometry: OdometryModel = WHEELS) -> None:
         self.robot = robot
         self.config = config
-        self._tracker = ScanTracker(config.tracker)
+        self.odometry = odometry
+        self._tracker = ScanTracker(odometry)
         self._lasers = Lasers()
         self._count = 0
         self._newest: MappedKeyscan | None = None
@@ -238,13 +236,13 @@ class LidarFrontend:
         motion = se2.between(self._newest.T_local_base, tracked.T_local_base)
         constraint = Constraint(
             self.robot, self._count - 1, self._count, ConstraintKind.ODOMETRY, frozen(motion),
-            frozen(motion_information(motion, tracked, self.config.tracker.odometry)),
+            frozen(motion_information(motion, tracked, self.odometry)),
         )  # fmt: skip
         progress = float(np.hypot(motion[0], motion[1])) + TURN_AS_TRAVEL_M * abs(float(motion[2]))
         return constraint, self._newest.travel_m + progress
 
 
-def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryConfig) -> FloatArray:
+def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryModel) -> FloatArray:
     """Information of the motion between two consecutive keyscans.
 
     The sum of the points' information and odometry's, limited by a floor of the standard deviations.

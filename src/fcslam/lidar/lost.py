@@ -24,7 +24,7 @@ from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import odometry_error
 from fcslam.lidar.scan import point_scan
-from fcslam.lidar.tracker import TrackingResult
+from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, TrackingResult
 from fcslam.lidar.verification import verify
 from fcslam.records import FloatArray, LaserScan
 
@@ -34,6 +34,24 @@ constraint over the gap has the error by the model, of scale 1."""
 CONTINUOUS, CONTINUOUS_KNOWN = 0.6, 0.5
 """Two scans show one place if the later one has a larger share of its points in known area on surfaces of the earlier
 one. A larger share of all points lies in known area, too."""
+DOUBTFUL_TRAVEL_M = 1.0
+"""Least travel over consecutive doubtful scans before they are compared, metres."""
+FEWEST_SCANS = 5
+"""Least number of consecutive doubtful scans before they are compared."""
+MOST_SCANS = 100
+"""Number of consecutive doubtful scans that are compared even without ``DOUBTFUL_TRAVEL_M`` of travel."""
+SETTLED_M = 3.0
+"""Travel that a session must have mapped before its robot can be lost, metres."""
+AGREEING = 0.90
+"""Least median share of points that the doubtful scans explain of each other; below it, nothing is decided."""
+LOST_EXPLAINED = 0.60
+"""A lost robot sees a smaller share of its points in known area on a surface."""
+LOST_VIOLATION = 0.30
+"""A lost robot sees a larger share of its points in known area in free space."""
+LEAST_OVERLAP = 0.25
+"""Least share of all points in known area; below it, nothing is decided."""
+LARGEST_UNSEEN_M = 15.0
+"""A robot that moved farther between two scans is lost: nobody saw the way, metres."""
 
 
 class LostConfig(Settings):
@@ -46,84 +64,42 @@ class LostConfig(Settings):
         description="a scan is doubtful if a smaller share of its points in known area lies on a surface; "
         "0 disables the detection",
     )
-    travel_m: float = Field(
-        default=1.0, ge=0, description="least travel over consecutive doubtful scans before they are compared [m]"
-    )
-    fewest_scans: int = Field(
-        default=5, ge=1, description="least number of consecutive doubtful scans before they are compared"
-    )
-    most_scans: int = Field(
-        default=100,
-        ge=1,
-        description="number of consecutive doubtful scans that are compared even without `travel_m` of travel",
-    )
-    settled_m: float = Field(
-        default=3.0, ge=0, description="travel that a session must have mapped before its robot can be lost [m]"
-    )
-    agreeing: float = Field(
-        default=0.90,
-        ge=0,
-        le=1,
-        description="least median share of points that the doubtful scans explain of each other; below it, nothing is "
-        "decided",
-    )
-    explained: float = Field(
-        default=0.60,
-        ge=0,
-        le=1,
-        description="a lost robot sees a smaller share of its points in known area on a surface",
-    )
-    violation: float = Field(
-        default=0.30,
-        ge=0,
-        le=1,
-        description="a lost robot sees a larger share of its points in known area in free space",
-    )
-    overlap: float = Field(
-        default=0.25, ge=0, le=1, description="least share of all points in known area; below it, nothing is decided"
-    )
-    unseen_m: float = Field(
-        default=15.0,
-        gt=0,
-        description="a robot that moved farther between two scans is lost: nobody saw the way [m]",
-    )
 
 
-def has_moved_unseen(before: LaserScan, now: LaserScan, config: LostConfig) -> bool:
+def has_moved_unseen(before: LaserScan, now: LaserScan) -> bool:
     """Whether a robot moved so far between two scans that odometry alone must not tie their places together."""
     x, y, _ = se2.between(before.T_odom_base, now.T_odom_base)
-    return math.hypot(x, y) > config.unseen_m
+    return math.hypot(x, y) > LARGEST_UNSEEN_M
 
 
 def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:
     """Whether a scan may show another place than the scans before it."""
     # False for a scan that was not matched, as both are NaN.
-    return frontend.settled_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
+    return frontend.settled_m >= SETTLED_M and tracking.explained < config.doubted * tracking.known
 
 
-def can_decide(scans: Sequence[LaserScan], config: LostConfig) -> bool:
+def can_decide(scans: Sequence[LaserScan]) -> bool:
     """Whether these consecutive doubtful scans are enough for a decision."""
     steps = se2.relative(np.array([scan.T_odom_base for scan in scans]))
-    far = len(scans) >= config.fewest_scans and np.hypot(steps[:, 0], steps[:, 1]).sum() >= config.travel_m
-    return bool(far) or len(scans) >= config.most_scans
+    far = len(scans) >= FEWEST_SCANS and np.hypot(steps[:, 0], steps[:, 1]).sum() >= DOUBTFUL_TRAVEL_M
+    return bool(far) or len(scans) >= MOST_SCANS
 
 
-def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: LidarFrontend, config: LostConfig) -> bool:
+def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: LidarFrontend) -> bool:
     """Whether deferred scans show another place than the newest keyscans of the front end.
 
     Args:
         scans: consecutive scans that the front end has not processed.
         T_local_first: pose of the first of them in the tracker's local frame, shape (3,), metres and radians.
         frontend: the robot's front end; it does not change.
-        config: thresholds.
     """
-    fresh = LidarFrontend(frontend.robot, frontend.config)
-    if not _are_consistent(scans, fresh, config):
+    fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
+    if not _are_consistent(scans, fresh):
         return False
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
     worse = verify(before, now, predicted, frontend.config.verification).worse
-    return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
+    return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
 
 
 def drove_on(
@@ -141,7 +117,7 @@ def drove_on(
     trust = frontend.trust
     if trust.matches < TRUSTED_MATCHES or max(trust.position, trust.heading) > TRUSTED:
         return False
-    if not frontend.config.tracker.odometry.is_measured:
+    if not frontend.odometry.is_measured:
         return False
     pairs = ((before.get(scan.laser.T_base_laser), scan) for scan in scans)
     return any(last is not None and _show_one_place(last, scan, frontend) for last, scan in pairs)
@@ -149,19 +125,18 @@ def drove_on(
 
 def _show_one_place(before: LaserScan, now: LaserScan, frontend: LidarFrontend) -> bool:
     """Whether a scan shows what an earlier one of the same laser shows, where odometry says."""
-    trust, tracker = frontend.trust, frontend.config.tracker
     if before.laser != now.laser:
         return False
     x, y, turn = motion = se2.between(before.T_odom_base, now.T_odom_base)
-    error = trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), tracker.odometry))
+    error = frontend.trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), frontend.odometry))
     field = SurfelField(np.zeros(3))
     field.insert(point_scan(before.ranges_m, before.laser, before.sweep), np.zeros(3))
-    scan = point_scan(now.ranges_m, now.laser, now.sweep).thinned(tracker.point_spacing_m, tracker.point_limit)
-    match = match_scan(scan, field, motion, CORRELATED * error.information, tracker.matching)
+    scan = point_scan(now.ranges_m, now.laser, now.sweep).thinned(POINT_SPACING_M, POINT_LIMIT)
+    match = match_scan(scan, field, motion, CORRELATED * error.information)
     return match.known >= CONTINUOUS_KNOWN and match.explained >= CONTINUOUS * match.known
 
 
-def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend, config: LostConfig) -> bool:
+def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend) -> bool:
     """Track the scans with a fresh front end; whether they explain one another. Otherwise nothing can be decided."""
     shares = []
     for scan in scans:
@@ -169,4 +144,4 @@ def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend, config: Lo
         fresh.process(scan, tracking)
         if tracking.known > 0.0:  # not so for a scan that was not matched
             shares.append(tracking.explained / tracking.known)
-    return bool(shares) and bool(np.median(shares) >= config.agreeing)
+    return bool(shares) and bool(np.median(shares) >= AGREEING)

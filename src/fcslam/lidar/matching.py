@@ -5,10 +5,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from fcslam.compiled import njit
-from fcslam.config import Settings
 from fcslam.lidar.field import EMPTY, SurfelField, label_at
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
@@ -21,7 +19,7 @@ ALONG: Final = 0.25
 NO_NORMAL_WEIGHT: Final = 0.5
 """Weight of points without a normal: their surface is uncertain."""
 ALONG_LIMIT2: Final = 9.0
-"""A point on a surface is within 3 times ``explained_m`` of the surfel itself (squared): the surface ends somewhere."""
+"""A point on a surface is within 3 times ``EXPLAINED_M`` of the surfel itself (squared): the surface ends somewhere."""
 DAMPING: Final = 1e-6
 """Added to the diagonal of the normal equations, so that an unconstrained direction stays solvable."""
 SMALL_STEP_M: Final = 2e-4
@@ -38,20 +36,16 @@ FIXED: Final = np.full(3, 1e12)
 SHRINK: Final = 0.6
 FAST_SHRINK: Final = 0.35
 """Factor of the loss scale after each step; the fast one after a small step."""
-
-
-class MatchingConfig(Settings):
-    """Gauss-Newton scan matching."""
-
-    iterations: int = Field(default=20, gt=0, description="largest number of Gauss-Newton steps")
-    wide_scale_m: float = Field(default=0.30, gt=0, description="scale of the robust loss at the first step [m]")
-    narrow_scale_m: float = Field(default=0.06, gt=0, description="scale of the robust loss at the last step [m]")
-    point_sigma_m: float = Field(
-        default=0.03,
-        gt=0,
-        description="standard deviation of a point's distance; wide, as errors of neighbours are correlated [m]",
-    )
-    explained_m: float = Field(default=0.10, gt=0, description="a point this close to its surface lies on it [m]")
+MOST_ITERATIONS = 20
+"""Largest number of Gauss-Newton steps."""
+WIDE_SCALE_M = 0.30
+"""Scale of the robust loss at the first step, metres, if the guess is that of odometry."""
+NARROW_SCALE_M = 0.06
+"""Scale of the robust loss at the last step, metres."""
+POINT_SIGMA_M = 0.03
+"""Standard deviation of a point's distance; wide, as errors of neighbours are correlated, metres."""
+EXPLAINED_M = 0.10
+"""A point this close to its surface lies on it, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +80,8 @@ def match_scan(
     field: SurfelField,
     T_field_guess: FloatArray,
     prior_information: FloatArray,
-    config: MatchingConfig,
     velocity_information: FloatArray = FIXED,
+    wide_scale_m: float = WIDE_SCALE_M,
 ) -> ScanMatch:
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
@@ -100,8 +94,8 @@ def match_scan(
         field: surfaces.
         T_field_guess: start, and mean of the prior, shape (3,), metres and radians.
         prior_information: over (x, y, theta) in the field's coordinates, shape (3, 3); zeros for no prior.
-        config: loss and iterations.
         velocity_information: of the assumed velocity (x, y, theta), shape (3,), in (m/s)^-2 and (rad/s)^-2.
+        wide_scale_m: scale of the robust loss at the first step, metres.
 
     Returns:
         The pose, the information of the points, and how well they fit.
@@ -109,8 +103,7 @@ def match_scan(
     pose, velocity, information, explained, known, log_likelihoods = _match(
         _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
         np.array(T_field_guess),  # a writable copy: code is compiled once
-        prior_information, velocity_information, field.arrays,
-        config.iterations, config.wide_scale_m, config.narrow_scale_m, config.point_sigma_m, config.explained_m,
+        prior_information, velocity_information, field.arrays, wide_scale_m,
     )  # fmt: skip
     return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihoods, velocity)
 
@@ -126,8 +119,8 @@ class _Points(NamedTuple):
 
 
 @njit
-def _match(scan, guess, prior, velocity_prior, field, iterations, wide, narrow, sigma, explained_m):  # type: ignore[no-untyped-def]
-    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``narrow``.
+def _match(scan, guess, prior, velocity_prior, field, wide):  # type: ignore[no-untyped-def]
+    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``NARROW_SCALE_M``.
 
     It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + v^T diag(velocity_prior) v. The
     Jacobian of e_i over pose and velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J,
@@ -135,8 +128,8 @@ def _match(scan, guess, prior, velocity_prior, field, iterations, wide, narrow, 
     """
     pose, velocity = guess.copy(), np.zeros(3)
     scale = wide
-    for _ in range(iterations):
-        H, g, reduced = _normal_equations(scan, pose, velocity, field, scale, sigma, velocity_prior)
+    for _ in range(MOST_ITERATIONS):
+        H, g, reduced = _normal_equations(scan, pose, velocity, field, scale, velocity_prior)
         difference = pose - guess
         difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
         for r in range(3):
@@ -151,12 +144,12 @@ def _match(scan, guess, prior, velocity_prior, field, iterations, wide, narrow, 
         if len(scan.times) > 0:
             change = reduced[3] - reduced[0] * step[0] - reduced[1] * step[1] - reduced[2] * step[2]
             velocity -= change
-        if small and scale <= narrow:
+        if small and scale <= NARROW_SCALE_M:
             break
-        scale = max(narrow, scale * (FAST_SHRINK if small else SHRINK))
+        scale = max(NARROW_SCALE_M, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    H, g, _ = _normal_equations(scan, pose, velocity, field, narrow, sigma, velocity_prior)
-    explained, known, log_likelihoods = _fit(scan, pose, velocity, field, explained_m)
+    H, g, _ = _normal_equations(scan, pose, velocity, field, NARROW_SCALE_M, velocity_prior)
+    explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
     velocity[0], velocity[1] = cos * x + sin * y, cos * y - sin * x
@@ -177,15 +170,15 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _normal_equations(scan, pose, velocity, field, scale, sigma, velocity_prior):  # type: ignore[no-untyped-def]
-    """Normal equations over the pose, without the velocity, in units of sigma.
+def _normal_equations(scan, pose, velocity, field, scale, velocity_prior):  # type: ignore[no-untyped-def]
+    """Normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``.
 
     Returns:
         H (3, 3) and g (3,) of the pose; and (4, 3): the velocity that minimises the cost is moved by row 3 less the
         step of the pose times rows 0 to 2.
     """
     own_pose, mixed_sums, own_velocity, g, f = _sums(scan, pose, velocity, field, scale)
-    s2 = 1.0 / (sigma * sigma)
+    s2 = 1.0 / (POINT_SIGMA_M * POINT_SIGMA_M)
     H, gradient = s2 * _symmetric(own_pose), s2 * np.array(g)
     reduced = np.zeros((4, 3))
     if len(scan.times) > 0:
@@ -287,7 +280,7 @@ def _swept_point(points, i, cos, sin, t, velocity):  # type: ignore[no-untyped-d
 
 
 @njit
-def _fit(scan, pose, velocity, field, limit):  # type: ignore[no-untyped-def]
+def _fit(scan, pose, velocity, field):  # type: ignore[no-untyped-def]
     """Share of the points on a surface, share near any, and the log-likelihood of each, shape (N,)."""
     points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -310,11 +303,11 @@ def _fit(scan, pose, velocity, field, limit):  # type: ignore[no-untyped-def]
         d2 = dx * dx + dy * dy
         if s[2] == 0.0 and s[3] == 0.0:
             likely2 = d2
-            on_surface = d2 < limit * limit
+            on_surface = d2 < EXPLAINED_M * EXPLAINED_M
         else:
             e = s[2] * dx + s[3] * dy
             likely2 = e * e + ALONG * (d2 - e * e)
-            on_surface = abs(e) < limit and d2 <= ALONG_LIMIT2 * limit * limit
+            on_surface = abs(e) < EXPLAINED_M and d2 <= ALONG_LIMIT2 * EXPLAINED_M * EXPLAINED_M
         if on_surface:
             explained += 1
         log_likelihoods[i] = np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.records import FloatArray
 
 TAIL: float = 1.0
@@ -24,27 +22,29 @@ LEAST_TRUST = 0.1
 """Least learned scale: matches have an error of their own."""
 
 
-class OdometryConfig(Settings):
+@dataclass(frozen=True, slots=True)
+class OdometryModel:
     """Error of the wheel odometry since the last match, as the sum of a constant, a share of the travel and a share of
     the turn. The defaults trust it little: wheels may slip by a third of the way."""
 
-    is_measured: bool = Field(
-        default=True, description="whether wheels measure the motion; false: it is predicted from the motion before"
-    )
-    position_m: float = Field(default=0.02, gt=0, description="standard deviation of the position, constant part [m]")
-    position_per_travel: float = Field(
-        default=0.3, ge=0, description="standard deviation of the position per metre of travel [m/m]"
-    )
-    position_per_turn_m: float = Field(
-        default=0.05, ge=0, description="standard deviation of the position per radian of turn [m/rad]"
-    )
-    heading_rad: float = Field(default=0.02, gt=0, description="standard deviation of the heading, constant part [rad]")
-    heading_per_turn: float = Field(
-        default=0.2, ge=0, description="standard deviation of the heading per radian of turn [rad/rad]"
-    )
-    heading_per_travel_rad: float = Field(
-        default=0.05, ge=0, description="standard deviation of the heading per metre of travel [rad/m]"
-    )
+    is_measured: bool = True
+    """Whether wheels measure the motion; false: it is predicted from the motion before."""
+    position_m: float = 0.02
+    """Standard deviation of the position, constant part, metres."""
+    position_per_travel: float = 0.3
+    """Standard deviation of the position per metre of travel, metres per metre."""
+    position_per_turn_m: float = 0.05
+    """Standard deviation of the position per radian of turn, metres per radian."""
+    heading_rad: float = 0.02
+    """Standard deviation of the heading, constant part, radians."""
+    heading_per_turn: float = 0.2
+    """Standard deviation of the heading per radian of turn, radians per radian."""
+    heading_per_travel_rad: float = 0.05
+    """Standard deviation of the heading per metre of travel, radians per metre."""
+
+
+WHEELS = OdometryModel()
+"""Of a robot with wheel odometry."""
 
 
 class OdometryError(NamedTuple):
@@ -70,17 +70,17 @@ class OdometryError(NamedTuple):
         return -0.5 * (TAIL + 3.0) * math.log1p(self.mahalanobis2(innovation) / TAIL)
 
 
-def odometry_error(moved_m: float, turned_rad: float, config: OdometryConfig) -> OdometryError:
+def odometry_error(moved_m: float, turned_rad: float, model: OdometryModel) -> OdometryError:
     """Error of a motion by the model for every robot.
 
     Args:
         moved_m: travel, metres.
         turned_rad: turn, radians, not negative.
-        config: the model.
+        model: the model.
     """
     return OdometryError(
-        config.position_m + config.position_per_travel * moved_m + config.position_per_turn_m * turned_rad,
-        config.heading_rad + config.heading_per_turn * turned_rad + config.heading_per_travel_rad * moved_m,
+        model.position_m + model.position_per_travel * moved_m + model.position_per_turn_m * turned_rad,
+        model.heading_rad + model.heading_per_turn * turned_rad + model.heading_per_travel_rad * moved_m,
     )
 
 

@@ -4,15 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.evidence import over_steps, resolve
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import FIXED, MatchingConfig, ScanMatch, match_scan
-from fcslam.lidar.odometry import OdometryConfig, OdometryError, OdometryTrust, odometry_error
+from fcslam.lidar.matching import FIXED, ScanMatch, match_scan
+from fcslam.lidar.odometry import OdometryError, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
 
@@ -39,61 +37,31 @@ LARGEST_VELOCITY = 30.0
 _NO_INFORMATION = np.zeros((3, 3))
 
 
-class TrackerConfig(Settings):
-    """Scan-to-submap tracking."""
-
-    still_m: float = Field(
-        default=0.005,
-        ge=0,
-        description="a robot that moved less than this and turned less than `still_rad` since the last match "
-        "stands still; its scans are not matched [m]",
-    )
-    still_rad: float = Field(
-        default=0.003,
-        ge=0,
-        description="a robot that turned less than this and moved less than `still_m` since the last match "
-        "stands still; its scans are not matched [rad]",
-    )
-    point_spacing_m: float = Field(
-        default=0.05, gt=0, description="least distance between consecutive points of a scan that are matched [m]"
-    )
-    point_limit: int = Field(default=180, gt=10, description="largest number of points of a scan that are matched")
-    buffer_keyscans: int = Field(default=60, ge=4, description="keyscans of one laser in a full running buffer")
-    supported: float = Field(
-        default=0.30,
-        ge=0,
-        le=1,
-        description="least share of a scan's points on known surfaces; below it, odometry alone gives the pose",
-    )
-    doubtful: float = Field(
-        default=0.75,
-        ge=0,
-        le=1,
-        description="least share of the points in known area on surfaces; below it, a correlative search starts",
-    )
-    search_radius_m: float = Field(
-        default=1.0, gt=0, description="half side of the window of the correlative search [m]"
-    )
-    search_angle_rad: float = Field(
-        default=0.5, gt=0, description="half angle of the window of the correlative search [rad]"
-    )
-    surprise: float = Field(
-        default=4.0,
-        gt=0,
-        description="a match farther than this from odometry, in learned standard deviations of odometry's error, "
-        "starts a correlative search",
-    )
-    unlikely: float = Field(
-        default=10.0,
-        gt=0,
-        description="a match whose log-probability is lower than usual by this starts a correlative search",
-    )
-    odometry: OdometryConfig = Field(default=OdometryConfig(), description="error of the wheel odometry")
-    matching: MatchingConfig = Field(default=MatchingConfig(), description="Gauss-Newton scan matching")
-    search: SearchConfig = Field(
-        default=SearchConfig(distance_penalty=0.0, angle_penalty=0.0),
-        description="correlative search by branch and bound; odometry weighs its result, so no penalty does",
-    )
+STILL_M = 0.005
+"""A robot that moved less than this and turned less than ``STILL_RAD`` since the last match stands still; its scans
+are not matched, metres."""
+STILL_RAD = 0.003
+"""A robot that turned less than this and moved less than ``STILL_M`` since the last match stands still; its scans are
+not matched, radians."""
+POINT_SPACING_M = 0.05
+"""Least distance between consecutive points of a scan that are matched, metres."""
+POINT_LIMIT = 180
+"""Largest number of points of a scan that are matched."""
+BUFFER_KEYSCANS = 60
+"""Keyscans of one laser in a full running buffer."""
+SUPPORTED = 0.30
+"""Least share of a scan's points on known surfaces; below it, odometry alone gives the pose."""
+DOUBTFUL = 0.75
+"""Least share of the points in known area on surfaces; below it, a correlative search starts."""
+SEARCH_RADIUS_M = 1.0
+"""Half side of the window of the correlative search, metres."""
+SEARCH_ANGLE_RAD = 0.5
+"""Half angle of the window of the correlative search, radians."""
+SURPRISE = 4.0
+"""A match farther than this from odometry, in learned standard deviations of odometry's error, starts a correlative
+search."""
+UNLIKELY = 10.0
+"""A match whose log-probability is lower than usual by this starts a correlative search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +109,8 @@ class ScanTracker:
     place. So a scan always sees between half a buffer and a full one, and nothing is ever removed from a field.
     """
 
-    def __init__(self, config: TrackerConfig) -> None:
-        self._config = config
+    def __init__(self, odometry: OdometryModel) -> None:
+        self._odometry = odometry
         self._fields: list[tuple[SurfelField, int]] = []
         self._T_local_base = np.zeros(3)
         self._T_odom_base: FloatArray | None = None
@@ -160,10 +128,9 @@ class ScanTracker:
 
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; the tracker does not change before ``commit``."""
-        config = self._config
         # 1. Prediction: the last pose, moved by odometry.
         T_local_guess, moved_m, turned_rad = self._predict(scan)
-        is_still = moved_m < config.still_m and turned_rad < config.still_rad
+        is_still = self._odometry.is_measured and moved_m < STILL_M and turned_rad < STILL_RAD
         matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
         if self._fields and is_still and matched_here == self._matched_here:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None, scan.sweep)
@@ -177,24 +144,24 @@ class ScanTracker:
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 3. Scan matching; a doubtful match starts a correlative search, also where the robot was if odometry may have
         #    jumped. A match against odometry needs evidence.
-        error = odometry_error(moved_m, turned_rad, config.odometry)
-        thinned = points.thinned(config.point_spacing_m, config.point_limit)
+        error = odometry_error(moved_m, turned_rad, self._odometry)
+        thinned = points.thinned(POINT_SPACING_M, POINT_LIMIT)
         velocity = self._velocity_information(scan.sweep)
         match = self._match(points, thinned, T_local_guess, error, velocity)
         has_jumped = contradicts = False
-        if match.explained < config.doubtful and self._is_long_step(T_local_guess):
+        if match.explained < DOUBTFUL and self._is_long_step(T_local_guess):
             other = self._match(points, thinned, self._T_local_base, error, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
             is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
             if is_fixed and is_better and other.explained >= JUMP_SHARE:
                 match, T_local_guess, has_jumped = other, self._T_local_base, True
-        if config.odometry.is_measured:  # a prediction was right only as long as the motion went on as before
+        if self._odometry.is_measured:  # a prediction was right only as long as the motion went on as before
             learned = over_steps(self._trust.scale(error), moved_m, moved_m - self._moved_m)
             match, contradicts = resolve(
-                thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, config.matching, velocity
+                thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, velocity
             )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
-        if match.explained < config.supported:
+        if match.explained < SUPPORTED:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
@@ -224,7 +191,7 @@ class ScanTracker:
             T_local_base: pose of the keyscan, shape (3,).
             laser_count: lasers whose keyscans take turns in the buffer.
         """
-        capacity = laser_count * self._config.buffer_keyscans
+        capacity = laser_count * BUFFER_KEYSCANS
         if not self._fields or (len(self._fields) == 1 and self._fields[0][1] >= capacity // 2):
             self._fields.append((SurfelField(T_local_base), 0))
         elif self._fields[0][1] >= capacity:
@@ -251,7 +218,7 @@ class ScanTracker:
 
     def _explains(self, match: ScanMatch) -> bool:
         """Whether a match explains the points in known area."""
-        return match.explained >= self._config.doubtful * match.known
+        return match.explained >= DOUBTFUL * match.known
 
     def _is_long_step(self, T_local_guess: FloatArray) -> bool:
         """Whether odometry moved so far since the last scan that it may have jumped."""
@@ -263,7 +230,7 @@ class ScanTracker:
         if sweep is None:
             return FIXED
         x, y, theta = sweep.displacement(sweep.duration_s).tolist()
-        error = self._trust.scale(odometry_error(math.hypot(x, y), abs(theta), self._config.odometry))
+        error = self._trust.scale(odometry_error(math.hypot(x, y), abs(theta), self._odometry))
         position, heading = (sweep.duration_s / sigma for sigma in error)
         return np.array((position**2, position**2, heading**2))
 
@@ -276,22 +243,20 @@ class ScanTracker:
         velocity: FloatArray,
     ) -> ScanMatch:
         """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
-        config, field = self._config, self._fields[0][0]
+        field = self._fields[0][0]
         learned = self._trust.scale(error)
-        match = match_scan(thinned, field, T_local_guess, error.information, config.matching, velocity)
+        match = match_scan(thinned, field, T_local_guess, error.information, velocity)
         innovation = se2.between(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
-        is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= config.surprise**2
-        is_unlikely = log_posterior < self._usual * len(thinned) - config.unlikely  # False before the first match
+        is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= SURPRISE**2
+        is_unlikely = log_posterior < self._usual * len(thinned) - UNLIKELY  # False before the first match
         if not is_doubtful and not is_unlikely:
             return match
-        window = SearchWindow(config.search_radius_m, config.search_angle_rad)
-        found = search(
-            points, field, T_local_guess, window, config.search, visible_only=True, better_than=match.T_field_base
-        )
+        window = SearchWindow(SEARCH_RADIUS_M, SEARCH_ANGLE_RAD)
+        found = search(points, field, T_local_guess, window, visible_only=True, better_than=match.T_field_base)
         if np.array_equal(found.T_field_base, match.T_field_base):
             return match
-        other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching, velocity)
+        other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, velocity)
         other_innovation = se2.between(T_local_guess, other.T_field_base)
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:

@@ -15,7 +15,7 @@ from scipy import fft
 from scipy.ndimage import distance_transform_edt
 
 from fcslam.geometry import se2
-from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap, agreement
 from fcslam.records import FloatArray
 
@@ -33,7 +33,7 @@ PEAKS = 3
 """Best positions that are kept for each heading."""
 REFINED = 12
 """Best distinct transforms that are refined and scored exactly."""
-_REFINEMENT = MatchingConfig(wide_scale_m=0.4)
+REFINEMENT_SCALE_M = 0.4
 _ALIGNED_POINTS = 800
 """Points of a map that are aligned, about."""
 
@@ -68,7 +68,7 @@ def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
     """
     step = max(1, len(b.surface) // _ALIGNED_POINTS)
     sample = b.surface.only(np.arange(0, len(b.surface), step))
-    T_a_b = match_scan(sample, a.field, T_a_b, np.zeros((3, 3)), _REFINEMENT).T_field_base
+    T_a_b = match_scan(sample, a.field, T_a_b, np.zeros((3, 3)), wide_scale_m=REFINEMENT_SCALE_M).T_field_base
     sides = agreement(b, a, T_a_b), agreement(a, b, se2.inverse(T_a_b))
     known = [side.overlap * len(surface) for side, surface in zip(sides, (b.surface, a.surface), strict=True)]
     violating = [side.violation * count for side, count in zip(sides, known, strict=True)]

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.matching import match_scan
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Agreement, Submap, agreement
 from fcslam.records import FloatArray, Reason, ReasonCode
@@ -22,7 +22,7 @@ NOISE_FACTOR = 2.0
 """Noise raises the limit of a gate's violation by no more than this factor: people who walk about are no noise."""
 NO_PRIOR = np.zeros((3, 3))
 _VERIFIED = Reason(ReasonCode.VERIFIED)
-_ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
+ALIGNMENT_SCALE_M = 0.4
 """A guess between submaps is worse than one between scans: the loss starts wider."""
 
 
@@ -189,11 +189,15 @@ def align(
     a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
 ) -> Aligned:
     """The slow part of ``verify``: the alignment, which does not depend on the noise of the submaps."""
-    forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, _ALIGNMENT)
+    forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, wide_scale_m=ALIGNMENT_SCALE_M)
     # The prior must not count twice: backward it acts at the guess, as it does forward.
     start = T_a_b_guess if prior.any() else forward.T_field_base
     backward = match_scan(
-        _sample(a.surface), b.field, se2.inverse(start), _information_of_inverse(prior, start), _ALIGNMENT
+        _sample(a.surface),
+        b.field,
+        se2.inverse(start),
+        _information_of_inverse(prior, start),
+        wide_scale_m=ALIGNMENT_SCALE_M,
     )
     T_a_b, T_a_b_back = forward.T_field_base, se2.inverse(backward.T_field_base)
     gap = se2.between(T_a_b, T_a_b_back)

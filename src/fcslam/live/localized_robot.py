@@ -90,9 +90,7 @@ class LocalizedRobot(LiveTracker):
                 executor = worker_process()
                 stack.callback(executor.shutdown, cancel_futures=True)
             try:
-                self._localizer = LocalizerBeside(
-                    self.name, self._map, robot.localization, robot.lidar, initial, executor
-                )
+                self._localizer = LocalizerBeside(self.name, self._map, initial, executor)
             except BrokenExecutor as error:
                 raise InputError(
                     f"{self.name}: the process that searches the map does not start; a script that makes a "
@@ -106,7 +104,7 @@ class LocalizedRobot(LiveTracker):
         """Say about where the robot is now, as by hand. Any thread may call this.
 
         The pose counts once the walls around the robot confirm it; until then nothing changes, and after 15 m of travel
-        (``robot.localization.window_m``) it is forgotten.
+        it is forgotten.
 
         Args:
             pose: (x, y, theta) of ``base`` in the map, metres and radians.
@@ -197,7 +195,7 @@ class LocalizedRobot(LiveTracker):
         return RobotPose(
             newest.pose.stamp, frozen(se2.compose(estimate.T_map_odom, T_smooth_base)),
             T_odom_base, estimate.quality, known is not None, 0,
-            newest.pose.T_keyscan_base, newest.tracked, self._frontend.lidar_config.tracker.odometry,
+            newest.pose.T_keyscan_base, newest.tracked, self._frontend.odometry_model,
             estimate.covariance,
         )  # fmt: skip
 

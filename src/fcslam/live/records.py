@@ -7,7 +7,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import motion_information
-from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.outbox import WaitingPackets
@@ -38,7 +38,7 @@ class RobotPose:
     _motion: FloatArray
     """Since the last keyscan, shape (3,)."""
     _tracked: TrackedScan
-    _odometry: OdometryConfig
+    _odometry: OdometryModel
     _before: FloatArray
     """Covariance of the keyscan before in the map, shape (3, 3); 0 in a map of the robot's own, which begins there."""
 

@@ -520,7 +520,7 @@ class Robot(LiveTracker):
             newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
             T_odom_base, newest.quality,
             is_found and not newest.is_deferred, localizer.map_index, newest.pose.T_keyscan_base, newest.tracked,
-            self._frontend.lidar_config.tracker.odometry, np.zeros((3, 3)),
+            self._frontend.odometry_model, np.zeros((3, 3)),
         )  # fmt: skip
 
     def _tell(self) -> None:

@@ -9,16 +9,17 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
+SLACK_M = 0.2
+"""Length allowed to any step: the optimised map corrects by small steps, metres."""
+SLACK_RAD = 0.3
+"""Turn allowed to any step, radians."""
+
 
 class JumpLimits(Settings):
     """The fastest motion that a trajectory may have; a faster step is a jump."""
 
     speed_m_s: float = Field(default=3.0, gt=0, description="largest speed [m/s]")
     turn_rad_s: float = Field(default=4.0, gt=0, description="largest speed of a turn [rad/s]")
-    slack_m: float = Field(
-        default=0.2, ge=0, description="length allowed to any step: the optimised map corrects by small steps [m]"
-    )
-    slack_rad: float = Field(default=0.3, ge=0, description="turn allowed to any step [rad]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +60,8 @@ def find_jumps(stamps: FloatArray, poses: FloatArray, limits: JumpLimits) -> Jum
     steps = se2.relative(poses)
     length_m, turn_rad = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
     excess = np.maximum(
-        length_m / (limits.slack_m + limits.speed_m_s * within_s + 1e-9),
-        turn_rad / (limits.slack_rad + limits.turn_rad_s * within_s + 1e-9),
+        length_m / (SLACK_M + limits.speed_m_s * within_s + 1e-9),
+        turn_rad / (SLACK_RAD + limits.turn_rad_s * within_s + 1e-9),
     )
     count = int(np.count_nonzero(excess > 1.0))
     if not count:

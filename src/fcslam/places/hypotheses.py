@@ -8,40 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from fcslam.compiled import njit
-from fcslam.config import Settings
 from fcslam.features.codes import Matches
 from fcslam.records import FloatArray, frozen
 
 _REFINEMENTS = 5
 """Most rounds of least squares and inlier selection. The inliers nearly always stop changing after two or three."""
-
-
-class HypothesisConfig(Settings):
-    """Search for rigid motions between the keypoints of two places."""
-
-    seeds: int = Field(
-        default=50,
-        ge=2,
-        le=1000,
-        description="closest matches that seed the search: every two of them propose a motion",
-    )
-    inlier_distance_m: float = Field(
-        default=0.3, gt=0.0, le=5.0, description="largest distance between the matched keypoints of an inlier [m]"
-    )
-    minimum_inliers: int = Field(default=4, ge=2, description="fewest inliers of a motion hypothesis")
-    most_hypotheses: int = Field(default=2, ge=1, le=20, description="most motion hypotheses of a pair of places")
-    distinct_distance_m: float = Field(
-        default=1.0, ge=0.0, description="two motion hypotheses are distinct if their positions differ by more [m]"
-    )
-    distinct_angle_rad: float = Field(
-        default=0.26,
-        ge=0.0,
-        le=3.2,
-        description="two motion hypotheses are distinct if their angles differ by more [rad]",
-    )
+SEEDS = 50
+"""Closest matches that seed the search: every two of them propose a motion."""
+INLIER_M = 0.3
+"""Largest distance between the matched keypoints of an inlier, metres."""
+MINIMUM_INLIERS = 4
+"""Fewest inliers of a motion hypothesis."""
+MOST_HYPOTHESES = 2
+"""Most motion hypotheses of a pair of places."""
+DISTINCT_M = 1.0
+"""Two motion hypotheses are distinct if their positions differ by more, metres."""
+DISTINCT_RAD = 0.26
+"""Two motion hypotheses are distinct if their angles differ by more, radians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,34 +55,33 @@ class _Limits(NamedTuple):
 
 
 def rigid_hypotheses(
-    keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches, config: HypothesisConfig
+    keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches
 ) -> list[Hypothesis]:
     """Find the motions that most matches support, the best first.
 
-    Every two of the ``seeds`` closest matches propose a motion (two-point alignment). All matches score it, and least
+    Every two of the ``SEEDS`` closest matches propose a motion (two-point alignment). All matches score it, and least
     squares over the inliers refines the best. The search is deterministic and never proposes a reflection.
 
     Args:
         keypoints_a: shape (N, 2), metres in place a's coordinate frame.
         keypoints_b: shape (M, 2), metres in place b's coordinate frame.
         matches: pairs of their indices.
-        config: thresholds of the search.
 
     Returns:
-        At most ``most_hypotheses``; an empty list if no motion has ``minimum_inliers``.
+        At most ``MOST_HYPOTHESES``; an empty list if no motion has ``MINIMUM_INLIERS``.
     """
-    if len(matches.pairs) < config.minimum_inliers:
+    if len(matches.pairs) < MINIMUM_INLIERS:
         return []
     a = keypoints_a[matches.pairs[:, 0]].astype(np.float64)
     b = keypoints_b[matches.pairs[:, 1]].astype(np.float64)
-    seeds = np.argsort(matches.distances, kind="stable")[: config.seeds]
-    trials = _trials(a, b, seeds, config.inlier_distance_m)
+    seeds = np.argsort(matches.distances, kind="stable")[:SEEDS]
+    trials = _trials(a, b, seeds, INLIER_M)
     limits = _Limits(
-        config.inlier_distance_m,
-        config.minimum_inliers,
-        config.most_hypotheses,
-        config.distinct_distance_m,
-        config.distinct_angle_rad,
+        INLIER_M,
+        MINIMUM_INLIERS,
+        MOST_HYPOTHESES,
+        DISTINCT_M,
+        DISTINCT_RAD,
     )
     poses, agreeing = _best(a, b, trials, limits)
     return [

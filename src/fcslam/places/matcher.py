@@ -19,7 +19,7 @@ from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig
 from fcslam.places.index import PlaceIndex
-from fcslam.places.motions import Motion, MotionConfig, propose_motions
+from fcslam.places.motions import Motion, propose_motions
 from fcslam.places.persistence import index_state, restored_index
 from fcslam.places.query_result import QueryResult
 from fcslam.places.similarity import PAPER_SCALE
@@ -37,6 +37,12 @@ class MatchDecision(StrEnum):
     """The overlap of their submaps."""
     SIMILARITY = "similarity"
     """Their similarity alone: Algorithm 1, lines 14-17."""
+
+
+TOLERANCE_M = 1.0
+"""Largest distance at which an image motion confirms a predicted pose, metres."""
+TOLERANCE_RAD = 0.3
+"""Largest angle at which an image motion confirms a predicted pose, radians."""
 
 
 class MatcherConfig(Settings):
@@ -86,13 +92,6 @@ class MatcherConfig(Settings):
         "elsewhere, to find evidence against the join",
     )
     vocabulary: VocabularyConfig = Field(default=VocabularyConfig(), description="dynamic vocabulary")
-    motions: MotionConfig = Field(default=MotionConfig(), description="motions between places from keypoints")
-    prediction_tolerance_m: float = Field(
-        default=1.0, gt=0.0, description="largest distance at which an image motion confirms a predicted pose [m]"
-    )
-    prediction_tolerance_rad: float = Field(
-        default=0.3, gt=0.0, description="largest angle at which an image motion confirms a predicted pose [rad]"
-    )
     verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
 
 
@@ -243,7 +242,7 @@ class PlaceMatcher:
         near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
         others = (*self._candidates(result, is_unaligned), *lookalikes)
-        far = [_far(i, propose_motions(self._places[i], place, self._config.motions)) for i in others]
+        far = [_far(i, propose_motions(self._places[i], place)) for i in others]
         return [*near, *far]
 
     def state(self) -> State:
@@ -326,7 +325,7 @@ class PlaceMatcher:
         stored = self._places[i]
         if place.channel is Channel.LIDAR:
             return _Comparison(i, [(T_i_j, NO_PRIOR)], 0.0, predicted=True)
-        proposed = propose_motions(stored, place, self._config.motions)
+        proposed = propose_motions(stored, place)
         motion = next((motion for motion in proposed if self._confirms(motion, T_i_j)), None)
         if motion is None:
             return _far(i, proposed)
@@ -334,10 +333,7 @@ class PlaceMatcher:
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
-        return bool(
-            np.hypot(off[0], off[1]) <= self._config.prediction_tolerance_m
-            and abs(off[2]) <= self._config.prediction_tolerance_rad
-        )
+        return bool(np.hypot(off[0], off[1]) <= TOLERANCE_M and abs(off[2]) <= TOLERANCE_RAD)
 
     def _verified(
         self, comparisons: Sequence[_Comparison], place: Place, result: QueryResult[KeyscanId]

@@ -8,35 +8,23 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.geometry import se2
-from fcslam.places.hypotheses import Hypothesis, HypothesisConfig, rigid_hypotheses
+from fcslam.places.hypotheses import Hypothesis, rigid_hypotheses
 from fcslam.records import Channel, FloatArray, Place
 
 INDEPENDENT_KEYPOINTS: Final = 10
 """Most independent keypoints of one image. The errors of its keypoints are correlated, because they share one scan and
 one robot pose, so more keypoints do not add information."""
-
-
-class MotionConfig(Settings):
-    """Matching the keypoints of two places."""
-
-    hamming_limit: int = Field(
-        default=60, gt=0, le=256, description="largest Hamming distance of two matching descriptors [bits]"
-    )
-    inliers: int = Field(default=8, ge=4, description="fewest inliers of a motion that the submaps then verify")
-    level_m: float = Field(
-        default=0.1, gt=0.0, description="largest difference in height of two matching image keypoints [m]"
-    )
-    keypoint_sigma_m: float = Field(
-        default=0.1, gt=0.0, description="standard deviation of the position of an image keypoint [m]"
-    )
-    hypotheses: HypothesisConfig = Field(
-        default=HypothesisConfig(), description="search for rigid motions between keypoints"
-    )
+LARGEST_HAMMING = 60
+"""Largest Hamming distance of two matching descriptors, bits."""
+LEAST_INLIERS = 8
+"""Fewest inliers of a motion that the submaps then verify."""
+LARGEST_LEVEL_M = 0.1
+"""Largest difference in height of two matching image keypoints, metres."""
+KEYPOINT_SIGMA_M = 0.1
+"""Standard deviation of the position of an image keypoint, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,33 +40,28 @@ class Motion:
     """Matching descriptors divided by the descriptors of the smaller place, in [0, 1]."""
 
 
-def propose_motions(a: Place, b: Place, config: MotionConfig) -> list[Motion]:
+def propose_motions(a: Place, b: Place) -> list[Motion]:
     """Find the motions that enough matching keypoints support, the best first.
 
     Args:
         a, b: two places with descriptors of the same detector version.
-        config: thresholds of the matching.
     """
-    matches = mutual_matches(a.descriptors, b.descriptors, config.hamming_limit)
+    matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     if a.channel is Channel.CAMERA:
-        matches = _level(a, b, matches, config.level_m)
-    proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches, config.hypotheses)
+        matches = _level(a, b, matches)
+    proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
-    return [
-        Motion(h.T_a_b, _information(b, h, matches, config), share)
-        for h in proposed
-        if h.inlier_count >= config.inliers
-    ]
+    return [Motion(h.T_a_b, _information(b, h, matches), share) for h in proposed if h.inlier_count >= LEAST_INLIERS]
 
 
-def _level(a: Place, b: Place, matches: Matches, level_m: float) -> Matches:
-    """Keep the matches whose keypoints have the same height to within ``level_m``."""
+def _level(a: Place, b: Place, matches: Matches) -> Matches:
+    """Keep the matches whose keypoints have the same height to within ``LARGEST_LEVEL_M``."""
     heights_a, heights_b = a.keypoints[matches.pairs[:, 0], 2], b.keypoints[matches.pairs[:, 1], 2]
-    level = np.abs(heights_a - heights_b) <= level_m
+    level = np.abs(heights_a - heights_b) <= LARGEST_LEVEL_M
     return Matches(matches.pairs[level], matches.distances[level])
 
 
-def _information(b: Place, hypothesis: Hypothesis, matches: Matches, config: MotionConfig) -> FloatArray:
+def _information(b: Place, hypothesis: Hypothesis, matches: Matches) -> FloatArray:
     """Information of the motion from the positions of its inliers (Gauss-Newton normal matrix)."""
     if b.channel is not Channel.CAMERA:
         return np.zeros((3, 3))
@@ -88,4 +71,4 @@ def _information(b: Place, hypothesis: Hypothesis, matches: Matches, config: Mot
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -turned[:, 1], turned[:, 0]
     total = np.einsum("kij,kil->jl", jacobian, jacobian)
-    return np.asarray(total * min(1.0, INDEPENDENT_KEYPOINTS / len(inliers)) / config.keypoint_sigma_m**2)
+    return np.asarray(total * min(1.0, INDEPENDENT_KEYPOINTS / len(inliers)) / KEYPOINT_SIGMA_M**2)

@@ -10,13 +10,13 @@ from pathlib import Path
 from pydantic import Field
 
 from fcslam.errors import FeatureError
-from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig
+from fcslam.features.birdseye import DETECTOR_VERSION
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, KeyscanId, LaserModel, LaserScan, Place
 from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.robot.keyframe_folder import KeyframeFolder
-from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
+from fcslam.robot.own_places import OwnPlaces
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
 from fcslam.wire.messages import Body, Hello
@@ -28,10 +28,6 @@ class SessionConfig(SendingConfig):
     lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
     channels: tuple[Channel, ...] = Field(
         default=tuple(Channel), min_length=1, description="sensors that describe places: lidar, camera"
-    )
-    birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary descriptors of LiDAR submaps")
-    own_places: OwnPlacesConfig = Field(
-        default=OwnPlacesConfig(), description="place recognition on the robot, among its own LiDAR places"
     )
     views: ViewsConfig = Field(default=ViewsConfig(), description="binary descriptors of camera images")
 
@@ -176,7 +172,7 @@ class _Session:
         self.epoch = epoch
         self._robot = robot
         self._config = config
-        self._own_places = OwnPlaces(config.own_places, config.birdseye)
+        self._own_places = OwnPlaces()
         self._lidar = LidarBackend(robot, config.lidar, self._own_places)
         self._lasers: tuple[LaserModel, ...] = ()
         self._view_extractor = view_extractor

@@ -14,7 +14,7 @@ from fcslam.lidar.facing import Contradiction, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.records import FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
+from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.motion import OdometryUpdates
@@ -168,7 +168,7 @@ def _tracked(
     records: Iterator[SensorRecord], config: LidarConfig, assumed_s: float
 ) -> tuple[ScanMotions, OdometryTrack | None]:
     """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
-    frontend = LidarFrontend("calibration", without_odometry(config))
+    frontend = LidarFrontend("calibration", config, PREDICTED)
     prediction, mapped = MotionPrediction(), MappedScans()
     unknown = np.full(3, np.nan)
     stamps: list[float] = []

@@ -21,7 +21,8 @@ from fcslam.errors import FeatureError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, drove_on, has_moved_unseen, is_doubtful, is_lost
-from fcslam.lidar.tracker import TrackedScan, TrackingResult
+from fcslam.lidar.odometry import WHEELS, OdometryModel
+from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord, Sweep
 from fcslam.robot.backend import (
     BackendInput,
@@ -35,9 +36,8 @@ from fcslam.robot.backend import (
     essential,
 )
 from fcslam.robot.beside import BackendRunner, Inline
-from fcslam.robot.map_localizer import MapLocalizationConfig
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.motion_prediction import LONGEST_S, MotionPrediction, without_odometry
+from fcslam.robot.motion_prediction import LONGEST_S, PREDICTED, MotionPrediction
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.sources.contradictions import CHANGED, changed_share
@@ -56,9 +56,6 @@ class RobotConfig(SessionConfig):
     lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
     odometry: OdometryLimits = Field(
         default=OdometryLimits(), description="jumps of the wheel odometry, which scan matching bridges"
-    )
-    localization: MapLocalizationConfig = Field(
-        default=MapLocalizationConfig(), description="localisation in a finished map, which does not change"
     )
 
 
@@ -108,8 +105,6 @@ class RobotFrontend:
         """Stands in for the odometry; None if there is odometry."""
         self.odometry_fault: str | None = None
         """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
-        self.lidar_config = config.lidar
-        """Settings of the LiDAR front end; those for a robot without odometry once that is known."""
         self._config = config
         self._mapped = MappedScans()
         self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
@@ -207,6 +202,11 @@ class RobotFrontend:
         """
         return self._submit(NewDetector(file, path))
 
+    @property
+    def odometry_model(self) -> OdometryModel:
+        """Error of the odometry, or of the prediction in its place."""
+        return WHEELS if self.prediction is None else PREDICTED
+
     def place_keyframes(self) -> None:
         """Have the back end write where the keyframes are, if it keeps them."""
         self._submit(PlaceKeyframes())
@@ -215,7 +215,7 @@ class RobotFrontend:
         """End the present session and begin another: the next scan is of another place, as after a ride in a lift."""
         self._process_deferred()
         if self.newest is None:
-            self._lidar = LidarFrontend(self.robot, self.lidar_config)
+            self._lidar = LidarFrontend(self.robot, self._config.lidar, self.odometry_model)
         else:
             self._end_session()
         self._previous = None
@@ -230,10 +230,10 @@ class RobotFrontend:
         """The scan with its odometry free of jumps, or with a prediction if there is none."""
         if self.prediction is None and self._is_without_odometry(scan):
             self.prediction = MotionPrediction()
-            self.lidar_config = without_odometry(self.lidar_config)
             self.begin_session()
-        if scan.sweep is None and self.lidar_config.scan_duration_s > 0.0:
-            scan = replace(scan, sweep=Sweep(0.0, self.lidar_config.scan_duration_s))
+        duration_s = self._config.lidar.scan_duration_s
+        if scan.sweep is None and duration_s > 0.0:
+            scan = replace(scan, sweep=Sweep(0.0, duration_s))
             if self.prediction is None and self._previous is not None:
                 scan = _moving_on(scan, self._previous)
         return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
@@ -268,14 +268,13 @@ class RobotFrontend:
         self._observe(scan)
 
     def _localize(self, scan: LaserScan) -> None:
-        config = self._config.lost
         before, self._previous = self._previous, scan
-        if before is not None and has_moved_unseen(before, scan, config):
+        if before is not None and has_moved_unseen(before, scan):
             self._process_deferred()
             self._end_session()
         # 1. Localize the scan; unless it is doubtful, process it.
         tracking = self._lidar.localize(scan)
-        if not is_doubtful(tracking, self._lidar, config):
+        if not is_doubtful(tracking, self._lidar, self._config.lost):
             if self._deferred:
                 self._process_deferred()
                 tracking = self._lidar.localize(scan)
@@ -287,11 +286,11 @@ class RobotFrontend:
         self._deferred.append(scan)
         self.newest = _newest(self._lidar.scan_pose(scan.stamp, tracking.tracked), tracking, is_deferred=True)
         scans = [record for record in self._deferred if isinstance(record, LaserScan)]
-        if not can_decide(scans, config):
+        if not can_decide(scans):
             return
         # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them. If the
         # robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
-        if is_lost(scans, self._T_local_deferred, self._lidar, config):
+        if is_lost(scans, self._T_local_deferred, self._lidar):
             is_whole = self.odometry.jumps == self._jumps
             if is_whole and drove_on(self._explained, scans, self._lidar):
                 self._lidar.begin_local_map()
@@ -306,7 +305,7 @@ class RobotFrontend:
 
     def _begin(self) -> None:
         """Begin a session."""
-        self._lidar = LidarFrontend(self.robot, self.lidar_config)
+        self._lidar = LidarFrontend(self.robot, self._config.lidar, self.odometry_model)
         self._newest, self._scans, self._explained = None, {}, {}
         self.tracks.append(ScanTrack())
 
@@ -332,7 +331,7 @@ class RobotFrontend:
         self.newest = _newest(step.pose, tracking, is_deferred=False)
         self._newest = scan, step.pose
         self._scans[scan.laser.T_base_laser] = scan
-        if tracking.explained >= self.lidar_config.tracker.doubtful * tracking.known:  # false if it was not matched
+        if tracking.explained >= DOUBTFUL * tracking.known:  # false if it was not matched
             self._explained[scan.laser.T_base_laser] = scan
         self._jumps = self.odometry.jumps
 

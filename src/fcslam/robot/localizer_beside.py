@@ -9,11 +9,10 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 from fcslam.errors import FcslamError
-from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
-from fcslam.robot.map_localizer import MapEstimate, MapLocalizationConfig, MapLocalizer
+from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Body
 
@@ -33,10 +32,7 @@ class MapState:
 class LocalizerBeside:
     """Runs a ``MapLocalizer`` in the only worker of an executor; a ``BackendRunner`` for ``RobotFrontend``."""
 
-    def __init__(
-        self, robot: str, occupancy: OccupancyMap, config: MapLocalizationConfig, lidar: LidarConfig,
-        initial: FloatArray | None, executor: Executor,
-    ) -> None:  # fmt: skip
+    def __init__(self, robot: str, occupancy: OccupancyMap, initial: FloatArray | None, executor: Executor) -> None:
         """Load the map into the worker; arguments as for ``MapLocalizer``.
 
         Raises:
@@ -47,7 +43,7 @@ class LocalizerBeside:
         """After the newest input that the worker has handled."""
         self.keyscans = 0
         """Number of keyscans so far."""
-        executor.submit(_begin, robot, occupancy, config, lidar, initial).result()
+        executor.submit(_begin, robot, occupancy, initial).result()
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """Queue the next input."""
@@ -95,10 +91,8 @@ _localizations: dict[str, _Localization] = {}
 """By robot."""
 
 
-def _begin(
-    robot: str, occupancy: OccupancyMap, config: MapLocalizationConfig, lidar: LidarConfig, initial: FloatArray | None
-) -> None:
-    _localizations[robot] = _Localization(MapLocalizer(frozen_map(occupancy, "the map"), config, lidar, initial))
+def _begin(robot: str, occupancy: OccupancyMap, initial: FloatArray | None) -> None:
+    _localizations[robot] = _Localization(MapLocalizer(frozen_map(occupancy, "the map"), initial))
 
 
 def _process(robot: str, input: BackendInput) -> MapState:

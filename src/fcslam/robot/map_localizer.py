@@ -13,13 +13,12 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, LidarConfig, MappedKeyscan
+from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, MappedKeyscan
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import Agreement, Submap, agreement, build_submap
+from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
 from fcslam.wire.messages import Body
@@ -32,56 +31,40 @@ FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.05, 0.01
 """Standard deviations of a pose that the exhaustive search found."""
 
 
-class MapLocalizationConfig(Settings):
-    """Localisation in a finished map."""
-
-    first_m: float = Field(default=3.0, gt=0, description="travel before the first search of the whole map [m]")
-    growth: float = Field(default=1.5, gt=1.0, description="length of a stretch, relative to that at the search before")
-    window_m: float = Field(default=15.0, gt=0, description="longest stretch whose walls are searched for [m]")
-    ratio: float = Field(
-        default=1.5,
-        ge=1.0,
-        description="least ratio of the score of the best alignment with the map to that of the best one elsewhere; "
-        "below it, the alignment does not count",
-    )
-    evidence: float = Field(
-        default=3.0,
-        ge=1.0,
-        description="evidence that fixes the pose: the number of separate stretches whose best alignments agree, plus "
-        "the least of their ratios, less one",
-    )
-    violation: float = Field(
-        default=0.10, ge=0, le=1, description="largest share of the walls in free space of the map, or the reverse"
-    )
-    supported: float = Field(
-        default=0.30,
-        ge=0,
-        le=1,
-        description="least share of a keyscan's points on walls of the map; below it, the robot's own motion alone "
-        "counts",
-    )
-    check_m: float = Field(default=2.0, gt=0, description="travel between two comparisons with the map [m]")
-    checked_m: float = Field(default=5.0, gt=0, description="the walls that are compared are of the last metres [m]")
-    overlap: float = Field(
-        default=0.25, ge=0, le=1, description="least share of the walls in known area; below it, nothing is compared"
-    )
-    doubted: float = Field(
-        default=0.80,
-        ge=0,
-        le=1,
-        description="with a smaller share of the walls in the map, the pose is compared with the best one elsewhere",
-    )
-    lost_explained: float = Field(
-        default=0.60, ge=0, le=1, description="a robot that is lost sees a smaller share of its walls in the map"
-    )
-    lost_violation: float = Field(
-        default=0.20, ge=0, le=1, description="and a larger share of its walls in free space of the map"
-    )
-    unseen_m: float = Field(
-        default=20.0, gt=0, description="travel without known walls after which the robot is not localised any more [m]"
-    )
-    initial_m: float = Field(default=1.5, gt=0, description="largest error of a given initial position [m]")
-    initial_rad: float = Field(default=0.5, gt=0, description="largest error of a given initial heading [rad]")
+FIRST_SEARCH_M = 3.0
+"""Travel before the first search of the whole map, metres."""
+STRETCH_GROWTH = 1.5
+"""Length of a stretch, relative to that at the search before."""
+LONGEST_STRETCH_M = 15.0
+"""Longest stretch whose walls are searched for, metres."""
+LEAST_RATIO = 1.5
+"""Least ratio of the score of the best alignment with the map to that of the best one elsewhere; below it, the
+alignment does not count."""
+LEAST_EVIDENCE = 3.0
+"""Evidence that fixes the pose: the number of separate stretches whose best alignments agree, plus the least of their
+ratios, less one."""
+LARGEST_VIOLATION = 0.10
+"""Largest share of the walls in free space of the map, or the reverse."""
+SUPPORTED = 0.30
+"""Least share of a keyscan's points on walls of the map; below it, the robot's own motion alone counts."""
+CHECK_EVERY_M = 2.0
+"""Travel between two comparisons with the map, metres."""
+CHECKED_M = 5.0
+"""The walls that are compared are of the last metres, metres."""
+LEAST_OVERLAP = 0.25
+"""Least share of the walls in known area; below it, nothing is compared."""
+DOUBTED = 0.80
+"""With a smaller share of the walls in the map, the pose is compared with the best one elsewhere."""
+LOST_EXPLAINED = 0.60
+"""A robot that is lost sees a smaller share of its walls in the map."""
+LOST_VIOLATION = 0.20
+"""And a larger share of its walls in free space of the map."""
+LARGEST_UNSEEN_M = 20.0
+"""Travel without known walls after which the robot is not localised any more, metres."""
+INITIAL_ERROR_M = 1.5
+"""Largest error of a given initial position, metres."""
+INITIAL_ERROR_RAD = 0.5
+"""Largest error of a given initial heading, radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,18 +93,14 @@ class _Vote:
 class MapLocalizer:
     """Localises one robot by its keyscans; a ``BackendRunner`` for ``RobotFrontend``. It sends nothing."""
 
-    def __init__(
-        self, frozen_map: Submap, config: MapLocalizationConfig, lidar: LidarConfig, initial: FloatArray | None = None
-    ) -> None:
+    def __init__(self, frozen_map: Submap, initial: FloatArray | None = None) -> None:
         """Begin without a pose.
 
         Args:
             frozen_map: the map (``fcslam.lidar.frozen_map``).
-            config: thresholds.
-            lidar: settings of scan matching.
             initial: about where the first session starts in the map, shape (3,), metres and radians; None: anywhere.
         """
-        self._map, self._config, self._lidar = frozen_map, config, lidar
+        self._map = frozen_map
         self.estimate: MapEstimate | None = None
         """None while the robot does not know where it is in the map."""
         self.fixes = 0
@@ -137,7 +116,7 @@ class MapLocalizer:
     def suggest(self, T_map_odom: FloatArray) -> None:
         """Try a pose that somebody gives, as by hand: the walls that the robot sees from now on must confirm it.
 
-        Until they do, nothing changes; after ``window_m`` it is forgotten.
+        Until they do, nothing changes; after ``LONGEST_STRETCH_M`` it is forgotten.
 
         Args:
             T_map_odom: about where the ``odom`` frame of the present session lies in the map, shape (3,), metres and
@@ -163,7 +142,7 @@ class MapLocalizer:
 
     def _begin(self) -> None:
         self._recent: deque[MappedKeyscan] = deque()
-        """The keyscans of the last ``window_m``."""
+        """The keyscans of the last ``LONGEST_STRETCH_M``."""
         self._T_map_base: FloatArray | None = None
         """Pose of the newest keyscan; None: unknown."""
         self._covariance: FloatArray = np.zeros((3, 3))
@@ -173,7 +152,7 @@ class MapLocalizer:
         """The alignments of separate stretches that agree so far."""
         self._searched_m = 0.0
         """Travel at the end of the last stretch that voted."""
-        self._next_search_m = self._config.first_m
+        self._next_search_m = FIRST_SEARCH_M
         self._checked_m = self._seen_m = 0.0
         """Travel at the last comparison with the map, and at the last one that found known walls."""
         self._suggested = None
@@ -181,14 +160,14 @@ class MapLocalizer:
     def _add(self, keyscan: MappedKeyscan) -> None:
         before = self._recent[-1] if self._recent else None
         self._recent.append(keyscan)
-        while self._recent[0].travel_m < keyscan.travel_m - self._config.window_m:
+        while self._recent[0].travel_m < keyscan.travel_m - LONGEST_STRETCH_M:
             self._recent.popleft()
         if self._T_map_base is not None and before is not None:
             # 1. Prediction by the robot's own motion, correction by the map.
             self._T_map_base = self._match(self._predict(self._T_map_base, before, keyscan), keyscan)
             # 2. Compare the newest walls with the map, and now and then all around the robot.
             self._newest_share = self._explained(0.0, self._newest_share)
-            if keyscan.travel_m >= self._checked_m + self._config.check_m:
+            if keyscan.travel_m >= self._checked_m + CHECK_EVERY_M:
                 self._check(keyscan)
         # 3. Try the pose that somebody gave.
         self._try_suggested(keyscan)
@@ -212,45 +191,43 @@ class MapLocalizer:
         """Share of the walls of the last metres that lie on walls of the map; ``otherwise``, if it knows too little."""
         assert self._T_map_base is not None
         found = self._agreement(self._T_map_base, reach_m)
-        return found.explained if found.overlap >= self._config.overlap else otherwise
+        return found.explained if found.overlap >= LEAST_OVERLAP else otherwise
 
     def _match(self, T_map_guess: FloatArray, keyscan: MappedKeyscan) -> FloatArray:
         """The pose matched with the map, with the guess as prior."""
-        tracker = self._lidar.tracker
-        points = keyscan.points.thinned(tracker.point_spacing_m, tracker.point_limit)
+        points = keyscan.points.thinned(POINT_SPACING_M, POINT_LIMIT)
         prior: FloatArray = np.asarray(np.linalg.inv(self._covariance))
         # Errors of neighbouring points are correlated; the match counts them in full, so the prior is scaled instead.
-        match = match_scan(points, self._map.field, T_map_guess, prior / POINT_INFORMATION_SHARE, tracker.matching)
-        if match.explained < self._config.supported:
+        match = match_scan(points, self._map.field, T_map_guess, prior / POINT_INFORMATION_SHARE)
+        if match.explained < SUPPORTED:
             return T_map_guess
         self._covariance = np.asarray(np.linalg.inv(prior + POINT_INFORMATION_SHARE * match.information))
         return match.T_field_base
 
     def _check(self, keyscan: MappedKeyscan) -> None:
         assert self._T_map_base is not None
-        config = self._config
         self._checked_m = keyscan.travel_m
-        found = self._agreement(self._T_map_base, config.checked_m)
-        if found.overlap >= config.overlap:
+        found = self._agreement(self._T_map_base, CHECKED_M)
+        if found.overlap >= LEAST_OVERLAP:
             self._seen_m, self._quality = keyscan.travel_m, found.explained
-            if found.explained < config.lost_explained and found.violation > config.lost_violation:
+            if found.explained < LOST_EXPLAINED and found.violation > LOST_VIOLATION:
                 self._lose()
-            elif found.explained < config.doubted:
+            elif found.explained < DOUBTED:
                 self._contest(self._T_map_base, keyscan)
-        elif keyscan.travel_m > self._seen_m + config.unseen_m:
+        elif keyscan.travel_m > self._seen_m + LARGEST_UNSEEN_M:
             self._lose()
 
     def _contest(self, T_map_base: FloatArray, keyscan: MappedKeyscan) -> None:
         """Give up a doubtful pose if the walls fit clearly better elsewhere."""
         from fcslam.lidar.uniqueness import align_map, best_elsewhere
 
-        submap = self._submap(self._config.checked_m)
+        submap = self._submap(CHECKED_M)
         rival = best_elsewhere(self._map, submap, T_map_base)
-        if rival is None or rival.violation > self._config.violation:
+        if rival is None or rival.violation > LARGEST_VIOLATION:
             return
         here = align_map(self._map, submap, T_map_base)
         ratio = rival.score_m / max(LEAST_RIVAL_M, here.score_m)
-        if ratio >= self._config.ratio:
+        if ratio >= LEAST_RATIO:
             self._lose()
             self._vote(rival.T_a_b, ratio, keyscan)
 
@@ -267,16 +244,15 @@ class MapLocalizer:
         """Align the walls of the newest stretch with the whole map."""
         from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load
 
-        config = self._config
-        length_m = min(keyscan.travel_m - self._searched_m, config.window_m)
+        length_m = min(keyscan.travel_m - self._searched_m, LONGEST_STRETCH_M)
         submap = self._submap(length_m)
-        self._next_search_m = keyscan.travel_m + max(config.check_m, (config.growth - 1.0) * length_m)
+        self._next_search_m = keyscan.travel_m + max(CHECK_EVERY_M, (STRETCH_GROWTH - 1.0) * length_m)
         found = two_best(self._map, submap)
         if found is None:
             return
         best, rival = found
         ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
-        if ratio < config.ratio or best.violation > config.violation:
+        if ratio < LEAST_RATIO or best.violation > LARGEST_VIOLATION:
             return
         self._vote(best.T_a_b, ratio, keyscan)
 
@@ -286,28 +262,28 @@ class MapLocalizer:
             return
         from fcslam.lidar.uniqueness import align_map
 
-        config, (T_map_odom, given_m) = self._config, self._suggested
-        if keyscan.travel_m > given_m + config.window_m:
+        T_map_odom, given_m = self._suggested
+        if keyscan.travel_m > given_m + LONGEST_STRETCH_M:
             self._suggested = None
             return
         guess = se2.compose(T_map_odom, keyscan.T_local_base)
         near = align_map(self._map, self._submap(keyscan.travel_m - given_m), guess)
         off = se2.between(guess, near.T_a_b)
-        is_near = np.hypot(off[0], off[1]) <= config.initial_m and abs(off[2]) <= config.initial_rad
-        if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= config.violation:
+        is_near = np.hypot(off[0], off[1]) <= INITIAL_ERROR_M and abs(off[2]) <= INITIAL_ERROR_RAD
+        if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= LARGEST_VIOLATION:
             self._fix(near.T_a_b, keyscan)
 
     def _vote(self, T_map_base: FloatArray, ratio: float, keyscan: MappedKeyscan) -> None:
         """Count the best alignment of a stretch; with enough evidence it fixes the pose."""
         vote = _Vote(se2.compose(T_map_base, se2.inverse(keyscan.T_local_base)), ratio)
         self._votes = [*(other for other in self._votes if self._agree(vote, other, keyscan)), vote]
-        if len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0 >= self._config.evidence:
+        if len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0 >= LEAST_EVIDENCE:
             self._fix(T_map_base, keyscan)
         self._begin_stretch(keyscan.travel_m)
 
     def _begin_stretch(self, travel_m: float) -> None:
         """Begin a stretch: the next search uses the scans from here on."""
-        self._searched_m, self._next_search_m = travel_m, travel_m + self._config.first_m
+        self._searched_m, self._next_search_m = travel_m, travel_m + FIRST_SEARCH_M
 
     def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:
         """Whether two alignments put the newest keyscan at one pose of the map."""
@@ -321,7 +297,7 @@ class MapLocalizer:
         self._T_map_base = T_map_base
         self._covariance = np.diag((FIRST_SIGMA_M**2, FIRST_SIGMA_M**2, FIRST_SIGMA_RAD**2))
         self._checked_m = self._seen_m = keyscan.travel_m
-        self._quality = self._agreement(T_map_base, self._config.checked_m).explained
+        self._quality = self._agreement(T_map_base, CHECKED_M).explained
         self._newest_share = self._explained(0.0, self._quality)
 
     def _lose(self) -> None:

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import LidarConfig
-from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.odometry import OdometryModel
 from fcslam.records import FloatArray, LaserScan, Sweep, frozen
 
 LONGEST_S = 1.0
@@ -14,20 +13,15 @@ LONGEST_S = 1.0
 LEAST_SHARE, LARGEST_SHARE = 0.5, 3.0
 """Limits of the next motion as a share of the last one: intervals vary if scans are dropped, but also if stamps are
 wrong."""
-ERRORS = OdometryConfig(
+PREDICTED = OdometryModel(
     is_measured=False,
     position_m=0.1,
     position_per_travel=0.5,
     heading_rad=0.1,
     heading_per_turn=0.5,
 )
-"""Errors of the prediction: within a tenth of a second, a robot may brake or turn by so much."""
-
-
-def without_odometry(config: LidarConfig) -> LidarConfig:
-    """The settings of a robot without odometry: every scan is matched, and the prediction is trusted little."""
-    tracker = config.tracker.model_copy(update={"still_m": 0.0, "still_rad": 0.0, "odometry": ERRORS})
-    return config.model_copy(update={"tracker": tracker})
+"""Of a robot without odometry: every scan is matched, and the prediction is trusted little. Within a tenth of a second,
+a robot may brake or turn by so much."""
 
 
 class MotionPrediction:

@@ -15,6 +15,10 @@ LEAST_BRIDGE_M, LEAST_BRIDGE_RAD = 0.02, 0.02
 
 WITHOUT_CLOCK_S = 2.0
 """Scans with equal stamps may be so far apart: some logs were recorded without a clock, a scan every two metres."""
+SLACK_M = 1.0
+"""Length allowed to any step, as stamps may be wrong, metres."""
+SLACK_RAD = 1.5
+"""Turn allowed to any step, radians."""
 
 
 class OdometryLimits(Settings):
@@ -22,8 +26,6 @@ class OdometryLimits(Settings):
 
     speed_m_s: float = Field(default=5.0, gt=0, description="largest speed [m/s]")
     turn_rad_s: float = Field(default=6.0, gt=0, description="largest speed of a turn [rad/s]")
-    slack_m: float = Field(default=1.0, ge=0, description="length allowed to any step, as stamps may be wrong [m]")
-    slack_rad: float = Field(default=1.5, ge=0, description="turn allowed to any step [rad]")
 
 
 class OdometryGate:
@@ -91,6 +93,6 @@ class OdometryGate:
         limits = self._limits
         within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
         return bool(
-            math.hypot(motion[0], motion[1]) > limits.slack_m + limits.speed_m_s * within_s
-            or abs(motion[2]) > limits.slack_rad + limits.turn_rad_s * within_s
+            math.hypot(motion[0], motion[1]) > SLACK_M + limits.speed_m_s * within_s
+            or abs(motion[2]) > SLACK_RAD + limits.turn_rad_s * within_s
         )

@@ -3,39 +3,31 @@
 from collections.abc import Collection
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
-from fcslam.features.birdseye import BirdseyeConfig, BirdseyeFeatures, describe
+from fcslam.features.birdseye import BIRDSEYE, BirdseyeFeatures, describe
 from fcslam.features.codes import mutual_matches
 from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.index import PlaceIndex
-from fcslam.places.motions import MotionConfig
+from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
 
-
-class OwnPlacesConfig(Settings):
-    """Place recognition on the robot, among its own LiDAR places."""
-
-    vocabulary: VocabularyConfig = Field(default=VocabularyConfig(), description="dynamic vocabulary")
-    motions: MotionConfig = Field(default=MotionConfig(), description="motions between places from keypoints")
+VOCABULARY = VocabularyConfig()
+"""Of the places of one robot."""
 
 
 class OwnPlaces:
     """The LiDAR places of one session (``lidar.closing.PlaceRecognizer``), with a vocabulary of their own."""
 
-    def __init__(self, config: OwnPlacesConfig, birdseye: BirdseyeConfig) -> None:
-        self._config = config
-        self._birdseye = birdseye
+    def __init__(self, vocabulary: VocabularyConfig = VOCABULARY) -> None:
         self._features: dict[int, BirdseyeFeatures] = {}
-        self._index: PlaceIndex[int] = PlaceIndex(config.vocabulary, np.random.default_rng(0))
+        self._index: PlaceIndex[int] = PlaceIndex(vocabulary, np.random.default_rng(0))
         self._backlog: list[int] = []
         """Places that the index lacks: a robot whose loops are short never asks it."""
 
     def store(self, keyscan: int, surface: FloatArray) -> None:
         """Describe and store a submap by the points of its surfaces, shape (N, 2), metres in its anchor's base."""
-        self._features[keyscan] = describe(surface, self._birdseye)
+        self._features[keyscan] = describe(surface, BIRDSEYE)
         self._backlog.append(keyscan)
 
     def features(self, keyscan: int) -> BirdseyeFeatures:
@@ -60,7 +52,7 @@ class OwnPlaces:
 
     def motions(self, a: int, b: int) -> list[FloatArray]:
         """Motions ``T_a_b``, shape (3,), that enough keypoints of two stored submaps support, the best first."""
-        config, (of_a, of_b) = self._config.motions, (self._features[a], self._features[b])
-        matches = mutual_matches(of_a.descriptors, of_b.descriptors, config.hamming_limit)
-        proposed = rigid_hypotheses(of_a.keypoints_m, of_b.keypoints_m, matches, config.hypotheses)
-        return [hypothesis.T_a_b for hypothesis in proposed if hypothesis.inlier_count >= config.inliers]
+        of_a, of_b = self._features[a], self._features[b]
+        matches = mutual_matches(of_a.descriptors, of_b.descriptors, LARGEST_HAMMING)
+        proposed = rigid_hypotheses(of_a.keypoints_m, of_b.keypoints_m, matches)
+        return [hypothesis.T_a_b for hypothesis in proposed if hypothesis.inlier_count >= LEAST_INLIERS]

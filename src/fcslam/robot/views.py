@@ -24,6 +24,8 @@ from fcslam.robot.keyframe_folder import KeyframeFolder
 
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
+FEWEST_KEYPOINTS = 20
+"""Least number of keypoints with a position; an image with fewer is no place."""
 
 
 class ViewsConfig(Settings):
@@ -34,9 +36,6 @@ class ViewsConfig(Settings):
         default=0.5,
         gt=0.0,
         description="turn after which an image becomes a camera place; at 0.5 rad about half of the view is new [rad]",
-    )
-    fewest_keypoints: int = Field(
-        default=20, ge=1, description="least number of keypoints with a position; an image with fewer is no place"
     )
     ceiling_m: float = Field(
         default=3.0, gt=0.0, description="height of the ceiling above the floor; keypoints above it are dropped [m]"
@@ -148,7 +147,7 @@ class ViewExtractor:
         features = self._detector.detect(picture)
         pixels, ceiling_m = features.keypoints_px, self._config.ceiling_m
         positions, placed = locate_among(pixels, image.camera, image.surroundings, ceiling_m)
-        if placed.sum() < self._config.fewest_keypoints:
+        if placed.sum() < FEWEST_KEYPOINTS:
             return None
         if self._folder is not None:
             self._folder.keep(image, features, self._detector.version)

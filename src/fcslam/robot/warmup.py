@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fcslam.lidar.frontend import LidarFrontend
-from fcslam.lidar.lost import is_lost
+from fcslam.lidar.lost import FEWEST_SCANS, is_lost
 from fcslam.records import LaserModel, LaserScan, Sweep, frozen
 from fcslam.robot.frontend import RobotConfig
 from fcslam.wire.quantisation import dequantise, quantise
@@ -27,9 +27,9 @@ def warm_up_tracking(config: RobotConfig) -> None:
     scans = list(_scans(_ROOM, 0.0))
     for scan in scans:
         frontend.process(scan)
-    elsewhere = list(_scans(_OTHER_ROOM, scans[-1].stamp))[: config.lost.fewest_scans]
+    elsewhere = list(_scans(_OTHER_ROOM, scans[-1].stamp))[:FEWEST_SCANS]
     first = frontend.localize(elsewhere[0]).tracked
-    is_lost(elsewhere, first.T_local_base, frontend, config.lost)
+    is_lost(elsewhere, first.T_local_base, frontend)
     gc.collect()
     gc.freeze()
 

@@ -49,12 +49,11 @@ class Sends(StrEnum):
 
 
 class WordsConfig(Settings):
-    """The words that robots and cloud share, and the map that a robot sends once."""
+    """The words that robots and cloud share."""
 
     vocabulary: Path | None = Field(
         default=None, description="file of the vocabularies of all channels, as `fcslam vocabulary` writes it"
     )
-    map: OccupancyConfig = Field(default=OccupancyConfig(), description="the robot's own map")
 
 
 class SendingConfig(Settings):
@@ -87,7 +86,7 @@ class WordSender:
         assert config.vocabulary is not None, "checked with the settings"
         self._path = config.vocabulary
         self._vocabularies = {found.channel: found for found in read_vocabularies(config.vocabulary)}
-        self._grid = config.map
+        self._grid = OccupancyConfig()
         self._begin()
 
     def check(self, detector_versions: Mapping[Channel, str]) -> None:

@@ -16,13 +16,12 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.compiled import is_compiled, uncached
-from fcslam.features.birdseye import BirdseyeConfig
 from fcslam.geometry import se2
 from fcslam.lidar import correlative, matching
 from fcslam.lidar import field as field_code
-from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.field import SurfelField, field_of
-from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.matching import match_scan
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
@@ -44,7 +43,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
+from fcslam.robot.own_places import OwnPlaces
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import decode, encode, measure
@@ -75,12 +74,12 @@ def warm_up_scanning() -> None:
 
 def warm_up_matching() -> None:
     """Compile what the second scan needs. Arrays without content: nothing else is compiled for them."""
-    match_scan(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), np.zeros((3, 3)), MatchingConfig())
+    match_scan(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), np.zeros((3, 3)))
 
 
 def warm_up_searching() -> None:
     """Compile the search of doubtful scans, and packets of keyscans."""
-    search(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), SearchWindow(0.5, 0.1), SearchConfig())
+    search(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), SearchWindow(0.5, 0.1))
     measure(Packet("r", 0, 0, 0.0, Keyscan(KeyscanId("r", 0), 0.0, dequantise(np.ones(9, np.uint16)))))
 
 
@@ -95,7 +94,7 @@ def warm_up_robot() -> None:
 def warm_up_recognition() -> None:
     """Compile the vocabulary, and what compares places."""
     vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
-    places = OwnPlaces(OwnPlacesConfig(vocabulary=vocabulary), BirdseyeConfig())
+    places = OwnPlaces(vocabulary)
     surface = build_submap([(point_scan(s.ranges_m, s.laser), s.T_odom_base) for s in _scans(9)]).surface.points
     for k in range(4):
         places.store(k, surface)

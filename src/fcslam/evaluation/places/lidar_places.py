@@ -17,8 +17,8 @@ from fcslam.evaluation.places.sets import PlaceSet
 from fcslam.features.codes import mutual_matches
 from fcslam.lidar.lost import LostConfig
 from fcslam.metrics.retrieval import PairTruth
-from fcslam.places.hypotheses import HypothesisConfig, rigid_hypotheses
-from fcslam.places.motions import MotionConfig
+from fcslam.places.hypotheses import rigid_hypotheses
+from fcslam.places.motions import LARGEST_HAMMING
 from fcslam.places.sequence import excluding_recent
 from fcslam.records import Channel, FloatArray, Keyscan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -69,8 +69,8 @@ def describe_recording(recording: Path) -> DescribedSet:
 
 def planar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
     """Number of inliers of the best rigid motion between two LiDAR places."""
-    matches = mutual_matches(a.descriptors, b.descriptors, MotionConfig().hamming_limit)
-    found = rigid_hypotheses(a.positions, b.positions, matches, HypothesisConfig())
+    matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
+    found = rigid_hypotheses(a.positions, b.positions, matches)
     return found[0].inlier_count if found else 0
 
 
