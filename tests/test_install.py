@@ -119,3 +119,28 @@ def test_the_dockerfile_copies_files_that_are_there_and_not_ignored():
     assert copied == kept
     assert all((ROOT / name).exists() for name in copied)
     assert [rest for word, rest in found if word in ("USER", "ENTRYPOINT")] == ["fcslam", '["fcslam"]']
+
+
+WITHOUT_SERVICE = """
+import sys
+from fcslam.cli import OF_THE_SERVICE
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in OF_THE_SERVICE:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+from fcslam.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_recordings_are_mapped_and_shown_without_the_packages_of_the_service(tmp_path):
+    log = LOGS / "anna.clf.xz"
+    fcslam_ = (sys.executable, "-c", WITHOUT_SERVICE)
+    run(*fcslam_, "map", log, "-o", tmp_path / "run", "-q", cwd=tmp_path)
+    run(*fcslam_, "show", tmp_path / "run", "--html", tmp_path / "run.html", cwd=tmp_path)
+    assert "<html" in (tmp_path / "run.html").read_text(encoding="utf-8")
+    command = [*fcslam_, "serve", "--data", tmp_path / "data"]
+    served = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+    assert served.returncode == 2
+    assert re.fullmatch(r"fcslam: this needs \w+; install it: pip install 'fcslam\[service\]'\n", served.stderr)

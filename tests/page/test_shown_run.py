@@ -20,7 +20,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EvaluationError
 from fcslam.mission_file import as_stored, mission_bytes
 from fcslam.page import viewer
-from fcslam.page.report import ASKED, MOST_TILES, report_html
+from fcslam.page.report import MOST_TILES, report_html
 from fcslam.page.routes import ASSETS
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
@@ -31,6 +31,11 @@ from fcslam.service.http.app import PREFIX
 from fcslam.wire.packets import decode, measure
 from tests.service.http.desk import A
 
+ASKED = (
+    *("fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "config.yaml"),
+    *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
+)
+"""Paths that the page requests, besides events, trajectories and tiles."""
 HOSTILE = "</script><script>alert(1)</script>"
 
 

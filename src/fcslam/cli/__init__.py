@@ -40,6 +40,8 @@ from fcslam.errors import FcslamError, InputError, printable
 
 BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
 """Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells, 1 for a closed pipe as in click."""
+OF_THE_SERVICE = {"cryptography", "fastapi", "httpx", "prometheus_client", "starlette", "uvicorn"}
+"""Packages of the extra ``service``: mapping recordings needs none of them."""
 PROGRAM = "fcslam"
 COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
@@ -170,6 +172,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except FcslamError as error:
         return _fail(str(error), BAD_INPUT)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] not in OF_THE_SERVICE:
+            raise
+        return _fail(f"this needs {error.name}; install it: pip install 'fcslam[service]'", BAD_INPUT)
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
             raise

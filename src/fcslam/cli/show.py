@@ -51,7 +51,6 @@ def show(
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
     from fcslam.errors import OutputError
     from fcslam.page.shown_run import ShownRun
-    from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
 
     if html is not None and html.exists() and not (force and html.is_file()):
         raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
@@ -60,6 +59,8 @@ def show(
         if html is not None:
             _write_report(shown, html, run)
             return
+        from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
+
         with listen(HOST, port) as listening:
             _announce(f"fcslam shows {run}", listening, open_browser)
             typer.echo("Ctrl-C ends it")

@@ -1,39 +1,39 @@
 """The page over a finished run as one file: it holds what the page asks for, and asks nobody."""
 
-import asyncio
 import base64
 import hashlib
 import itertools
 import json
 import math
 import re
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
-import httpx
-from fastapi import FastAPI
-
+from fcslam.config import Settings
 from fcslam.errors import EvaluationError
-from fcslam.maps.tiles import WORLD_M, finest_zoom
-from fcslam.page.routes import ASSETS
-from fcslam.page.viewer import ReadOnly, viewer_app
+from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
+from fcslam.page import ASSETS
 from fcslam.records import ClosureStatus
-from fcslam.runs import OccupancyMap, open_run
-from fcslam.service.http.app import PREFIX
+from fcslam.runs import CONFIG, METRICS, TRAJECTORIES, OccupancyMap, open_run
+from fcslam.runs.map_files import map_stem
+from fcslam.service.summaries import (
+    all_edits,
+    all_sessions,
+    fleet_summary,
+    map_separations,
+    map_summaries,
+    newest_closures,
+    run_of,
+)
 from fcslam.service.viewed_mission import ViewedMission
 
-ASKED = (
-    "fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "config.yaml",
-    *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
-)  # fmt: skip
-"""Paths that the page requests, besides events, trajectories and tiles."""
+MOST_CLOSURES = 5000
+"""Of each status, as the page asks for."""
 MOST_TILES = 200
 """Of all maps together: a tile has about 15 kB. Of a larger map, the file holds coarser tiles."""
 SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="stylesheet" href="page.css">'
 """Elements of the page that the file holds instead."""
-
-Get = Callable[[str], Awaitable[httpx.Response]]
 
 
 def report_html(mission: ViewedMission) -> str:
@@ -42,33 +42,57 @@ def report_html(mission: ViewedMission) -> str:
     Raises:
         EvaluationError: something of the run is broken.
     """
-    return _page(asyncio.run(_responses(viewer_app(ReadOnly(mission)), _maps(mission))))
+    maps = {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
+    zooms = {k: _zoom(occupancy, MOST_TILES // len(maps)) for k, occupancy in maps.items()}
+    return _page({"texts": _texts(mission, zooms), "pictures": _pictures(mission, maps, zooms)})
 
 
-def _maps(mission: ViewedMission) -> dict[int, OccupancyMap]:
-    return {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
+def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
+    """What the service answers to the page, by path. Maps have tiles down to ``zooms``."""
+    sessions = all_sessions(mission)
+    texts = {
+        "fleet": _json(fleet_summary(mission, read_only=True)),
+        "maps": _json(one.model_copy(update={"zoom": zooms.get(one.map, 0)}) for one in map_summaries(mission)),
+        "separations": _json(map_separations(mission)),
+        "robots": _json(sessions),
+        "edits": _json(all_edits(mission)),
+        "learning": "[]",
+    }
+    for status in ClosureStatus:
+        try:
+            texts[f"closures?status={status}&limit={MOST_CLOSURES}"] = newest_closures(
+                run_of(mission), status, MOST_CLOSURES
+            ).decode()
+        except ValueError as error:
+            raise EvaluationError(f"the run has closures that cannot be shown ({error})") from error
+    located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
+    if mission.run_folder is not None:
+        for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):
+            texts[path] = (mission.run_folder / unquote(path)).read_text(encoding="utf-8")
+    return texts
 
 
-async def _responses(app: FastAPI, maps: dict[int, OccupancyMap]) -> dict[str, dict[str, str]]:
-    """Responses of the service to the page, by path: texts, and pictures in base64."""
-    transport = httpx.ASGITransport(app=app, raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url=f"http://localhost{PREFIX}/") as client:
+def _pictures(mission: ViewedMission, maps: Mapping[int, OccupancyMap], zooms: Mapping[int, int]) -> dict[str, str]:
+    """The tiles of all maps in base64, by path."""
+    folder = mission.run_folder
+    return {
+        f"maps/{k}/tiles/{zoom}/{column}/{row}.png": base64.b64encode(
+            tile_png(folder, map_stem(k), zoom, column, row)
+        ).decode()
+        for k, occupancy in maps.items()
+        if folder is not None
+        for zoom, column, row in _tiles(occupancy, zooms[k])
+    }
 
-        async def get(path: str) -> httpx.Response:
-            answer = await client.get(path)
-            if not answer.is_success:
-                raise EvaluationError(f"the run has no {path} that can be shown ({answer.json()['error']})")
-            return answer
 
-        texts = {path: (await get(path)).text for path in ASKED}
-        sessions = [robot["session"] for robot in json.loads(texts["robots"]) if robot["T_map_base"]]
-        for path in (f"trajectories/{quote(session, safe='')}.tum" for session in sessions):
-            texts[path] = (await get(path)).text
-        zooms = {k: _zoom(occupancy, MOST_TILES // len(maps)) for k, occupancy in maps.items()}
-        texts["maps"] = json.dumps([{**one, "zoom": zooms.get(one["map"], 0)} for one in json.loads(texts["maps"])])
-        tiles = [path for k, occupancy in maps.items() for path in _tiles(k, occupancy, zooms[k])]
-        pictures = {path: base64.b64encode((await get(path)).content).decode() for path in tiles}
-    return {"texts": texts, "pictures": pictures}
+def _json(content: Settings | Iterable[Settings]) -> str:
+    """As the service writes it."""
+    whole = (
+        content.model_dump(mode="json")
+        if isinstance(content, Settings)
+        else [one.model_dump(mode="json") for one in content]
+    )
+    return json.dumps(whole, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
 
 
 def _zoom(occupancy: OccupancyMap, most: int) -> int:
@@ -78,12 +102,12 @@ def _zoom(occupancy: OccupancyMap, most: int) -> int:
     return sum(1 for count in counts if count <= most) - 1
 
 
-def _tiles(k: int, occupancy: OccupancyMap, deepest: int) -> Iterator[str]:
-    """The paths of all tiles that show part of a map."""
+def _tiles(occupancy: OccupancyMap, deepest: int) -> Iterator[tuple[int, int, int]]:
+    """Zoom, column and row of all tiles that show part of a map."""
     for zoom in range(deepest + 1):
         columns, rows = _covered(occupancy, zoom)
         for column, row in itertools.product(columns, rows):
-            yield f"maps/{k}/tiles/{zoom}/{column}/{row}.png"
+            yield zoom, column, row
 
 
 def _covered(occupancy: OccupancyMap, zoom: int) -> tuple[range, range]:

@@ -1,12 +1,12 @@
 """The files of the page. They hold no data of a mission, so nobody needs a token for them."""
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 from fastapi import APIRouter
 from fastapi.responses import FileResponse
 
-ASSETS = Path(__file__).parent / "assets"
+from fcslam.page import ASSETS
+
 FILES = {
     "/": ("index.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),

@@ -19,7 +19,7 @@ from fcslam.service.http.limits import json_body, read_body, read_json
 from fcslam.service.http.responses import DetectorVersion, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK
 from fcslam.service.http.state import ServiceState
-from fcslam.service.http.viewers import edit_summary
+from fcslam.service.summaries import edit_summary
 
 LOOK_EVERY_S = 0.1
 LEAST_FREE_BYTES = 8 * 2**20

@@ -1,0 +1,159 @@
+"""A viewed mission as the page and the REST interface show it: summaries of the run folder and of the store."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import fcslam
+from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
+from fcslam.cloud.sessions import session_name
+from fcslam.maps.tiles import finest_zoom
+from fcslam.records import Channel, ClosureStatus, Edit
+from fcslam.runs import ClosureRow, Run, separations
+from fcslam.runs.map_files import HEADER_BYTES, area_of, map_stem
+from fcslam.service.http.responses import (
+    ClosureSummary,
+    EditSummary,
+    FleetSummary,
+    MapSeparation,
+    MapSummary,
+    SessionSummary,
+)
+from fcslam.service.mission_store import MissionStore
+from fcslam.service.viewed_mission import ViewedMission, viewed_run
+from fcslam.wire.messages import Hello
+from fcslam.wire.packets import decode
+
+
+def fleet_summary(mission: ViewedMission, read_only: bool) -> FleetSummary:
+    """Counts; ``read_only``: nobody can change the mission."""
+    run, counts = run_of(mission), mission.packet_counts()
+    return FleetSummary(
+        mission=mission.name,
+        version=fcslam.__version__,
+        read_only=read_only,
+        packets=counts.arrived,
+        applied=counts.applied,
+        waiting=counts.waiting,
+        worker_ready=counts.worker_ready,
+        robots=list(run.trajectories),
+        maps=len({robot.map_index for robot in run.trajectories.values()}),
+        # JSON has no NaN
+        metrics={name: metric.value if math.isfinite(metric.value) else None for name, metric in run.metrics.items()},
+    )
+
+
+def all_sessions(mission: ViewedMission) -> list[SessionSummary]:
+    """The sessions of all robots."""
+    robots = dict.fromkeys(session.robot for session in mission.sessions())
+    return [session for robot in robots for session in sessions_of(mission, robot)]
+
+
+def sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
+    """The sessions of one robot."""
+    store, mapped = mission.store, run_of(mission).trajectories
+    sessions, changes = [], in_force(store.edits())
+    for session in mission.sessions(robot):
+        name = session_name(robot, session.epoch)
+        known, correction = mapped.get(name), store.correction(robot, session.epoch)
+        sessions.append(
+            SessionSummary(
+                robot=robot,
+                session=name,
+                epoch=session.epoch,
+                packets=session.next,
+                map=known.map_index if known else None,
+                floor=known.floor if known else "",
+                path_length_m=known.path_length_m if known else 0.0,
+                keyscans=len(known.stamps) if known else 0,
+                T_map_base=known.T_map_base[-1].tolist() if known else None,
+                T_map_odom=correction.correction.T_map_odom.tolist() if correction else None,
+                correction=correction.correction.version if correction else -1,
+                quality=correction.correction.quality if correction else 0.0,
+                removed=is_removed(name, changes),
+                detectors=_detectors(store, robot, session.epoch),
+                last_heard_s=mission.last_heard_s(robot),
+            )
+        )
+    return sessions
+
+
+def _detectors(store: MissionStore, robot: str, epoch: int) -> dict[Channel, str]:
+    hello = store.newest_hello(robot, epoch)
+    body = None if hello is None else decode(hello).body
+    return dict(body.detector_versions) if isinstance(body, Hello) else {}
+
+
+@lru_cache(maxsize=8)  # many pages ask for the same
+def newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> bytes:
+    """The newest closures as JSON."""
+    chosen = [closure for closure in run.closures if status in (None, closure.status)]
+    summaries = [closure_summary(closure).model_dump(mode="json") for closure in chosen[-limit:]]
+    return json.dumps(summaries, allow_nan=False, separators=(",", ":")).encode()
+
+
+def closure_summary(closure: ClosureRow) -> ClosureSummary:
+    """One closure."""
+    return ClosureSummary(
+        robot_i=closure.robot_i, stamp_i=closure.stamp_i, robot_j=closure.robot_j, stamp_j=closure.stamp_j,
+        channel=closure.channel, similarity=closure.similarity, T_i_j=closure.T_i_j.tolist(), status=closure.status,
+        reason=closure.reason.code, value=closure.reason.value, limit=closure.reason.limit,
+        setting=closure.reason.setting, explanation=str(closure.reason),
+    )  # fmt: skip
+
+
+def all_edits(mission: ViewedMission) -> list[EditSummary]:
+    """All edits, and what undid them."""
+    edits = mission.store.edits()
+    return [edit_summary(edit, undone(edits)) for edit in edits]
+
+
+def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
+    """An edit; ``gone`` names the edits that undid others (``fcslam.cloud.edits.undone``)."""
+    return EditSummary(
+        number=edit.number, kind=kind_of(edit.content), content=asdict(edit.content), author=edit.author,
+        time_s=edit.time_s, undone_by=gone.get(edit.number),
+    )  # fmt: skip
+
+
+def map_summaries(mission: ViewedMission) -> list[MapSummary]:
+    """The robots of each map."""
+    robots, folder = run_of(mission).trajectories.values(), mission.run_folder
+    return [
+        MapSummary(
+            map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], **_tiling(folder, map_stem(k))
+        )
+        for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
+    ]
+
+
+def map_separations(mission: ViewedMission) -> list[MapSeparation]:
+    """Why maps of one floor are separate, for every two of them."""
+    return [
+        MapSeparation(maps=s.maps, candidates=s.candidates, verified=s.verified, explanation=str(s))
+        for s in separations(run_of(mission))
+    ]
+
+
+def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
+    """Zoom and extent of a map as in ``MapSummary``."""
+    if folder is None or not (folder / f"{stem}.yaml").exists():
+        return {"zoom": 0, "extent": None}
+    with (folder / f"{stem}.pgm").open("rb") as image:
+        header = image.read(HEADER_BYTES)
+    area = area_of(stem, header, (folder / f"{stem}.yaml").read_text(encoding="utf-8", errors="replace"))
+    return {"zoom": finest_zoom(area.resolution_m), "extent": area.extent_m}
+
+
+def run_of(mission: ViewedMission) -> Run:
+    """The newest run, without its maps; an empty one if there is none yet.
+
+    Raises:
+        EvaluationError: it is broken, or not there any more.
+    """
+    folder = mission.run_folder
+    return Run({}) if folder is None else viewed_run(folder)
