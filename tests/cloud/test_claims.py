@@ -13,7 +13,6 @@ from fcslam.errors import PacketError
 from fcslam.lidar.frontend import motion_information
 from fcslam.lidar.odometry import WHEELS
 from fcslam.lidar.tracker import TrackedScan
-from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Channel, ConstraintKind, LaserModel, frozen
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
@@ -115,7 +114,7 @@ def test_no_claim_is_more_precise_than_scan_matching(kind):
         claimed = 10.0 ** rng.uniform(-3, 3, size=3)
         information = (axes * claimed) @ axes.T / unit
         claim = replace(motion("a", 0, 1, np.array((1.0, 0.0, 0.2)), kind), information=frozen(information))
-        found = with_least_noise(claim, VerificationConfig())
+        found = with_least_noise(claim)
         assert (found is claim) == (claimed.max() <= 1.01)
         np.testing.assert_allclose(
             np.diag(axes.T @ (found.information * unit) @ axes), np.minimum(claimed, 1.01), rtol=0.02
@@ -131,4 +130,4 @@ def test_what_robots_state_is_within_the_least_noise():
             tracked = TrackedScan(np.array((1.0, 2.0, 0.7)), information, None)
             stated = motion_information(np.array(step), tracked, WHEELS)
             claim = replace(motion("a", 0, 1, np.array(step)), information=frozen(stated))
-            assert with_least_noise(claim, VerificationConfig()) is claim
+            assert with_least_noise(claim) is claim

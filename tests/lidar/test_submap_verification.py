@@ -8,7 +8,14 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Agreement, PackedSubmap, agreement, build_submap, self_violation
 from fcslam.lidar.submap_bytes import packed_bytes, read_packed
-from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, _shortfall, verify
+from fcslam.lidar.verification import (
+    CLOSURE_SIGMA_M,
+    CLOSURE_SIGMA_RAD,
+    VerificationConfig,
+    _information_of_inverse,
+    _shortfall,
+    verify,
+)
 from fcslam.records import Reason, ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
 
@@ -62,7 +69,7 @@ def test_the_information_is_symmetric_positive_and_no_better_than_the_floor(same
     information = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG).information
     np.testing.assert_array_equal(information, information.T)
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-    assert np.all(sigma >= np.array([CONFIG.closure_sigma_m, CONFIG.closure_sigma_m, CONFIG.closure_sigma_rad]) - 1e-12)
+    assert np.all(sigma >= np.array([CLOSURE_SIGMA_M, CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD]) - 1e-12)
     assert sigma[0] < 0.1
 
 

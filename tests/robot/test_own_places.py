@@ -14,7 +14,6 @@ from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.tracker import TrackedScan
-from fcslam.lidar.verification import VerificationConfig
 from fcslam.robot.own_places import OwnPlaces
 from tests.lidar.worlds import box, path, recording, scan_at, shifted
 
@@ -75,7 +74,7 @@ def submaps_of(world, length_m):
 
 
 def closures(submaps, poses, recognizer, config=None):
-    closer = LoopCloser(config or ClosingConfig(), VerificationConfig(), recognizer)
+    closer = LoopCloser(config or ClosingConfig(), recognizer)
     anchors = np.array([poses[anchored.keyscan] for anchored, _ in submaps])
     found = [closer.add(anchored, submap, anchors[: k + 1]) for k, (anchored, submap) in enumerate(submaps)]
     return [(2 * c.earlier, 2 * c.later, c) for closures in found for c in closures]

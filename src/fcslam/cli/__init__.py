@@ -43,6 +43,14 @@ BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
 OF_THE_SERVICE = {"cryptography", "fastapi", "httpx", "prometheus_client", "starlette", "uvicorn"}
 """Packages of the extra ``service``: mapping recordings needs none of them."""
 PROGRAM = "fcslam"
+MAPS, ROBOTS, SIMULATION, LEARNING, SETUP = (
+    "Maps",
+    "Robots and service",
+    "Simulation and measurements",
+    "Cameras and learning",
+    "Setup",
+)
+"""Groups of the commands in `fcslam --help`."""
 COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
 
@@ -54,6 +62,7 @@ app = typer.Typer(
 )
 app.command(
     "map",
+    rich_help_panel=MAPS,
     epilog=examples(
         "fcslam map robot1.clf.gz robot2.clf.gz",
         "fcslam map anna=run1.bag ben=run2.mcap -o runs/building",
@@ -65,6 +74,7 @@ app.command(
 )(mapping.map_recordings)
 app.command(
     "localize",
+    rich_help_panel=MAPS,
     epilog=examples(
         "fcslam localize today.bag --map runs/building",
         "fcslam localize today.bag --map office.yaml --initial-pose 2,3.5,1.57",
@@ -72,14 +82,18 @@ app.command(
 )(localization.localize)
 app.command(
     "changes",
+    rich_help_panel=MAPS,
     epilog=examples(
         "fcslam changes runs/building",
         "fcslam changes runs/building --since 2026-11-20 -o changes/week",
     ),
 )(changed.changes)
-app.command("info", epilog=examples("fcslam info robot1.bag", "fcslam info robot1.mcap --json"))(info.info)
+app.command("info", rich_help_panel=MAPS, epilog=examples("fcslam info robot1.bag", "fcslam info robot1.mcap --json"))(
+    info.info
+)
 app.command(
     "convert",
+    rich_help_panel=MAPS,
     epilog=examples(
         "fcslam convert robot1.clf.gz robot1.bag",
         "fcslam convert robot2.mcap robot2.clf.gz --scan-topic /front/scan",
@@ -87,17 +101,27 @@ app.command(
 )(conversion.convert)
 app.command(
     "simulate",
+    rich_help_panel=SIMULATION,
     epilog=examples(
         "fcslam simulate --building office --no-camera",
         "fcslam simulate --lighting day --lighting evening --moved-furniture 0.3",
         "fcslam simulate --robots 20 --building office -o office --resume",
     ),
 )(simulate.simulate)
-app.command("extract", epilog=examples("fcslam extract photos -o features --keypoints 1000"))(extract.extract)
-app.command("demo", epilog=examples("fcslam demo --live", "fcslam demo --robots 4 --no-camera -o demo4"))(demo.demo)
-app.command("train", epilog=examples("fcslam train photos -o detector", "fcslam train photos --quick"))(train.train)
+app.command("extract", rich_help_panel=LEARNING, epilog=examples("fcslam extract photos -o features --keypoints 1000"))(
+    extract.extract
+)
+app.command(
+    "demo",
+    rich_help_panel=SIMULATION,
+    epilog=examples("fcslam demo --live", "fcslam demo --robots 4 --no-camera -o demo4"),
+)(demo.demo)
+app.command(
+    "train", rich_help_panel=LEARNING, epilog=examples("fcslam train photos -o detector", "fcslam train photos --quick")
+)(train.train)
 app.command(
     "robot",
+    rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam robot robot1.clf.gz --server http://127.0.0.1:8340 --state state",
         "fcslam robot robot1.bag --server https://cloud:8340 --state s --token-file t",
@@ -108,10 +132,12 @@ app.command(
 )(robots.robot)
 app.command(
     "record",
+    rich_help_panel=ROBOTS,
     epilog=examples("fcslam record ros2:/robot1 -o day.mcap", "fcslam record ros1:/ -o day.bag --duration 600"),
 )(live.record)
 app.command(
     "serve",
+    rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam serve --data cloud",
         "fcslam serve --data cloud --host 0.0.0.0 --tokens tokens.yaml",
@@ -119,6 +145,7 @@ app.command(
 )(serve.serve)
 app.command(
     "show",
+    rich_help_panel=MAPS,
     epilog=examples(
         "fcslam show runs/building",
         "fcslam show runs/building --html report.html",
@@ -127,18 +154,20 @@ app.command(
 )(show.show)
 app.command(
     "certificates",
+    rich_help_panel=ROBOTS,
     epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),
 )(certificates.certificates)
 app.command(
     "vocabulary",
+    rich_help_panel=LEARNING,
     epilog=examples("fcslam vocabulary runs/building -o building.words"),
 )(vocabulary.vocabulary)
-app.command("warm-up", epilog=examples("fcslam warm-up"))(warming.warm_up)
-app.add_typer(edit.app, name="edit")
-app.add_typer(federate.app, name="federate")
-app.add_typer(tokens.app, name="tokens")
-app.add_typer(evaluate.app, name="evaluate")
-app.add_typer(config.app, name="config")
+app.command("warm-up", rich_help_panel=SETUP, epilog=examples("fcslam warm-up"))(warming.warm_up)
+app.add_typer(edit.app, name="edit", rich_help_panel=MAPS)
+app.add_typer(federate.app, name="federate", rich_help_panel=LEARNING)
+app.add_typer(tokens.app, name="tokens", rich_help_panel=ROBOTS)
+app.add_typer(evaluate.app, name="evaluate", rich_help_panel=SIMULATION)
+app.add_typer(config.app, name="config", rich_help_panel=SETUP)
 
 
 def _finite(text: str) -> float:

@@ -11,7 +11,7 @@ from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import least_sigmas
-from fcslam.lidar.verification import VerificationConfig
+from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
 from fcslam.records import Constraint, ConstraintKind, FloatArray, MapTile, Place, frozen
 from fcslam.wire.limits import TILE_CELLS
 
@@ -69,18 +69,18 @@ def check_constraint(constraint: Constraint, largest_m: float) -> None:
         )
 
 
-def with_least_noise(constraint: Constraint, closing: VerificationConfig) -> Constraint:
+def with_least_noise(constraint: Constraint) -> Constraint:
     """The constraint with the precision that scan matching has at best.
 
     Robots state no more: more points do not reduce the errors of matching that neighbouring points share, nor those of
-    the scanner's calibration (``least_sigmas``, ``closing.closure_sigma_m``). So this changes only claims that are
+    the scanner's calibration (``least_sigmas``, ``CLOSURE_SIGMA_M``). So this changes only claims that are
     false.
     """
     if constraint.kind is ConstraintKind.ODOMETRY:
         x, y, theta = constraint.T_i_j.tolist()
         sigma_m, sigma_rad = least_sigmas(math.hypot(x, y), abs(theta))
     else:
-        sigma_m, sigma_rad = closing.closure_sigma_m, closing.closure_sigma_rad
+        sigma_m, sigma_rad = CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = constraint.information.tolist()
     # Without arrays: whether no eigenvalue of the information is above _ROUNDING, in units of the least noise.
     x, y, t = (_ROUNDING - scaled for scaled in (xx * sigma_m**2, yy * sigma_m**2, tt * sigma_rad**2))

@@ -107,11 +107,11 @@ class Fleet:
                 self._add_keyscan(keyscan, packet.sequence)
             case Constraint(kind=ConstraintKind.ODOMETRY) as motion:
                 self._sessions.add_motion(motion)
-                self._graph.extend(with_least_noise(motion, self._config.matcher.verification))
+                self._graph.extend(with_least_noise(motion))
             case Constraint() as closure:
                 self._sessions.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
                 check_constraint(closure, LONGEST_CLOSURE_M)
-                self._decisions.add_local(with_least_noise(closure, self._config.matcher.verification))
+                self._decisions.add_local(with_least_noise(closure))
             case Place() as place:
                 self._place(place)
             case WordPlace() as place:

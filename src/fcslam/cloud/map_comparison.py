@@ -13,7 +13,7 @@ from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.lidar.verification import VerificationConfig
+from fcslam.lidar.verification import PARTIAL, VerificationConfig
 from fcslam.records import FloatArray, KeyscanId, frozen
 from fcslam.storage.state_file import State
 
@@ -157,7 +157,7 @@ class MapComparison:
             if found.known_m < LEAST_KNOWN_M:
                 continue
             agreeing += found.violation <= self._verification.loose.violation
-            contradicting += found.violation > self._verification.partial.violation
+            contradicting += found.violation > PARTIAL.violation
         return Overlap(agreeing, contradicting)
 
     def state(self) -> State:

@@ -24,7 +24,6 @@ from fcslam.lidar.pair_verification import align_batch
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.submap_bytes import submap_bytes
-from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import LaserModel
 from fcslam.storage.state_file import code_version
 
@@ -291,8 +290,7 @@ def _proof() -> bytes:
     guesses = poses[1] + rng.normal(0.0, (0.3, 0.3, 0.05), (20, 3))
     priors = [np.zeros((3, 3)), np.diag((10.0, 10.0, 100.0))]
     rows = np.array([(0, 1, *guess, *priors[k % 2].ravel()) for k, guess in enumerate(guesses)])
-    config = VerificationConfig().model_dump_json()
-    answer = align_batch(names, dict(zip(names, submaps, strict=True)), rows.tobytes(), config)
+    answer = align_batch(names, dict(zip(names, submaps, strict=True)), rows.tobytes())
     assert isinstance(answer, bytes), "it was sent all submaps"
     return answer
 

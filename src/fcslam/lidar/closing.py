@@ -21,7 +21,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.submap import Submap
-from fcslam.lidar.verification import Verification, VerificationConfig, verify
+from fcslam.lidar.verification import VERIFICATION, Verification, verify
 from fcslam.records import FloatArray
 
 SURPRISE_M, SURPRISE_RAD = 0.15, 0.03
@@ -152,12 +152,10 @@ class LoopCloser:
     def __init__(
         self,
         config: ClosingConfig,
-        verification: VerificationConfig,
         recognizer: PlaceRecognizer | None = None,
     ) -> None:
         self._config = config
         self._recognizer = recognizer
-        self._verification = verification
         self.submaps: list[AnchoredSubmap] = []
         """All submaps so far."""
         self._travel = np.empty(0)
@@ -253,7 +251,7 @@ class LoopCloser:
             if result.score < LEAST_SCORE:
                 return None
             guess = result.T_field_base
-        check = verify(a, b, guess, self._verification)
+        check = verify(a, b, guess, VERIFICATION)
         innovation = se2.between(predicted, check.T_a_b)
         outside = (
             np.hypot(innovation[0], innovation[1]) > radius + ALIGNMENT_MARGIN_M
@@ -303,7 +301,7 @@ class LoopCloser:
         self, earlier: int, later: int, anchors: FloatArray, path_m: float, guess: FloatArray
     ) -> LocalClosure | None:
         """Verify a recognised place; None if it is another one, or if no drift explains where it is."""
-        check = verify(self._held[earlier], self._held[later], guess, self._verification)
+        check = verify(self._held[earlier], self._held[later], guess, VERIFICATION)
         innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
         off_m = float(np.hypot(innovation[0], innovation[1]))
         if not (check.loose or check.support) or off_m > RECOGNIZED_DRIFT * path_m:

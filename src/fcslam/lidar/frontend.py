@@ -18,7 +18,6 @@ from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackingResult
-from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import (
     Constraint,
     ConstraintKind,
@@ -76,7 +75,6 @@ class LidarConfig(Settings):
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
-    verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
 
 
 @dataclass(frozen=True, slots=True)

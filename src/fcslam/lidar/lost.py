@@ -25,7 +25,7 @@ from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import odometry_error
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, TrackingResult
-from fcslam.lidar.verification import verify
+from fcslam.lidar.verification import VERIFICATION, verify
 from fcslam.records import FloatArray, LaserScan
 
 TRUSTED, TRUSTED_MATCHES = 1.0, 20
@@ -98,7 +98,7 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: Lid
         return False
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
-    worse = verify(before, now, predicted, frontend.config.verification).worse
+    worse = verify(before, now, predicted, VERIFICATION).worse
     return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
 
 

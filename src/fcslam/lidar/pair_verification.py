@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, field
-from functools import lru_cache
 from hashlib import blake2b
 from typing import Final, NamedTuple
 
@@ -102,7 +101,7 @@ class VerificationPool:
             return []
         peers = self._present()
         batches = _split(len(pairs), 1 + len(peers), math.ceil(BATCH_S / self._pair_s))
-        aligned = self._align(pairs, config, batches, peers)
+        aligned = self._align(pairs, batches, peers)
         return [judge(found, config, pair.noise) for found, pair in zip(aligned, pairs, strict=True)]
 
     def _present(self) -> "list[_Peer]":
@@ -110,16 +109,14 @@ class VerificationPool:
         self._peers = {executor: self._peers.get(executor) or _Peer(executor) for executor in executors}
         return [peer for peer in self._peers.values() if peer.rests_until <= now]
 
-    def _align(
-        self, pairs: Sequence[Pair], config: VerificationConfig, batches: Sequence[range], peers: "list[_Peer]"
-    ) -> list[Aligned]:
-        call = _Call(pairs, config, deque(batches), {}, {})
+    def _align(self, pairs: Sequence[Pair], batches: Sequence[range], peers: "list[_Peer]") -> list[Aligned]:
+        call = _Call(pairs, deque(batches), {}, {})
         while len(call.done) < len(batches):
             self._hand_out(call, peers)
             if call.todo:
                 batch = call.todo.pop()
                 began = self._clock()
-                call.done[batch] = [align(p.a, p.b, p.T_a_b_guess, config, p.prior) for p in pairs[_slice(batch)]]
+                call.done[batch] = [align(p.a, p.b, p.T_a_b_guess, p.prior) for p in pairs[_slice(batch)]]
                 self._measured((self._clock() - began) / len(batch))
             else:
                 wait(call.running, self._until_late_s(call), FIRST_COMPLETED)
@@ -134,7 +131,7 @@ class VerificationPool:
                     continue
                 batch = call.todo.popleft()
                 try:
-                    future = peer.submit(call.pairs[_slice(batch)], call.config, self._hash)
+                    future = peer.submit(call.pairs[_slice(batch)], self._hash)
                 except RuntimeError as error:  # the executor is broken or shut down
                     self._failed(peer, error)
                     call.todo.append(batch)
@@ -198,7 +195,6 @@ class _Call:
     """One call of a pool."""
 
     pairs: Sequence[Pair]
-    config: VerificationConfig
     todo: deque[range]
     running: "dict[Future[Answer], _Running]"
     done: dict[range, list[Aligned]]
@@ -227,9 +223,7 @@ class _Peer:
         self.pending = [future for future in self.pending if not future.done()]
         return len(self.pending) < AHEAD
 
-    def submit(
-        self, pairs: Sequence[Pair], config: VerificationConfig, hash_of: Callable[[Submap], bytes]
-    ) -> "Future[Answer]":
+    def submit(self, pairs: Sequence[Pair], hash_of: Callable[[Submap], bytes]) -> "Future[Answer]":
         """Start to align a batch."""
         submaps = {hash_of(submap): submap for pair in pairs for submap in (pair.a, pair.b)}
         number = {name: k for k, name in enumerate(submaps)}
@@ -240,7 +234,7 @@ class _Peer:
             ]
         )
         new = {name: submap_bytes(submap) for name, submap in submaps.items() if name not in self.sent}
-        future = self.executor.submit(align_batch, list(submaps), new, rows.tobytes(), config.model_dump_json())
+        future = self.executor.submit(align_batch, list(submaps), new, rows.tobytes())
         for name in submaps:
             self.sent.pop(name, None)
             self.sent[name] = None
@@ -264,14 +258,13 @@ _keeping: Final = threading.Lock()
 """Held while ``_kept`` changes: a worker of a cluster may have several threads."""
 
 
-def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes, config: str) -> Answer:
+def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes) -> Answer:
     """The alignments of a batch, in another process.
 
     Args:
         names: hashes of the submaps that the batch compares.
         new: those that the process was not sent yet, by their hashes.
         rows: float64, shape (N, 14): the numbers of both submaps in ``names``, the guess and its prior, of each pair.
-        config: a ``VerificationConfig`` as JSON.
     """
     with _keeping:
         for name, data in new.items():
@@ -285,18 +278,12 @@ def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes,
             _kept[name] = submaps[-1]
         while len(_kept) > SUBMAPS_KEPT:
             del _kept[next(iter(_kept))]
-    settings = _settings(config)
     return _aligned_bytes(
         [
-            align(submaps[int(row[0])], submaps[int(row[1])], row[2:5].copy(), settings, row[5:].reshape(3, 3).copy())
+            align(submaps[int(row[0])], submaps[int(row[1])], row[2:5].copy(), row[5:].reshape(3, 3).copy())
             for row in np.frombuffer(rows).reshape(-1, _ROW)
         ]
     )
-
-
-@lru_cache(maxsize=8)
-def _settings(config: str) -> VerificationConfig:
-    return VerificationConfig.model_validate_json(config)
 
 
 def _aligned_bytes(batch: Sequence[Aligned]) -> bytes:

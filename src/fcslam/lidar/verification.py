@@ -24,6 +24,12 @@ NO_PRIOR = np.zeros((3, 3))
 _VERIFIED = Reason(ReasonCode.VERIFIED)
 ALIGNMENT_SCALE_M = 0.4
 """A guess between submaps is worse than one between scans: the loss starts wider."""
+INFORMATIVE = 30.0
+"""Least eigenvalue of the normal tensor of an informative closure; a corridor has less."""
+SYMMETRY_M, SYMMETRY_RAD = 0.15, 0.03
+"""Largest motion between the alignments of both directions."""
+CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD = 0.03, 0.006
+"""Least standard deviations of a closure, however many points it has."""
 
 
 class Gate(Settings):
@@ -62,23 +68,9 @@ class LooseGate(Gate):
     )
 
 
-class PartialGate(Gate):
-    """Thresholds of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope)."""
-
-    explained: float = Field(
-        default=0.65,
-        ge=0,
-        le=1,
-        description="least share of the points in known area that lie on a surface, in either direction",
-    )
-    violation: float = Field(
-        default=0.22,
-        ge=0,
-        le=1,
-        description="largest share of the points in known area that lie in the other submap's free space",
-    )
-    count: int = Field(default=500, ge=0, description="least number of points on a surface; points are 0.1 m apart")
-    overlap: float = Field(default=0.5, ge=0, le=1, description="least share of all points that lie in known area")
+PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
+"""Of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a cluster,
+and never alone."""
 
 
 class VerificationConfig(Settings):
@@ -86,31 +78,10 @@ class VerificationConfig(Settings):
 
     strict: Gate = Field(default=Gate(), description="thresholds where no estimate predicts the closure")
     loose: LooseGate = Field(default=LooseGate(), description="thresholds where an estimate predicts the closure")
-    partial: PartialGate = Field(
-        default=PartialGate(),
-        description="thresholds of a partially supported closure: it counts half in a cluster, and never alone",
-    )
-    informative: float = Field(
-        default=30.0,
-        ge=0,
-        description="least eigenvalue of the normal tensor of an informative closure; a corridor has less",
-    )
-    symmetry_m: float = Field(
-        default=0.15, gt=0, description="largest distance between the alignments of both directions [m]"
-    )
-    symmetry_rad: float = Field(
-        default=0.03, gt=0, description="largest turn between the alignments of both directions [rad]"
-    )
-    closure_sigma_m: float = Field(
-        default=0.03,
-        gt=0,
-        description="least standard deviation of a closure's position, however many points it has [m]",
-    )
-    closure_sigma_rad: float = Field(
-        default=0.006,
-        gt=0,
-        description="least standard deviation of a closure's heading, however many points it has [rad]",
-    )
+
+
+VERIFICATION = VerificationConfig()
+"""Of closures of one robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,12 +153,10 @@ def verify(
     Returns:
         The alignment halfway between both directions, and the gates that it passes.
     """
-    return judge(align(a, b, T_a_b_guess, config, prior), config, noise)
+    return judge(align(a, b, T_a_b_guess, prior), config, noise)
 
 
-def align(
-    a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
-) -> Aligned:
+def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_PRIOR) -> Aligned:
     """The slow part of ``verify``: the alignment, which does not depend on the noise of the submaps."""
     forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, wide_scale_m=ALIGNMENT_SCALE_M)
     # The prior must not count twice: backward it acts at the guess, as it does forward.
@@ -211,16 +180,16 @@ def align(
         max(side.overlap for side in sides),
         worse.normal_tensor,
     )
-    return Aligned(T_a_b, _information(forward.information + prior, T_a_b, config), worse, worse.weakest, gap)
+    return Aligned(T_a_b, _information(forward.information + prior, T_a_b), worse, worse.weakest, gap)
 
 
 def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], float] = no_noise) -> Verification:
     """Which gates an alignment passes; arguments as for ``verify``."""
     worse, weakest = aligned.worse, aligned.weakest
-    asymmetric = _asymmetry(aligned.gap, config)
+    asymmetric = _asymmetry(aligned.gap)
     symmetric = asymmetric is None
-    informative = weakest >= config.informative
-    one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, config.informative, "informative")
+    informative = weakest >= INFORMATIVE
+    one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, INFORMATIVE)
     strict, loose = _shortfall(worse, config.strict, "strict", noise), _shortfall(worse, config.loose, "loose", noise)
     return Verification(
         T_a_b=aligned.T_a_b,
@@ -228,7 +197,7 @@ def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], floa
         worse=worse,
         strict=symmetric and not strict,
         loose=symmetric and not loose,
-        partial=symmetric and informative and not _shortfall(worse, config.partial, "partial", no_noise),
+        partial=symmetric and informative and not _shortfall(worse, PARTIAL, "partial", no_noise),
         informative=informative,
         reason=asymmetric or strict or (_VERIFIED if informative else one_direction),
         loose_reason=asymmetric or loose or _VERIFIED,
@@ -240,12 +209,12 @@ def _sample(surface: PointScan) -> PointScan:
     return surface.only(np.arange(0, len(surface), max(1, len(surface) // ALIGNED_POINTS)))
 
 
-def _asymmetry(gap: FloatArray, config: VerificationConfig) -> Reason | None:
+def _asymmetry(gap: FloatArray) -> Reason | None:
     """The limit that the gap (3,) between the alignments of both directions reaches, if any."""
-    if (gap_m := float(np.hypot(gap[0], gap[1]))) >= config.symmetry_m:
-        return Reason(ReasonCode.ASYMMETRIC, gap_m, config.symmetry_m, "symmetry_m")
-    if (gap_rad := abs(float(gap[2]))) >= config.symmetry_rad:
-        return Reason(ReasonCode.ASYMMETRIC, gap_rad, config.symmetry_rad, "symmetry_rad")
+    if (gap_m := float(np.hypot(gap[0], gap[1]))) >= SYMMETRY_M:
+        return Reason(ReasonCode.ASYMMETRIC, gap_m, SYMMETRY_M)
+    if (gap_rad := abs(float(gap[2]))) >= SYMMETRY_RAD:
+        return Reason(ReasonCode.ASYMMETRIC, gap_rad, SYMMETRY_RAD)
     return None
 
 
@@ -279,7 +248,7 @@ def _information_of_inverse(information: FloatArray, T_a_b: FloatArray) -> Float
     return np.asarray(inverse.T @ information @ inverse)
 
 
-def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConfig) -> FloatArray:
+def _information(points: FloatArray, T_a_b: FloatArray) -> FloatArray:
     """Information of the points in the coordinates of b, shape (3, 3), limited by the least standard deviations."""
     turn = np.eye(3)
     cos, sin = np.cos(T_a_b[2]), np.sin(T_a_b[2])
@@ -287,6 +256,6 @@ def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConf
     covariance = np.linalg.inv(
         turn.T @ points @ turn + np.diag((UNFIXED_INFORMATION, UNFIXED_INFORMATION, UNFIXED_INFORMATION))
     )
-    floor = np.diag((config.closure_sigma_m**2, config.closure_sigma_m**2, config.closure_sigma_rad**2))
+    floor = np.diag((CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_RAD**2))
     information = np.linalg.inv(covariance + floor)
     return np.asarray(0.5 * (information + information.T))
