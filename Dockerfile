@@ -1,4 +1,4 @@
-# fcslam in a container, with what requirements.txt pins. Without a container runtime, run tools/dockerfile_in_root.py.
+# fcslam in a container, with what deploy/requirements.lock pins. Without a container runtime, run tools/dockerfile_in_root.py.
 #
 #     docker build -t fcslam .
 #     docker run --rm -v "$PWD":/data fcslam map robot1.bag robot2.bag -o runs/building
@@ -9,10 +9,10 @@ RUN apt-get update \
     && apt-get install --yes --no-install-recommends python3 python3-venv ca-certificates \
     && rm -rf /var/lib/apt/lists/*
 
-COPY requirements.txt pyproject.toml README.md LICENSE /src/
+COPY deploy/requirements.lock pyproject.toml README.md LICENSE /src/
 COPY src /src/src
 RUN python3 -m venv /opt/fcslam \
-    && /opt/fcslam/bin/pip install --no-cache-dir --no-deps --require-hashes -r /src/requirements.txt \
+    && /opt/fcslam/bin/pip install --no-cache-dir --no-deps --require-hashes -r /src/requirements.lock \
     && /opt/fcslam/bin/pip install --no-cache-dir --no-deps /src \
     && rm -rf /src
 

@@ -50,9 +50,9 @@ help:
 	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim adds packages"
 	@echo "make learning     install torch and Flower, for training the detector, if they are available"
 	@echo "make gl           install the GL library of the simulated cameras, if permitted"
-	@echo "make lock         write requirements.txt: what a service and a robot install, with hashes"
-	@echo "make sbom         write sbom.json, the software bill of materials of requirements.txt (CycloneDX)"
-	@echo "make audit        look for known vulnerabilities of requirements.txt; needs the Internet"
+	@echo "make lock         write deploy/requirements.lock: what a service and a robot install, with hashes"
+	@echo "make sbom         write sbom.json, the software bill of materials of deploy/requirements.lock (CycloneDX)"
+	@echo "make audit        look for known vulnerabilities of deploy/requirements.lock; needs the Internet"
 	@echo "make docs         write the reference pages from the code, and the documentation to site/"
 	@echo "make proto        generate the Python code of the wire format"
 
@@ -158,7 +158,7 @@ docs: $(INSTALLED)
 # constraints.txt says the versions; this adds the hashes.
 lock: $(INSTALLED)
 	@$(BIN)/uv pip compile -q pyproject.toml --extra service --constraint constraints.txt --generate-hashes --no-annotate --no-header \
-	    --python-version 3.11 --python-platform x86_64-manylinux_2_28 --only-binary :all: -o requirements.txt
+	    --python-version 3.11 --python-platform x86_64-manylinux_2_28 --only-binary :all: -o deploy/requirements.lock
 
 sbom: $(INSTALLED)
 	@$(BIN)/python tools/sbom.py >sbom.json

@@ -7,7 +7,7 @@ from tools.audit import verdict
 from tools.sbom import bill, pins
 
 ROOT = Path(__file__).parents[1]
-REQUIREMENTS = (ROOT / "requirements.txt").read_text(encoding="utf-8")
+REQUIREMENTS = (ROOT / "deploy" / "requirements.lock").read_text(encoding="utf-8")
 
 
 def normal(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Look for known vulnerabilities of what requirements.txt installs, and say so where packages could not be looked up.
+"""Look for known vulnerabilities of what deploy/requirements.lock installs, and name packages that were not looked up.
 
 make audit
 """
@@ -36,7 +36,7 @@ def main() -> int:
             sys.executable,
             *COMMAND.split(),
             "-r",
-            str(ROOT / "requirements.txt"),
+            str(ROOT / "deploy" / "requirements.lock"),
             "-f",
             "json",
             "-o",

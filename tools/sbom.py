@@ -1,4 +1,4 @@
-"""Write a software bill of materials (CycloneDX 1.5 JSON) of what requirements.txt installs.
+"""Write a software bill of materials (CycloneDX 1.5 JSON) of what deploy/requirements.lock installs.
 
 make sbom
 """
@@ -46,5 +46,5 @@ def bill(text: str) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    json.dump(bill((ROOT / "requirements.txt").read_text(encoding="utf-8")), sys.stdout, indent=1)
+    json.dump(bill((ROOT / "deploy" / "requirements.lock").read_text(encoding="utf-8")), sys.stdout, indent=1)
     sys.stdout.write("\n")
