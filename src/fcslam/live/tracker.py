@@ -83,8 +83,9 @@ class LiveTracker(ABC):
         """Localize the next scan.
 
         Args:
-            ranges_m: metres, shape (beam_count,). NaN or negative: invalid; inf, or at least ``max_range_m``: no
-                return.
+            ranges_m: metres, one for each beam. NaN, negative, or at least ``max_range_m``: invalid; inf: no return,
+                which clears the floor. If their number varies from scan to scan, they are spread over the laser's field
+                of view.
             stamp: seconds. It may step back by 2 s at most, as clocks of several sensors disagree.
             odometry: pose (x, y, theta) of ``base`` by wheel odometry at the stamp, metres and radians; its origin does
                 not matter. None for all scans: there is no odometry, and scan matching alone gives the motion; an event
