@@ -348,6 +348,22 @@ def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
     assert log.read_text().startswith("ODOM")
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--start", "robot=1,2"), "'1,2' is not 3 numbers"),
+        (("--start", "robot=1,2,nan"), "is not 3 numbers"),
+        (("--start", "robot"), "give NAME=X,Y,THETA"),
+        (("--start", "robot=0,0,0", "--start", "robot=1,0,0"), "two starts"),
+        (("--start", "nobody=0,0,0"), "there is no robot nobody"),
+        (("--start-sigma", "0.3"), "give M,RAD"),
+        (("--start-sigma", "0.3,-1"), "start_sigma_rad"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(tmp_path, log, capsys, options, reason):
+    assert reason in refused(capsys, tmp_path, log, *options, "--output", tmp_path / "run")
+
+
 def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, log, capsys):
     run = tmp_path / "run"
     assert "--no-fuse" in refused(capsys, tmp_path, log, "--no-fuse", "--fusion", "two_point", "--output", run)

@@ -6,7 +6,8 @@ import pytest
 from fcslam.features.birdseye import BirdseyeConfig, describe
 from fcslam.geometry import se2
 from fcslam.lidar.submap import build_submap
-from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.lidar.verification import Gate, VerificationConfig
+from fcslam.places.matcher import Expectation, MatcherConfig, PlaceMatcher
 from fcslam.places.motions import MotionConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
@@ -98,6 +99,37 @@ def test_a_wrong_prediction_does_not_become_a_closure(visits):
     (match,) = matcher.match(visits.visit("b", 0, other_room(), POSE_B), {first.id: np.zeros(3)}, FRIENDS)
     assert not match.M
     assert match.reason.code is not ReasonCode.VERIFIED
+
+
+DOUBTFUL = VerificationConfig(strict=Gate(count=10_000))
+
+
+@pytest.mark.parametrize(
+    ("off", "matches"), [((0.2, -0.2, 0.05), True), ((1.5, 0.0, 0.0), False), ((0.0, 0.0, 0.6), False)]
+)
+def test_a_known_start_decides_about_a_doubtful_place_only_where_it_is_right(visits, off, matches):
+    truth = se2.between(POSE_A, POSE_B)
+    matcher = visits.matcher(verification=DOUBTFUL)
+    first = visits.visit("a", 0, room(), POSE_A)
+    matcher.match(first, {}, STRANGERS)
+    expected = {first.id: Expectation(se2.compose(truth, off), 0.6, 0.3)}
+    (match,) = matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS, expected)
+    assert (match.M, match.predicted) == (matches, False)
+    if matches:
+        assert np.all(np.abs(se2.between(truth, match.T_i_j)) < (0.03, 0.03, 0.01))
+
+
+def test_a_wrong_start_hides_no_place_and_makes_none(visits):
+    wrong = Expectation(np.array([2.0, 2.0, 1.0]), 0.6, 0.3)
+    matcher = visits.matcher()
+    first = visits.visit("a", 0, room(), POSE_A)
+    matcher.match(first, {}, STRANGERS)
+    (match,) = matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS, {first.id: wrong})
+    assert match.M
+    assert np.all(np.abs(se2.between(se2.between(POSE_A, POSE_B), match.T_i_j)) < (0.03, 0.03, 0.01))
+    other = visits.visit("c", 0, other_room(), POSE_B)
+    here = {first.id: Expectation(np.zeros(3), 0.6, 0.3)}
+    assert not any(match.M for match in matcher.match(other, {}, STRANGERS, here))
 
 
 def test_a_robot_alone_is_never_compared(visits):

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFile, Fusion, MissionSeed, NoFuse, PresetName, mission_config
+from fcslam.cli.mission_options import (
+    ConfigFile,
+    Fusion,
+    MissionSeed,
+    NoFuse,
+    PresetName,
+    Starts,
+    StartSigma,
+    mission_config,
+)
 from fcslam.cli.options import (
     Force,
     Quiet,
@@ -100,6 +109,8 @@ def map_recordings(
     laser_pose: LaserPose = None,
     cloud_band: CloudHeights = None,
     seed: MissionSeed = None,
+    start: Starts = None,
+    start_sigma: StartSigma = None,
     live: Live = False,
     port: Port = 0,
     open_browser: OpenBrowser = None,
@@ -124,7 +135,9 @@ def map_recordings(
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = None if onto is None else read_mission(onto)
-        settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier), preset)
+        settings = mission_config(
+            config, seed, no_fuse, fusion, continued_config(earlier), preset, start or (), start_sigma
+        )
         vetoes = read_vetoes(veto) if veto else ()
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
         if not logs and earlier is None:
@@ -132,6 +145,11 @@ def map_recordings(
         with compiled(notices(quiet)):
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
         sources = split_recordings(opened, split)
+        unknown = [name for name in settings.fleet.starts if start and name not in {one.name for one in sources}]
+        if unknown:
+            raise InputError(
+                f"--start: there is no robot {unknown[0]}; known: {', '.join(one.name for one in sources)}"
+            )
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
     with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:

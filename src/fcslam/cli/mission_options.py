@@ -1,5 +1,7 @@
 """Options that choose the configuration of a mission, and the configuration that follows from them."""
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,6 +41,24 @@ Fusion = Annotated[
     ),
 ]
 
+Starts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--start",
+        metavar="NAME=X,Y,THETA",
+        help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
+        "forces nothing. Can be repeated.",
+    ),
+]
+StartSigma = Annotated[
+    str | None,
+    typer.Option(
+        metavar="M,RAD",
+        help="Standard deviations of the starts: of x and y, and of the heading.",
+        show_default=_FROM_CONFIG,
+    ),
+]
+
 
 def mission_config(
     file: Path | None,
@@ -47,6 +67,8 @@ def mission_config(
     fusion: FusionStrategy | None = None,
     default: "MissionConfig | None" = None,
     preset: Preset | None = None,
+    starts: Sequence[str] = (),
+    start_sigma: str | None = None,
 ) -> "MissionConfig":
     """The configuration in ``file`` over the preset, or else the default one, with the changes of the command line.
 
@@ -64,6 +86,26 @@ def mission_config(
         raise ConfigError("--no-fuse fuses no maps, so --fusion has no effect; give only one of them")
     fleet: dict[str, object] = {"join_maps": False} if no_fuse else {}
     fleet |= {"fusion": fusion} if fusion is not None else {}
+    if starts:
+        named = [start.partition("=")[::2] for start in starts]
+        fleet["starts"] = {name: _numbers("--start", numbers, 3) for name, numbers in named}
+        if len(named) > len(dict(named)):
+            raise ConfigError("--start: a robot is given two starts; give one for each")
+    if start_sigma is not None:
+        fleet["start_sigma_m"], fleet["start_sigma_rad"] = _numbers("--start-sigma", start_sigma, 2)
     changes: dict[str, object] = {"fleet": fleet} if fleet else {}
     changes |= {"seed": seed} if seed is not None else {}
     return changed(config, changes, "the command line")
+
+
+def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:
+    from fcslam.errors import ConfigError
+
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        form = "NAME=X,Y,THETA in metres and radians" if count == 3 else "M,RAD"
+        raise ConfigError(f"{option}: {text!r} is not {count} numbers with commas between them; give {form}")
+    return numbers

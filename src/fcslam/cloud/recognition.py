@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from fcslam.cloud.visits import NEWEST_PLACES, Visit, visits_near, worth_compari
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import places_of_old_sessions, surplus_places
 from fcslam.lidar.pair_verification import VerifyPairs
-from fcslam.places.matcher import PlaceMatch, PlaceMatcher
+from fcslam.places.matcher import Expectation, PlaceMatch, PlaceMatcher
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 from fcslam.storage.state_file import State
 
@@ -37,6 +38,8 @@ class VocabularyState(NamedTuple):
 _VocabularyKey = tuple[Channel, str, str]
 """Channel, detector version and floor; places that differ in one of these are never compared."""
 
+START_SIGMAS = 3.0
+"""A closure within so many standard deviations of the known starts is expected."""
 _NO_PLACES = np.empty((0, 2), np.int64)
 
 
@@ -66,7 +69,8 @@ class PlaceRecognition:
         """
         key = self._key(place)
         matcher = self._matcher(key)
-        matches = matcher.match(place, self._predicted(place, mates), _outside(mates))
+        expected = self._expected(place, mates)
+        matches = matcher.match(place, self._predicted(place, mates), _outside(mates), expected)
         self._enter(key, place.id)
         return matches
 
@@ -162,6 +166,38 @@ class PlaceRecognition:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits, self._closures_near(visits), self._config.near_visits)
         return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
+
+    def _expected(self, place: Place, mates: Collection[str]) -> dict[KeyscanId, Expectation]:
+        """The nearest places of sessions in other maps, where the known starts of both sessions put them.
+
+        Far from the starts their headings leave open which of two separate places it is: they tell nothing there.
+        """
+        starts, key = self._config.starts, self._key(place)
+        expected: dict[KeyscanId, Expectation] = {}
+        if place.id.robot not in starts:
+            return {}
+        T_place = self._by_start(place.id.robot, np.array([place.id.number]))[0]
+        sigma_m, sigma_rad = self._config.start_sigma_m, self._config.start_sigma_rad
+        for session in starts:
+            numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
+            if session in mates or not len(numbers):
+                continue
+            poses = self._by_start(session, numbers)
+            visits = visits_near(session, numbers, poses, T_place[:2], self._config.sight_m)
+            for visit in sorted(visits, key=attrgetter("distance_m"))[: self._config.near_visits]:
+                T_nearest = poses[numbers == visit.nearest.number][0]
+                way_m = np.hypot(*(T_place[:2] - starts[place.id.robot][:2]))
+                way_m += np.hypot(*(T_nearest[:2] - starts[session][:2]))
+                within_m = START_SIGMAS * float(sigma_m * np.sqrt(2.0) + sigma_rad * way_m)
+                if within_m < self._config.consistency.separation_m:
+                    within_rad = START_SIGMAS * float(sigma_rad * np.sqrt(2.0))
+                    expected[visit.nearest] = Expectation(se2.between(T_nearest, T_place), within_m, within_rad)
+        return expected
+
+    def _by_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:
+        """Poses (N, 3) of keyscans in the frame of the known starts."""
+        poses = self._graph.trajectory(session)
+        return se2.compose(self._config.starts[session], se2.between(poses[0], poses[numbers]))
 
     def _closures_near(self, visits: Mapping[str, Sequence[Visit]]) -> Counter[frozenset[str]]:
         """Number of accepted closures at the newest places of each robot's visits, by pair of robots."""

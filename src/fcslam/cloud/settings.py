@@ -60,6 +60,13 @@ class FleetConfig(Settings):
         "closures between two robots, or the measurements of one, share with their neighbours along the path. It is "
         "below 0.03 for robots that measure correctly, also with noisy scanners",
     )
+    starts: dict[str, tuple[float, float, float]] = Field(
+        default={},
+        description="where robots started, by their names: x and y [m] and theta [rad], in one frame. Closures that "
+        "agree with the starts of both robots need to pass the loose gate only",
+    )
+    start_sigma_m: float = Field(default=0.3, gt=0, description="standard deviation of x and y of a start [m]")
+    start_sigma_rad: float = Field(default=0.1, gt=0, description="standard deviation of the heading of a start [rad]")
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     vocabularies: tuple[Path, ...] = Field(
