@@ -139,7 +139,9 @@ def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, options):
 
 @pytest.mark.parametrize("pose", ["1,2", "1,2,3,4", "a,b,c", "nan,0,0", "inf,0,0", ""])
 def test_a_pose_that_is_none(tmp_path, bag, capsys, pose):
-    assert "is no pose; give metres" in refused(capsys, "map", bag, "--laser-pose", pose, "-o", tmp_path / "out")
+    assert "is not a pose; give X,Y,THETA in metres" in refused(
+        capsys, "map", bag, "--laser-pose", pose, "-o", tmp_path / "out"
+    )
 
 
 @pytest.mark.parametrize("band", ["0.6,0.1", "0.1", "low,high", "0.1,0.6,-1", "0.1,nan", "0.1,0.6,0.4,2"])

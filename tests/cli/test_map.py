@@ -351,13 +351,13 @@ def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("--start", "robot=1,2"), "'1,2' is not 3 numbers"),
-        (("--start", "robot=1,2,nan"), "is not 3 numbers"),
-        (("--start", "robot"), "give NAME=X,Y,THETA"),
+        (("--start", "robot=1,2"), "--start robot= '1,2' is not a pose; give X,Y,THETA"),
+        (("--start", "robot=1,2,nan"), "is not a pose"),
+        (("--start", "robot"), "--start robot= '' is not a pose"),
         (("--start", "robot=0,0,0", "--start", "robot=1,0,0"), "two starts"),
-        (("--start", "nobody=0,0,0"), "there is no robot nobody"),
-        (("--start-sigma", "0.3"), "give M,RAD"),
-        (("--start-sigma", "0.3,-1"), "start_sigma_rad"),
+        (("--start", "nobody=0,0,0"), "a start names 'nobody', but the robots are"),
+        (("--start-sigma", "0.3"), "fleet.start_sigma.1: Field required"),
+        (("--start-sigma", "0.3,-1"), "fleet.start_sigma.1: Input should be greater than 0"),
     ],
 )
 def test_a_start_that_cannot_be_is_refused(tmp_path, log, capsys, options, reason):
@@ -473,7 +473,7 @@ def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
     [
         (["1", "2"], "all recordings can be on one floor only"),
         (["r=1", "r=2"], "r can be on one floor only"),
-        (["x=1"], "a floor names 'x', but the recordings are r"),
+        (["x=1"], "a floor names 'x', but the robots are r"),
         (["r="], "floor '' is not 1 to 16 of"),
         (["=1"], "a floor names ''"),
         (["x" * 17], "is not 1 to 16 of"),

@@ -145,11 +145,6 @@ def map_recordings(
         with compiled(notices(quiet)):
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
         sources = split_recordings(opened, split)
-        unknown = [name for name in settings.fleet.starts if start and name not in {one.name for one in sources}]
-        if unknown:
-            raise InputError(
-                f"--start: there is no robot {unknown[0]}; known: {', '.join(one.name for one in sources)}"
-            )
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
     with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:

@@ -1,6 +1,5 @@
 """Options that choose the configuration of a mission, and the configuration that follows from them."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -75,6 +74,7 @@ def mission_config(
     Raises:
         ConfigError: the file cannot be read or is invalid, or options of the command line do not fit the rest.
     """
+    from fcslam.cli.recordings import pose
     from fcslam.config import changed, load
     from fcslam.errors import ConfigError
     from fcslam.mission import MissionConfig
@@ -88,24 +88,11 @@ def mission_config(
     fleet |= {"fusion": fusion} if fusion is not None else {}
     if starts:
         named = [start.partition("=")[::2] for start in starts]
-        fleet["starts"] = {name: _numbers("--start", numbers, 3) for name, numbers in named}
-        if len(named) > len(dict(named)):
+        fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+        if len(dict(named)) < len(named):
             raise ConfigError("--start: a robot is given two starts; give one for each")
     if start_sigma is not None:
-        fleet["start_sigma_m"], fleet["start_sigma_rad"] = _numbers("--start-sigma", start_sigma, 2)
+        fleet["start_sigma"] = start_sigma.split(",")
     changes: dict[str, object] = {"fleet": fleet} if fleet else {}
     changes |= {"seed": seed} if seed is not None else {}
     return changed(config, changes, "the command line")
-
-
-def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:
-    from fcslam.errors import ConfigError
-
-    try:
-        numbers = tuple(map(float, text.split(",")))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        form = "NAME=X,Y,THETA in metres and radians" if count == 3 else "M,RAD"
-        raise ConfigError(f"{option}: {text!r} is not {count} numbers with commas between them; give {form}")
-    return numbers

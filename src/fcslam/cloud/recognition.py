@@ -1,7 +1,7 @@
 """Place recognition of the fleet: which stored places may a new one show again, and which are kept."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from fcslam.cloud.visits import NEWEST_PLACES, Visit, visits_near, worth_compari
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import places_of_old_sessions, surplus_places
 from fcslam.lidar.pair_verification import VerifyPairs
-from fcslam.places.matcher import Expectation, PlaceMatch, PlaceMatcher
+from fcslam.places.matcher import PlaceMatch, PlaceMatcher
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 from fcslam.storage.state_file import State
 
@@ -39,7 +39,7 @@ _VocabularyKey = tuple[Channel, str, str]
 """Channel, detector version and floor; places that differ in one of these are never compared."""
 
 START_SIGMAS = 3.0
-"""A closure within so many standard deviations of the known starts is expected."""
+"""A closure within so many standard deviations of the known starts agrees with them."""
 _NO_PLACES = np.empty((0, 2), np.int64)
 
 
@@ -69,10 +69,12 @@ class PlaceRecognition:
         """
         key = self._key(place)
         matcher = self._matcher(key)
-        expected = self._expected(place, mates)
-        matches = matcher.match(place, self._predicted(place, mates), _outside(mates), expected)
+        by_start = list(self._by_start(place, mates))
+        matches = matcher.match(place, self._predicted(place, mates), _outside(mates))
         self._enter(key, place.id)
-        return matches
+        verified = {match.i for match in matches if match.M}
+        at_start = {match.i: match for match in by_start if match.i not in verified}
+        return [*(match for match in matches if match.i not in at_start), *at_start.values()]
 
     def thin(self, place: Place, mates: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
@@ -167,37 +169,36 @@ class PlaceRecognition:
         chosen = worth_comparing(visits, self._closures_near(visits), self._config.near_visits)
         return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
 
-    def _expected(self, place: Place, mates: Collection[str]) -> dict[KeyscanId, Expectation]:
-        """The nearest places of sessions in other maps, where the known starts of both sessions put them.
+    def _by_start(self, place: Place, mates: Collection[str]) -> Iterator[PlaceMatch]:
+        """Matches with places of other maps that agree with the known starts.
 
-        Far from the starts their headings leave open which of two separate places it is: they tell nothing there.
+        Starts so far apart that their headings leave open which of two separate places it is tell nothing.
         """
-        starts, key = self._config.starts, self._key(place)
-        expected: dict[KeyscanId, Expectation] = {}
+        starts, (sigma_m, sigma_rad), key = self._config.starts, self._config.start_sigma, self._key(place)
         if place.id.robot not in starts:
-            return {}
-        T_place = self._by_start(place.id.robot, np.array([place.id.number]))[0]
-        sigma_m, sigma_rad = self._config.start_sigma_m, self._config.start_sigma_rad
+            return
+        T_start_place = self._from_start(place.id.robot, np.array([place.id.number]))[0]
         for session in starts:
             numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
-            if session in mates or not len(numbers):
+            T_starts = se2.between(starts[session], starts[place.id.robot])
+            within_m = START_SIGMAS * float(np.sqrt(2.0) * sigma_m + sigma_rad * np.hypot(*T_starts[:2]))
+            if session in mates or not len(numbers) or within_m > self._config.consistency.separation_m:
                 continue
-            poses = self._by_start(session, numbers)
-            visits = visits_near(session, numbers, poses, T_place[:2], self._config.sight_m)
-            for visit in sorted(visits, key=attrgetter("distance_m"))[: self._config.near_visits]:
-                T_nearest = poses[numbers == visit.nearest.number][0]
-                way_m = np.hypot(*(T_place[:2] - starts[place.id.robot][:2]))
-                way_m += np.hypot(*(T_nearest[:2] - starts[session][:2]))
-                within_m = START_SIGMAS * float(sigma_m * np.sqrt(2.0) + sigma_rad * way_m)
-                if within_m < self._config.consistency.separation_m:
-                    within_rad = START_SIGMAS * float(sigma_rad * np.sqrt(2.0))
-                    expected[visit.nearest] = Expectation(se2.between(T_nearest, T_place), within_m, within_rad)
-        return expected
+            T_start_i = dict(zip(numbers.tolist(), self._from_start(session, numbers), strict=True))
+            T_start_j = se2.compose(T_starts, T_start_place)
+            visits = visits_near(session, numbers, np.array([*T_start_i.values()]), T_start_j[:2], self._config.sight_m)
+            nearest = [visit.nearest for visit in sorted(visits, key=attrgetter("distance_m"))]
+            expected = {i: se2.between(T_start_i[i.number], T_start_j) for i in nearest[: self._config.near_visits]}
+            for match in self._matcher(key).match_at(place, expected):
+                T_start_found = se2.compose(T_start_i[match.i.number], match.T_i_j)
+                off = se2.between(T_starts, se2.compose(T_start_found, se2.inverse(T_start_place)))
+                if np.hypot(off[0], off[1]) < within_m and abs(off[2]) < START_SIGMAS * np.sqrt(2.0) * sigma_rad:
+                    yield match
 
-    def _by_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:
-        """Poses (N, 3) of keyscans in the frame of the known starts."""
+    def _from_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:
+        """Poses (N, 3) of keyscans from the first one of their session."""
         poses = self._graph.trajectory(session)
-        return se2.compose(self._config.starts[session], se2.between(poses[0], poses[numbers]))
+        return se2.between(poses[0], poses[numbers])
 
     def _closures_near(self, visits: Mapping[str, Sequence[Visit]]) -> Counter[frozenset[str]]:
         """Number of accepted closures at the newest places of each robot's visits, by pair of robots."""

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.fusion_strategy import FusionStrategy
@@ -63,10 +63,11 @@ class FleetConfig(Settings):
     starts: dict[str, tuple[float, float, float]] = Field(
         default={},
         description="where robots started, by their names: x and y [m] and theta [rad], in one frame. Closures that "
-        "agree with the starts of both robots need to pass the loose gate only",
+        "agree with the starts of both robots pass the loose gate with a third of its points",
     )
-    start_sigma_m: float = Field(default=0.3, gt=0, description="standard deviation of x and y of a start [m]")
-    start_sigma_rad: float = Field(default=0.1, gt=0, description="standard deviation of the heading of a start [rad]")
+    start_sigma: tuple[PositiveFloat, PositiveFloat] = Field(
+        default=(0.3, 0.1), description="standard deviations of the starts, [m] in x and y and [rad] in theta"
+    )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     vocabularies: tuple[Path, ...] = Field(

@@ -64,7 +64,6 @@ class Pair(NamedTuple):
     prior: FloatArray = NO_PRIOR
     noise: Callable[[], float] = no_noise
     """Stays in this process: it needs the scans."""
-    share: float = 1.0
 
 
 VerifyPairs = Callable[[Sequence[Pair], VerificationConfig], list[Verification]]
@@ -76,7 +75,7 @@ Processes = Callable[[], Sequence[Executor]]
 
 def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
     """Verify the pairs one after another in this process."""
-    return [verify(a, b, guess, config, prior, noise, share) for a, b, guess, prior, noise, share in pairs]
+    return [verify(a, b, guess, config, prior, noise) for a, b, guess, prior, noise in pairs]
 
 
 class VerificationPool:
@@ -104,7 +103,7 @@ class VerificationPool:
         peers = self._present()
         batches = _split(len(pairs), 1 + len(peers), math.ceil(BATCH_S / self._pair_s))
         aligned = self._align(pairs, config, batches, peers)
-        return [judge(found, config, pair.noise, pair.share) for found, pair in zip(aligned, pairs, strict=True)]
+        return [judge(found, config, pair.noise) for found, pair in zip(aligned, pairs, strict=True)]
 
     def _present(self) -> "list[_Peer]":
         executors, now = self._processes(), self._clock()

@@ -165,7 +165,6 @@ def verify(
     config: VerificationConfig,
     prior: FloatArray = NO_PRIOR,
     noise: Callable[[], float] = no_noise,
-    share: float = 1.0,
 ) -> Verification:
     """Check whether two submaps show the same place: align them in both directions and rate the worse one.
 
@@ -179,12 +178,11 @@ def verify(
             informative: structure that repeats along a corridor repeats in images, too.
         noise: sum of both submaps' violation of themselves (``self_violation``), called only where it decides. Two
             submaps cannot agree better than each agrees with itself, so a noisy scanner is allowed as much violation.
-        share: share of the points of a gate that is enough.
 
     Returns:
         The alignment halfway between both directions, and the gates that it passes.
     """
-    return judge(align(a, b, T_a_b_guess, config, prior), config, noise, share)
+    return judge(align(a, b, T_a_b_guess, config, prior), config, noise)
 
 
 def align(
@@ -212,20 +210,14 @@ def align(
     return Aligned(T_a_b, _information(forward.information + prior, T_a_b, config), worse, worse.weakest, gap)
 
 
-def judge(
-    aligned: Aligned,
-    config: VerificationConfig,
-    noise: Callable[[], float] = no_noise,
-    share: float = 1.0,
-) -> Verification:
+def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], float] = no_noise) -> Verification:
     """Which gates an alignment passes; arguments as for ``verify``."""
     worse, weakest = aligned.worse, aligned.weakest
     asymmetric = _asymmetry(aligned.gap, config)
     symmetric = asymmetric is None
     informative = weakest >= config.informative
     one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, config.informative, "informative")
-    strict = _shortfall(worse, config.strict, "strict", noise, share)
-    loose = _shortfall(worse, config.loose, "loose", noise, share)
+    strict, loose = _shortfall(worse, config.strict, "strict", noise), _shortfall(worse, config.loose, "loose", noise)
     return Verification(
         T_a_b=aligned.T_a_b,
         information=aligned.information,
@@ -253,17 +245,14 @@ def _asymmetry(gap: FloatArray, config: VerificationConfig) -> Reason | None:
     return None
 
 
-def _shortfall(
-    found: Agreement, gate: Gate, name: str, noise: Callable[[], float], share: float = 1.0
-) -> Reason | None:
+def _shortfall(found: Agreement, gate: Gate, name: str, noise: Callable[[], float]) -> Reason | None:
     """The first threshold of the gate called ``name`` that is not reached."""
-    count = share * gate.count
     if found.explained < gate.explained:
         return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained, f"{name}.explained")
     if found.violation > gate.violation and found.violation > (limit := _noisy_limit(found, gate, noise)):
         return Reason(ReasonCode.IN_FREE_SPACE, found.violation, limit, f"{name}.violation")
-    if found.count < count:
-        return Reason(ReasonCode.FEW_POINTS, found.count, count, f"{name}.count")
+    if found.count < gate.count:
+        return Reason(ReasonCode.FEW_POINTS, found.count, gate.count, f"{name}.count")
     if found.overlap < gate.overlap:
         return Reason(ReasonCode.LITTLE_OVERLAP, found.overlap, gate.overlap, f"{name}.overlap")
     return None

@@ -6,9 +6,8 @@ the overlap of the two submaps under this motion decides. To the letter of the p
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from types import MappingProxyType
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -29,7 +28,7 @@ from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, Reason
 from fcslam.storage.state_file import State
 
 START_SHARE = 1.0 / 3.0
-"""Share of the points of a gate that is enough where known starts predict a closure."""
+"""Share of the points of the loose gate that is enough where known starts predict a closure."""
 NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
 
 
@@ -125,21 +124,13 @@ class PlaceMatch:
 
     @classmethod
     def verified(
-        cls,
-        i: KeyscanId,
-        j: KeyscanId,
-        channel: Channel,
-        similarity: float,
-        check: Verification,
-        predicted: bool,
-        expected: bool = False,
+        cls, i: KeyscanId, j: KeyscanId, channel: Channel, similarity: float, check: Verification, predicted: bool
     ) -> Self:
-        """Decision of geometry; a pair that the joint map predicts, or known starts, needs less."""
-        needs_less = predicted or expected
+        """Decision of geometry; a predicted pair needs less."""
         return cls(
             i, j, channel, similarity,
-            M=check.loose if needs_less else check.strict,
-            reason=(check.loose_reason if needs_less else check.reason).under("verification"),
+            M=check.loose if predicted else check.strict,
+            reason=(check.loose_reason if predicted else check.reason).under("verification"),
             T_i_j=check.T_a_b, information=check.information, informative=check.informative,
             explained=check.worse.explained, predicted=predicted,
         )  # fmt: skip
@@ -155,23 +146,6 @@ class PlaceMatch:
         )  # fmt: skip
 
 
-class Expectation(NamedTuple):
-    """Where known starts of two robots put a place relative to another one, and how far off that may be."""
-
-    T_i_j: FloatArray
-    """Shape (3,), metres and radians."""
-    within_m: float
-    within_rad: float
-
-    def includes(self, T_i_j: FloatArray) -> bool:
-        """Whether a motion is as expected."""
-        off = se2.between(self.T_i_j, T_i_j)
-        return bool(np.hypot(off[0], off[1]) <= self.within_m and abs(off[2]) <= self.within_rad)
-
-
-NOTHING_EXPECTED: Mapping[KeyscanId, Expectation] = MappingProxyType({})
-
-
 class _Comparison(NamedTuple):
     """Pairs of one stored place that are to be verified."""
 
@@ -181,8 +155,6 @@ class _Comparison(NamedTuple):
     share: float
     """Of matching descriptors, if it is known."""
     predicted: bool
-    expected: Expectation | None = None
-    """It is the first of the guesses."""
 
 
 class PlaceMatcher:
@@ -232,11 +204,7 @@ class PlaceMatcher:
         return iter(self._places)
 
     def match(
-        self,
-        place: Place,
-        predicted: Mapping[KeyscanId, FloatArray],
-        is_unaligned: Callable[[KeyscanId], bool],
-        expected: Mapping[KeyscanId, Expectation] = NOTHING_EXPECTED,
+        self, place: Place, predicted: Mapping[KeyscanId, FloatArray], is_unaligned: Callable[[KeyscanId], bool]
     ) -> list[PlaceMatch]:
         """Compare a new place with the stored places that may be the same, then store it.
 
@@ -245,18 +213,35 @@ class PlaceMatcher:
             predicted: T_i_j, shape (3,), of the stored places i that the joint map predicts to be near; forgotten
                 places are ignored.
             is_unaligned: whether a stored place belongs to a robot in another map, whose relative pose is unknown.
-            expected: stored places of such robots that the known starts put near this one.
         """
         comparable = bool(predicted) or any(is_unaligned(i) for i in self._places)
         result = self._query(place) if comparable else QueryResult[KeyscanId]()  # Algorithm 1, lines 11-13
         if self._config.decision is MatchDecision.SIMILARITY:
             matches = self._similar(place, result, is_unaligned)
         else:
-            matches = self._verified(self._comparisons(place, result, predicted, is_unaligned, expected), place, result)
+            matches = self._verified(self._comparisons(place, result, predicted, is_unaligned), place, result)
         self._places[place.id] = place
         self._backlog.append(place)
         self._forget_oldest()
         return matches
+
+    def match_at(self, place: Place, expected: Mapping[KeyscanId, FloatArray]) -> list[PlaceMatch]:
+        """The stored places that a new place overlaps about where known starts of their robots put it.
+
+        Args:
+            place: the new place, j, which is not stored here.
+            expected: T_i_j, shape (3,), of the stored places i; forgotten places are ignored.
+        """
+        kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
+        pairs = [self._pair(self._places[i], place, T_i_j, NO_PRIOR) for i, T_i_j in kept]
+        loose = self._config.verification.loose
+        fewer = loose.model_copy(update={"count": round(START_SHARE * loose.count)})
+        checks = self._verify_pairs(pairs, self._config.verification.model_copy(update={"loose": fewer}))
+        matches = [
+            PlaceMatch.verified(i, place.id, place.channel, 0.0, check, predicted=True)
+            for (i, _), check in zip(kept, checks, strict=True)
+        ]
+        return [replace(match, predicted=False) for match in matches if match.M]
 
     def _similar(
         self, place: Place, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]
@@ -272,15 +257,13 @@ class PlaceMatcher:
         result: QueryResult[KeyscanId],
         predicted: Mapping[KeyscanId, FloatArray],
         is_unaligned: Callable[[KeyscanId], bool],
-        expected: Mapping[KeyscanId, Expectation],
     ) -> list[_Comparison]:
         """The pairs that geometry is to verify."""
         kept = {i: T_i_j for i, T_i_j in predicted.items() if i in self._places}
         near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
-        by_start = [i for i in expected if i in self._places]
-        others = dict.fromkeys((*by_start, *self._candidates(result, is_unaligned), *lookalikes))
-        far = [_far(i, propose_motions(self._places[i], place, self._config.motions), expected.get(i)) for i in others]
+        others = (*self._candidates(result, is_unaligned), *lookalikes)
+        far = [_far(i, propose_motions(self._places[i], place, self._config.motions)) for i in others]
         return [*near, *far]
 
     def state(self) -> State:
@@ -381,46 +364,28 @@ class PlaceMatcher:
     ) -> list[PlaceMatch]:
         """Verify every guess of the comparisons; the best one of each counts."""
         pairs = [
-            self._pair(self._places[comparison.i], place, *guess, START_SHARE if not k and comparison.expected else 1.0)
+            self._pair(self._places[comparison.i], place, *guess)
             for comparison in comparisons
-            for k, guess in enumerate(comparison.guesses)
+            for guess in comparison.guesses
         ]
         checks = iter(self._verify_pairs(pairs, self._config.verification))
         matches: list[PlaceMatch] = []
         for comparison in comparisons:
             found = [next(checks) for _ in comparison.guesses]
-            start = comparison.expected
-            by_start = max(
-                (check for check in found if start is not None and check.loose and start.includes(check.T_a_b)),
-                key=_rank,
-                default=None,
-            )
-            if start is not None and not start.includes(found[0].T_a_b):
-                del found[0]  # it was compared as if it were there
             if found:
-                best, is_expected = max(found, key=_rank), False
-                if by_start is not None and not best.strict:
-                    best, is_expected = by_start, True
+                best = max(found, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
                 similarity = result.similarity_of(comparison.i, comparison.share)
                 matches.append(
-                    PlaceMatch.verified(
-                        comparison.i, place.id, place.channel, similarity, best, comparison.predicted, is_expected
-                    )
+                    PlaceMatch.verified(comparison.i, place.id, place.channel, similarity, best, comparison.predicted)
                 )
         return matches
 
-    def _pair(self, stored: Place, place: Place, guess: FloatArray, prior: FloatArray, share: float) -> Pair:
+    def _pair(self, stored: Place, place: Place, guess: FloatArray, prior: FloatArray) -> Pair:
         a, b = self._submap_of(stored), self._submap_of(place)
-        return Pair(a, b, guess, prior, lambda: self._noise_of(stored) + self._noise_of(place), share)
+        return Pair(a, b, guess, prior, lambda: self._noise_of(stored) + self._noise_of(place))
 
 
-def _rank(check: Verification) -> tuple[bool, float]:
-    return check.strict, check.worse.explained - check.worse.violation
-
-
-def _far(i: KeyscanId, proposed: Sequence[Motion], expected: Expectation | None = None) -> _Comparison:
-    """The comparison of a pair that is not predicted, by its motions from keypoints and by known starts."""
+def _far(i: KeyscanId, proposed: Sequence[Motion]) -> _Comparison:
+    """The comparison of a pair that is not predicted, by its motions from keypoints."""
     share = proposed[0].share if proposed else 0.0
-    by_start = [] if expected is None else [(expected.T_i_j, NO_PRIOR)]
-    motions = [(motion.T_a_b, motion.information) for motion in proposed]
-    return _Comparison(i, [*by_start, *motions], share, predicted=False, expected=expected)
+    return _Comparison(i, [(motion.T_a_b, motion.information) for motion in proposed], share, predicted=False)
