@@ -81,6 +81,14 @@ def test_a_robot_that_stands_still_makes_one_small_map(tmp_path):
     assert not (tmp_path / "out" / "map_1.pgm").exists()
 
 
+@pytest.mark.parametrize("copy", ["copy.bag", "copy.mcap"])
+def test_a_copy_of_a_recording_under_another_name_is_refused(tmp_path, capsys, copy):
+    bag, copy = save(tmp_path / "run.bag", drive(40)), save(tmp_path / copy, drive(40))
+    assert "copy and run are copies of one recording" in refused(capsys, "map", bag, copy, "-o", tmp_path / "out")
+    other = save(tmp_path / "other.bag", drive(40, start=150.0))
+    assert run("map", bag, other, "-o", tmp_path / "out") == 0
+
+
 def test_choices_and_faults_are_said(tmp_path, capsys):
     said = [*drive(40), *(odom(100 + k, (9, 9, 0), topic="/filtered") for k in range(9))]
     bag = save(tmp_path / "run.bag", said[1:])
