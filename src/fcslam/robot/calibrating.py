@@ -65,7 +65,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     contradictions = [_contradiction_of(bag, laser) for laser in bag.survey().lasers]
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
-        lines = (f"{laser.name}: {_facing_line(found)}; not corrected" for laser, found in named if found)
+        lines = (f"{laser.name}: {found}; not corrected" for laser, found in named if found)
         return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
     found = contradictions[0]
     if found is None:
@@ -73,7 +73,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     turned_deg, upside_down, distance = found.facing
     if distance != 1.0:
         fine = _calibrate_finely(bag, config)
-        lines_before = () if fine.calibration.distance_scale else (_facing_line(found),)
+        lines_before = () if fine.calibration.distance_scale else (str(found),)
         return replace(fine, lines=(*lines_before, *fine.lines))
     T_base_laser = np.array(bag.survey().lasers[0].T_base_laser)
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
@@ -83,33 +83,12 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
     done = "--laser-pose is kept" if bag.has_given_pose else "corrected"
     correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
-    return Calibrated(fine.calibration, correction, (f"{_facing_line(found)}; {done}", *fine.lines))
+    return Calibrated(fine.calibration, correction, (f"{found}; {done}", *fine.lines))
 
 
 def _contradiction_of(bag: RosBag, laser: LaserModel) -> Contradiction | None:
     scans = (record for record in bag.records() if isinstance(record, LaserScan))
     return contradicted_facing(scan for scan in scans if is_same_laser(scan.laser, laser))
-
-
-def _facing_line(found: Contradiction) -> str:
-    """Why the mounting or the odometry cannot be right, and what to do."""
-    (turned_deg, upside_down, distance), claims = found.facing, []
-    if upside_down:
-        claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")
-    if turned_deg:
-        side = "left" if turned_deg > 0.0 else "right"
-        claims.append(f"the laser is turned by about {abs(turned_deg):.0f} deg to the {side} of what is stated")
-    if distance != 1.0:
-        claims.append(f"the robot's distance is {distance:.2f} of what odometry says")
-    remedy = (
-        "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the odometry"
-        if distance == 1.0
-        else "correct the radius of the wheels in its driver"
-    )
-    return (
-        f"the scans contradict the odometry: {', and '.join(claims)} (then {100 * found.agreement:.0f} % of the points "
-        f"agree, and {100 * found.stated_agreement:.0f} % as stated); {remedy}"
-    )
 
 
 def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
@@ -278,9 +257,15 @@ def _stamped(first_s: float, last_s: float) -> str | None:
 
 
 def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: list[str]) -> Calibrated:
-    for name, scale in (("distance", calibration.distance_scale), ("turn", calibration.turn_scale)):
+    for name, scale, what in (
+        ("distance", calibration.distance_scale, "radius"),
+        ("turn", calibration.turn_scale, "distance"),
+    ):
         if scale is not None and scale.differs(1.0, 5.0 * LEAST_SCALE):
-            lines.append(f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f})")
+            lines.append(
+                f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); correct the "
+                f"{what} of the wheels in its driver"
+            )
     if calibration.mounting is None:
         return Calibrated(calibration, correction, tuple(lines))
     x, y, yaw = calibration.mounting
