@@ -38,6 +38,8 @@ corrected."""
 LEAST_SCALE: Final = 0.01
 LEAST_SHARE: Final = 0.1
 """Smaller differences from what the bag says are not corrected."""
+SHORT_SHARE: Final = 0.2
+"""Beams that are said to take a smaller share of this time may take longer."""
 AT_ONCE_SHARE: Final = 0.15
 """Beams that take a smaller share of the time between scans are measured at once."""
 WHOLE_SHARE: Final = 0.05
@@ -110,7 +112,7 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
-    found = _corrected(calibration, assumed, bag.stream.states_sweep)
+    found = _corrected(calibration, assumed, _stated_share(bag.stream.stated_sweep, assumed_s))
     sweep = found.correction.sweep
     if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
         found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
@@ -163,7 +165,7 @@ def _tracked(
             continue
         if len(stamps) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break
-        beams = Sweep(0.0, assumed_s) if record.sweep is None else Sweep(record.sweep.first_s, record.sweep.last_s)
+        beams = Sweep(*_times(record.sweep, assumed_s))
         scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
         tracked = frontend.localize(scan)
         frontend.process(scan, tracked)
@@ -179,6 +181,23 @@ def _tracked(
     first_s, last_s = np.array(times).reshape(-1, 2).T
     motions = ScanMotions(np.array(stamps), np.array(poses).reshape(-1, 3), np.array(turned), first_s, last_s)
     return motions, _track_of(odometry)
+
+
+def _times(stated: Sweep | None, assumed_s: float) -> tuple[float, float]:
+    """Times of the first and the last beam with which a scan is tracked.
+
+    Some drivers state times that are far too short, which say as little as none.
+    """
+    is_said = stated is not None and abs(stated.last_s - stated.first_s) > SHORT_SHARE * assumed_s
+    return (stated.first_s, stated.last_s) if stated is not None and is_said else (0.0, assumed_s)
+
+
+def _stated_share(stated: Sweep | None, assumed_s: float) -> float:
+    """The stated duration of a scan per duration with which it is tracked."""
+    if stated is None:
+        return 0.0
+    first_s, last_s = _times(stated, assumed_s)
+    return (stated.last_s - stated.first_s) / (last_s - first_s)
 
 
 def _track_of(odometry: list[Odometry]) -> OdometryTrack | None:
@@ -200,19 +219,19 @@ def _unwrapped(poses: FloatArray) -> FloatArray:
     return known
 
 
-def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], states_sweep: bool) -> Calibrated:
+def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nominal: float) -> Calibrated:
     """The significant estimates as a correction and in words.
 
     Args:
         calibration: the estimates.
         assumed: times of the first and the last beam after the stamp with which the scans were tracked, seconds.
-        states_sweep: whether the bag says these times; otherwise it says that all beams are measured at once.
+        nominal: duration of a scan as the bag states it, per assumed duration; 0: all beams at once.
     """
     if calibration.mounting is not None:
         x, y, _ = calibration.mounting
         if math.hypot(x.value, y.value) > LARGEST_OFFSET_M:
             return Calibrated(calibration, BagCorrection(), ())
-    share, nominal = _share(calibration), 1.0 if states_sweep else 0.0
+    share = _share(calibration)
     is_late = calibration.delay is not None and calibration.delay.differs(0.0, LEAST_DELAY_S)
     is_other = share is not None and share.differs(nominal, LEAST_SHARE)
     if not is_late and not is_other:
