@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.mission import MissionConfig, run_mission
-from fcslam.records import ReasonCode
+from fcslam.records import LaserModel, ReasonCode
 from fcslam.runs import separations
 from tests.flats import BACK, ROUND, Drive, doors, flat, lookalike
 
@@ -14,6 +15,10 @@ pytestmark = pytest.mark.slow
 
 def maps_of(run):
     return {trajectory.map_index for trajectory in run.trajectories.values()}
+
+
+def with_starts(starts):
+    return MissionConfig(fleet=FleetConfig(starts={name: tuple(pose) for name, pose in starts.items()}))
 
 
 def test_robots_that_met_in_one_flat_share_a_map():
@@ -30,15 +35,41 @@ def test_one_unmistakable_spot_is_enough():
     assert maps_of(run) == {0}
 
 
+WAYS = [(1.2, 1.3), (4.6, 1.2), (4.7, 3.6)], [(3.0, 2.6), (1.3, 1.5), (4.4, 1.7)]
+"""Too short for a laser of 5 m: no closure has enough points."""
+NEAR = LaserModel(180, -np.pi, np.pi / 90, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("off", "maps"),
+    [(None, {0, 1}), ((0.3, -0.2, 0.1), {0}), ((2.5, 0.0, 0.0), {0, 1}), ((0.0, 0.0, 1.5), {0, 1})],
+    ids=["none", "right", "wrong place", "wrong heading"],
+)
+def test_known_starts_join_robots_that_saw_little_together_and_wrong_ones_nothing(off, maps):
+    one, other = (Drive(name, way, flat(), laser=NEAR) for name, way in zip("ab", WAYS, strict=True))
+    starts = {} if off is None else {"a": one.poses[0], "b": other.poses[0] + off}
+    run = run_mission([one, other], with_starts(starts))
+    assert maps_of(run) == maps
+    if maps == {0}:
+        first = (run.trajectories[drive.name].T_map_base[0] for drive in (one, other))
+        assert np.allclose(se2.between(*first), se2.between(one.poses[0], other.poses[0]), atol=0.05)
+
+
 def test_flats_with_equal_walls_and_other_furniture_stay_apart():
     run = run_mission([Drive("a", ROUND, flat(), 0), Drive("b", BACK, lookalike(), 1)], MissionConfig())
     assert maps_of(run) == {0, 1}
 
 
-def test_robots_at_different_doors_of_a_corridor_stay_apart():
-    """They never met; every door fits every other, and the last line names this."""
+def test_known_starts_do_not_join_another_flat():
+    one, other = Drive("a", ROUND, flat(), 0), Drive("b", ROUND, lookalike(), 1)
+    assert maps_of(run_mission([one, other], with_starts(dict.fromkeys("ab", (0.0, 0.0, 0.0))))) == {0, 1}
+
+
+@pytest.mark.parametrize("starts", [{}, dict.fromkeys("ab", (0.0, 0.0, 0.0))], ids=["unknown", "wrong"])
+def test_robots_at_different_doors_of_a_corridor_stay_apart(starts):
+    """They never met; every door fits every other, also that of a wrong start, and the last line names this."""
     ways = {"a": [(4.0, 0.0), (12.0, 0.1), (5.0, 0.0)], "b": [(26.0, 0.0), (34.0, 0.1), (27.0, 0.0)]}
-    run = run_mission([Drive(name, way, doors()) for name, way in ways.items()], MissionConfig())
+    run = run_mission([Drive(name, way, doors()) for name, way in ways.items()], with_starts(starts))
     assert maps_of(run) == {0, 1}
     (apart,) = separations(run)
     assert apart.reason is not None

@@ -25,8 +25,8 @@ def test_verified_closures_name_what_they_lack():
     (found,) = separations(run_of({"a": 0, "b": 1}, failed, *rejected))
     assert (found.candidates, found.verified, found.reason) == (1, 146, FEW)
     assert str(found) == (
-        "map 0 (a) and map 1 (b): 146 verified closures, but they agree from 2 separate places, 3 needed "
-        "(fleet.consistency.minimum_evidence)"
+        "map 0 (a) and map 1 (b): 146 verified closures, but they agree from 2 separate places, 3 needed; "
+        "drive b through map 0 around (0.0, 0.0) again, and beyond"
     )
 
 
@@ -38,7 +38,7 @@ def test_the_closest_candidate_speaks_where_nothing_was_verified():
     ]
     (found,) = separations(run_of({"a": 0, "b": 1}, *(("b", "a", ClosureStatus.CANDIDATE, why) for why in reasons)))
     assert found.reason == reasons[2]
-    assert "3 candidates, none verified: 238 points lie on a surface, 250 needed (count)" in str(found)
+    assert "3 candidates, none verified: 238 points lie on a surface, 250 needed; drive b through map 0" in str(found)
 
 
 def test_maps_that_were_not_to_be_joined_need_no_reason():
@@ -64,7 +64,9 @@ def test_every_pair_of_maps_is_named_and_one_map_has_none():
     assert [s.maps for s in separations(run_of({"a": 0, "b": 1, "c": 2}))] == [(0, 1), (0, 2), (1, 2)]
     assert separations(run_of({"a": 0, "b": 0})) == []
     (nothing,) = separations(run_of({"a": 0, "b": 1}))
-    assert str(nothing) == "map 0 (a) and map 1 (b): no two of their places look alike"
+    assert str(nothing) == (
+        "map 0 (a) and map 1 (b): no two of their places look alike; drive b through a part of map 0"
+    )
 
 
 def test_every_code_has_a_text():

@@ -87,6 +87,7 @@ def map_recordings(
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
     opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=0 if earlier else 1)
     robots = split_recordings(opened, split)
+    sources.check_copies(robots)
     drive = side_by_side(processes)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}

@@ -7,7 +7,7 @@ import heapq
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Self
@@ -124,15 +124,19 @@ def run_mission(
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
-        ConfigError: a veto or a floor names a robot that is not there, or a floor is not valid.
+        ConfigError: a veto, a floor or a start names a robot that is not there, or a floor is not valid.
         OutputError: a robot's name cannot be a file name.
     """
     onto = onto or EMPTY
     _check_robots(sources)
-    _check_vetoes(vetoes, [*onto.robots, *(source.name for source in sources)])
-    _check_floors(floors, [source.name for source in sources])
+    recordings = [source.name for source in sources]
+    known = [*onto.robots, *recordings]
+    _check_known("a veto", (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)), known)
+    _check_known("a start", config.fleet.starts, known)
+    _check_known("a floor", floors, recordings)
+    _check_floors(floors)
     cloud = MissionCloud(config, onto, vetoes, verify_pairs)
-    meter = _Meter(watch, cloud, [*onto.robots, *(source.name for source in sources)])
+    meter = _Meter(watch, cloud, known)
     with drive(sources, config.robot) as robots:
         new = [
             on_floor(continued(legs, onto.epochs(source.name)), floors.get(source.name, ""))
@@ -335,17 +339,15 @@ def _check_robots(sources: Sequence[Source]) -> None:
     check_names(names)
 
 
-def _check_floors(floors: Mapping[str, str], robots: Sequence[str]) -> None:
-    for name, floor in floors.items():
-        if name not in robots:
-            raise ConfigError(f"a floor names '{name}', but the recordings are {', '.join(robots)}")
+def _check_floors(floors: Mapping[str, str]) -> None:
+    for floor in floors.values():
         try:
             check_floor(floor)
         except PacketError as error:
             raise ConfigError(str(error)) from error
 
 
-def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:
-    for name in (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)):
+def _check_known(what: str, names: Iterable[str], robots: Sequence[str]) -> None:
+    for name in names:
         if robot_of(name) not in robots:
-            raise ConfigError(f"a veto names '{name}', but the robots are {', '.join(robots)}")
+            raise ConfigError(f"{what} names '{name}', but the robots are {', '.join(robots)}")

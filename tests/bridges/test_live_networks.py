@@ -75,7 +75,7 @@ def for_player(path, scans):
     np.savez(
         path,
         stamps=[scan.stamp for scan in scans],
-        ranges=[np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans],
+        ranges=[scan.ranges_m for scan in scans],
         odometry=[scan.T_odom_base for scan in scans],
         laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
         beam_s=0.0 if sweep is None else sweep.duration_s / (laser.beam_count - 1),

@@ -81,6 +81,14 @@ def test_a_robot_that_stands_still_makes_one_small_map(tmp_path):
     assert not (tmp_path / "out" / "map_1.pgm").exists()
 
 
+@pytest.mark.parametrize("copy", ["copy.bag", "copy.mcap"])
+def test_a_copy_of_a_recording_under_another_name_is_refused(tmp_path, capsys, copy):
+    bag, copy = save(tmp_path / "run.bag", drive(40)), save(tmp_path / copy, drive(40))
+    assert "copy and run are copies of one recording" in refused(capsys, "map", bag, copy, "-o", tmp_path / "out")
+    other = save(tmp_path / "other.bag", drive(40, start=150.0))
+    assert run("map", bag, other, "-o", tmp_path / "out") == 0
+
+
 def test_choices_and_faults_are_said(tmp_path, capsys):
     said = [*drive(40), *(odom(100 + k, (9, 9, 0), topic="/filtered") for k in range(9))]
     bag = save(tmp_path / "run.bag", said[1:])
@@ -139,7 +147,9 @@ def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, options):
 
 @pytest.mark.parametrize("pose", ["1,2", "1,2,3,4", "a,b,c", "nan,0,0", "inf,0,0", ""])
 def test_a_pose_that_is_none(tmp_path, bag, capsys, pose):
-    assert "is no pose; give metres" in refused(capsys, "map", bag, "--laser-pose", pose, "-o", tmp_path / "out")
+    assert "is not a pose; give X,Y,THETA in metres" in refused(
+        capsys, "map", bag, "--laser-pose", pose, "-o", tmp_path / "out"
+    )
 
 
 @pytest.mark.parametrize("band", ["0.6,0.1", "0.1", "low,high", "0.1,0.6,-1", "0.1,nan", "0.1,0.6,0.4,2"])

@@ -348,6 +348,22 @@ def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
     assert log.read_text().startswith("ODOM")
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--start", "robot=1,2"), "--start robot= '1,2' is not a pose; give X,Y,THETA"),
+        (("--start", "robot=1,2,nan"), "is not a pose"),
+        (("--start", "robot"), "--start robot= '' is not a pose"),
+        (("--start", "robot=0,0,0", "--start", "robot=1,0,0"), "two starts"),
+        (("--start", "nobody=0,0,0"), "a start names 'nobody', but the robots are"),
+        (("--start-sigma", "0.3"), "fleet.start_sigma.1: Field required"),
+        (("--start-sigma", "0.3,-1"), "fleet.start_sigma.1: Input should be greater than 0"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(tmp_path, log, capsys, options, reason):
+    assert reason in refused(capsys, tmp_path, log, *options, "--output", tmp_path / "run")
+
+
 def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, log, capsys):
     run = tmp_path / "run"
     assert "--no-fuse" in refused(capsys, tmp_path, log, "--no-fuse", "--fusion", "two_point", "--output", run)
@@ -457,7 +473,7 @@ def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
     [
         (["1", "2"], "all recordings can be on one floor only"),
         (["r=1", "r=2"], "r can be on one floor only"),
-        (["x=1"], "a floor names 'x', but the recordings are r"),
+        (["x=1"], "a floor names 'x', but the robots are r"),
         (["r="], "floor '' is not 1 to 16 of"),
         (["=1"], "a floor names ''"),
         (["x" * 17], "is not 1 to 16 of"),

@@ -107,7 +107,7 @@ def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reas
         (["--localize", "nowhere", "--state", "state"], "leave --state out"),
         (["--localize", "nowhere", "--server", "http://127.0.0.1:9"], "nowhere holds no earlier copy of the map"),
         (["--localize", "nowhere", "--server", "cloud"], "'cloud' is not the address of a cloud"),
-        (["--localize", "nowhere", "--initial-pose", "1,2"], "--initial-pose '1,2' is no pose"),
+        (["--localize", "nowhere", "--initial-pose", "1,2"], "--initial-pose '1,2' is not a pose"),
         (["--initial-pose", "1,2,3"], "an initial pose is one in a finished map; give --localize, too"),
     ],
 )

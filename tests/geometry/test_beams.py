@@ -4,7 +4,7 @@ from math import nan, pi, radians, tau
 
 import pytest
 
-from fcslam.geometry.beams import beam_step, is_same_laser, misfit
+from fcslam.geometry.beams import beam_step, is_same_laser, misfit, spread
 from fcslam.records import Beams, LaserModel
 
 DEGREE = radians(1.0)
@@ -29,6 +29,20 @@ TURN = Beams(1100, -pi, tau / 1100)
 def test_variations_of_one_laser(beams, declared):
     assert misfit(beams, declared) is None
     assert misfit(declared, beams) is None
+
+
+@pytest.mark.parametrize("count", [1000, 1099, 1101, 1300])
+def test_more_or_fewer_beams_spread_over_the_same_turn(count):
+    for sign in (1, -1):
+        declared = Beams(1100, -sign * pi, sign * tau / 1100)
+        assert spread(count, declared) == pytest.approx(Beams(count, -sign * pi, sign * tau / count))
+        assert misfit(spread(count, declared), declared) is None
+
+
+@pytest.mark.parametrize("count", [170, 180, 182, 200])
+def test_more_or_fewer_beams_spread_over_the_same_view(count):
+    assert spread(count, SICK).span_rad == pytest.approx(SICK.span_rad)
+    assert misfit(spread(count, SICK), SICK) is None
 
 
 @pytest.mark.parametrize(

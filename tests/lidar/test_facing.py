@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import fcslam
 from fcslam.geometry import se2
 from fcslam.lidar.facing import Facing, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.records import LaserModel, LaserScan, frozen
-from fcslam.robot.calibrating import calibrated
+from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.sources import BagOptions, open_source, write_bag
 from tests.lidar import worlds
+from tests.live.same_thread import SameThread
 
 NARROW = LaserModel(91, -math.pi / 2, math.radians(2.0), 5.0, (0.2, 0.05, 0.0))
 WIDE = LaserModel(180, -math.pi, math.radians(2.0), 12.0, (0.2, 0.05, 0.0))
@@ -89,7 +91,7 @@ def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg
     off = se2.between(NARROW.T_base_laser, first.laser.T_base_laser)
     assert np.hypot(off[0], off[1]) < 0.1
     assert off[2] == pytest.approx(0.0, abs=0.05)
-    assert np.array_equal(first.ranges_m, np.where(scans[0].ranges_m >= 5.0, np.inf, scans[0].ranges_m))
+    assert np.array_equal(first.ranges_m, np.where(scans[0].ranges_m >= 5.0, np.nan, scans[0].ranges_m), equal_nan=True)
     x, y, theta = NARROW.T_base_laser
     given = BagOptions(laser_poses=((x, y, theta - math.radians(turned_deg)),))
     kept = calibrated(open_source(path, given), LidarConfig())
@@ -104,4 +106,25 @@ def test_a_laser_may_be_given_upside_down(tmp_path):
     source = open_source(path, BagOptions(laser_poses=((*NARROW.T_base_laser, True),)))
     first = next(record for record in source.records() if isinstance(record, LaserScan))
     assert first.laser.T_base_laser == NARROW.T_base_laser
-    assert np.array_equal(first.ranges_m, np.where(scans[0].ranges_m >= 5.0, np.inf, scans[0].ranges_m))
+    assert np.array_equal(first.ranges_m, np.where(scans[0].ranges_m >= 5.0, np.nan, scans[0].ranges_m), equal_nan=True)
+
+
+@pytest.mark.parametrize(("turned_deg", "said"), [(0, False), (180, True)])
+def test_a_live_robot_says_once_that_its_laser_faces_another_way(turned_deg, said):
+    told = []
+    scans = stated(drive(NARROW), turned_deg)
+    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=told.append) as robot:
+        for scan in scans:
+            robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
+    lines = [event.text for event in told if "the laser is turned by about 180 deg" in event.text]
+    assert len(lines) == said
+    assert all("not corrected" in line for line in lines)
+
+
+@pytest.mark.parametrize("distance", [0.8, 1.2])
+def test_a_scale_of_the_wheels_is_said_in_one_line(tmp_path, distance):
+    poses = worlds.drive(3 * [(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.05)
+    write_bag(tmp_path / "r.mcap", stated(worlds.recording(poses, poses, worlds.room(), WIDE), distance=distance))
+    (line,) = calibrate_bag(open_source(tmp_path / "r.mcap"), LidarConfig()).lines
+    assert float(line.split("the robot's distance is ")[1].split()[0]) == pytest.approx(distance, rel=0.02)
+    assert line.endswith("correct the radius of the wheels in its driver")

@@ -18,7 +18,9 @@ from fcslam.lidar.lost import (
     is_lost,
 )
 from fcslam.lidar.odometry import OdometryTrust
-from fcslam.records import frozen
+from fcslam.mission import MissionConfig
+from fcslam.records import LaserModel, frozen
+from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.motion_prediction import PREDICTED
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
@@ -185,3 +187,17 @@ def test_what_was_not_matched_is_not_doubted(around):
     frontend = mapped(around[:60])
     nothing = replace(around[60], ranges_m=frozen(np.full(LASER.beam_count, LASER.max_range_m), np.float32))
     assert not is_doubtful(frontend.localize(nothing), frontend, CONFIG)
+
+
+@pytest.mark.parametrize("thickness_m", [0.0, 0.02, 0.1])
+def test_a_robot_that_looks_at_a_board_from_its_other_side_is_not_lost(thickness_m):
+    """A laser of 3.5 m sees little else than the board when it has driven round its end."""
+    short = LaserModel(360, -np.pi, np.pi / 180, 3.5)
+    half = 0.5 * thickness_m
+    board = box(-4.0, -half, 4.0, half)
+    poses = drive([(-3.0, -0.8), (4.8, -0.8), (4.8, 0.8), (-3.0, 0.8)], step_m=0.2, step_rad=0.2)
+    scans = recording(poses, poses, np.concatenate((board, box(-7.0, -3.0, 7.0, 3.0))), laser=short)
+    robot = RobotFrontend("r", MissionConfig().robot)
+    for scan in scans:
+        robot.process(scan)
+    assert len(robot.tracks) == 1

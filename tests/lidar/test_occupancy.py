@@ -165,14 +165,98 @@ def test_a_beam_beyond_the_usable_range_clears_inside_the_grid_and_hits_nothing(
     assert cleared[-1] == 3.0
 
 
-@pytest.mark.parametrize("nothing", [0.0, -1.0, np.nan, np.inf, -np.inf, 50.0, 81.83])
-def test_what_is_no_return_adds_nothing(nothing):
+@pytest.mark.parametrize("nothing", [0.0, -1.0, np.nan, -np.inf, 50.0, 81.83])
+def test_what_is_no_range_adds_nothing(nothing):
     scans = room_scans(count=2)
     silent = np.full(ALL_ROUND.beam_count, nothing, np.float32)
     grid = cast(scans, CONFIG)
     more = cast([*scans, Casting(silent, ALL_ROUND, np.zeros(3))], CONFIG)
     np.testing.assert_array_equal(more.hits, grid.hits)
     np.testing.assert_array_equal(more.passes, grid.passes)
+
+
+SHORT = LaserModel(720, -np.pi, np.pi / 360, 4.0)
+
+
+def short_scan(x, y, seen_from_m=4.0, lost=0.0, seed=0, person=False):
+    """Ranges of ``SHORT`` beside a long wall at y = 3 that returns beams up to ``seen_from_m``, at (x, y), which faces
+    +x. A ``person`` of 0.3 m stands in the origin. A share of ``lost`` of the beams has no return."""
+    cos, sin = np.cos(SHORT.angles_rad()), np.sin(SHORT.angles_rad())
+    with np.errstate(divide="ignore"):
+        ranges = np.where(sin > 0.0, (3.0 - y) / sin, np.inf)
+    ranges[ranges >= seen_from_m] = np.inf
+    if person:
+        along, across = -(x * cos + y * sin), x * sin - y * cos
+        near = (np.abs(across) < 0.15) & (along > 0.0)
+        ranges = np.where(near, along - np.sqrt(np.maximum(0.0, 0.0225 - across**2)), ranges)
+        ranges[ranges >= 4.0] = np.inf
+    ranges[np.random.default_rng(seed).random(len(ranges)) < lost] = np.inf
+    return Casting(ranges.astype(np.float32), SHORT, np.array((x, y, 0.0)))
+
+
+def states(castings, config=CONFIG):
+    """The state of the cell at any (x, y)."""
+    grid = cast(castings, config)
+    cells = classify(grid, config)
+
+    def at(x, y):
+        column, row = (int(np.floor((v - o) / CELL_M)) for v, o in zip((x, y), grid.origin_xy, strict=True))
+        inside = 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
+        return Occupancy(cells[row, column]) if inside else Occupancy.UNKNOWN
+
+    return at
+
+
+@pytest.mark.parametrize("y", [-4.0, 0.0])
+def test_beams_without_return_clear_the_floor_up_to_the_maximum_range(y):
+    at = states([short_scan(0.0, y), short_scan(0.01, y)])
+    for heading in np.radians(np.arange(181, 359, 3)):
+        assert at(3.8 * np.cos(heading), y + 3.8 * np.sin(heading)) == Occupancy.FREE
+        assert at(4.2 * np.cos(heading), y + 4.2 * np.sin(heading)) == Occupancy.UNKNOWN
+
+
+def test_the_length_of_beams_without_return_can_be_set():
+    scans = [short_scan(0.0, -4.0), short_scan(0.01, -4.0)]
+    at = states(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=2.0))
+    assert (at(0.0, -5.8), at(0.0, -6.2)) == (Occupancy.FREE, Occupancy.UNKNOWN)
+    none = cast(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=0.0))
+    assert none.passes.sum() == 0
+
+
+@pytest.mark.parametrize("later", [False, True])
+def test_a_person_who_left_is_cleared_by_beams_without_return(later):
+    there = [short_scan(-2.0 + 0.05 * k, -2.0, person=True) for k in range(10)]
+    gone = [short_scan(-1.5 + 0.05 * k, -2.0) for k in range(70)]
+    assert states(there)(0.0, -0.15) == Occupancy.OCCUPIED
+    periods = [there, gone] if later else [there + gone]
+    *_, grid = cast_periods(periods, CONFIG)
+    cells = classify(grid, CONFIG)
+    column, row = (int(np.floor((v - o) / CELL_M)) for v, o in zip((0.0, 0.0), grid.origin_xy, strict=True))
+    assert (cells[row - 3 : row + 4, column - 3 : column + 4] == Occupancy.FREE).all()
+
+
+@pytest.mark.parametrize("later", [False, True])
+@pytest.mark.parametrize(("seen_from_m", "lost"), [(1.2, 0.0), (4.0, 0.05)], ids=["black", "lossy"])
+def test_a_wall_stays_whose_returns_are_missing_at_times(seen_from_m, lost, later):
+    """A black wall returns no beam from afar, where the robot is most of the time; or any beam may fail."""
+    near = [short_scan(-2.0 + 0.02 * k, 2.0, seen_from_m, lost, k) for k in range(200)]
+    far = [short_scan(-2.0 + 0.005 * k, 0.5, seen_from_m, lost, k) for k in range(800)]
+    *_, grid = cast_periods([near, far] if later else [near + far], CONFIG)
+    cells = classify(grid, CONFIG)
+    row, left, right = (
+        int(np.floor(v / CELL_M)) for v in (3.0 - grid.origin_xy[1], -2 - grid.origin_xy[0], 2 - grid.origin_xy[0])
+    )
+    assert (cells[row, left:right] == Occupancy.OCCUPIED).all()
+    assert not (cells[row + 1 :, left:right] == Occupancy.FREE).any()
+
+
+def test_the_grid_ends_where_beams_without_return_do():
+    room = room_scans(count=40)
+    lossy = [
+        scan._replace(ranges_m=np.where(np.arange(720) % 50 == k % 50, np.inf, scan.ranges_m).astype(np.float32))
+        for k, scan in enumerate(room)
+    ]
+    assert max(cast(lossy, CONFIG).hits.shape) <= max(cast(room, CONFIG).hits.shape) + 2
 
 
 def test_a_grid_too_large_gets_coarser_instead():

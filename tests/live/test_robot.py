@@ -254,10 +254,25 @@ def test_a_bare_corridor_is_told_once_to_a_robot_without_odometry():
     assert poses[-1].covariance[0, 0] > 3.0 * poses[-1].covariance[1, 1]
 
 
+def test_the_number_of_beams_may_vary_from_scan_to_scan():
+    """As of an RPLidar: one turn has a few beams more or less."""
+    laser = fcslam.LaserModel(360, -math.pi, math.tau / 360, 12.0)
+    truth = worlds.drive([(-2.0, -1.0), (1.5, -1.5), (1.5, 2.0)])
+    rng, found = np.random.default_rng(0), []
+    with fcslam.Robot("anna", laser, executor=SameThread()) as robot:
+        for k, pose in enumerate(truth):
+            beams = fcslam.LaserModel(count := 345 + k % 30, -math.pi, math.tau / count, 12.0)
+            (ranges,) = worlds.ranges(pose[None], worlds.room(), beams, 0.01, rng)
+            found.append(robot.add_scan(ranges, 0.1 * k, pose).T_map_base)
+    off = se2.between(se2.between(truth[0], truth[-1]), se2.between(found[0], found[-1]))
+    assert np.all(np.abs(off) < (0.03, 0.03, 0.01))
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"ranges_m": [1.0]}, r"ranges_m: shape \(1,\), but the laser has 180 beams"),
+        ({"ranges_m": [1.0]}, r"ranges_m: shape \(1,\), but the laser has about 180 beams"),
+        ({"ranges_m": np.ones(90)}, r"ranges_m: shape \(90,\), but the laser has about 180 beams"),
         ({"ranges_m": "far"}, "ranges_m: not an array of numbers"),
         ({"stamp": math.nan}, "stamp: nan is no time"),
         ({"odometry": (0.0, 0.0)}, "odometry: .* is not a pose"),

@@ -105,7 +105,7 @@ def test_a_finished_run_answers_as_the_service_does(shown):
     assert [(edit["kind"], edit["author"]) for edit in told["edits"]] == [("veto", "anna")]
     (apart,) = told["separations"]
     assert (apart["maps"], apart["explanation"]) == (
-        [0, 1], "map 0 (a, a+1) and map 1 (b): no two of their places look alike"
+        [0, 1], "map 0 (a, a+1) and map 1 (b): no two of their places look alike; drive b through a part of map 0"
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import pytest
 from fcslam.features.birdseye import BIRDSEYE, describe
 from fcslam.geometry import se2
 from fcslam.lidar.submap import build_submap
+from fcslam.lidar.verification import Gate, LooseGate, VerificationConfig
 from fcslam.places import motions
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.places.vocabulary import VocabularyConfig
@@ -99,6 +100,26 @@ def test_a_wrong_prediction_does_not_become_a_closure(visits):
     (match,) = matcher.match(visits.visit("b", 0, other_room(), POSE_B), {first.id: np.zeros(3)}, FRIENDS)
     assert not match.M
     assert match.reason.code is not ReasonCode.VERIFIED
+
+
+def test_a_known_start_needs_fewer_points(visits):
+    truth = se2.between(POSE_A, POSE_B)
+    first, second = visits.visit("a", 0, room(), POSE_A), visits.visit("b", 0, room(), POSE_B)
+    for count, is_match in ((700, True), (3000, False)):  # a third of them is enough
+        gates = VerificationConfig(strict=Gate(count=count), loose=LooseGate(count=count))
+        matcher = visits.matcher(verification=gates)
+        matcher.match(first, {}, STRANGERS)
+        found = matcher.match_at(second, {first.id: se2.compose(truth, (0.2, -0.2, 0.05))})
+        assert [match.M for match in found] == [True] * is_match
+        assert all(np.all(np.abs(se2.between(truth, match.T_i_j)) < (0.03, 0.03, 0.01)) for match in found)
+        assert not any(match.M for match in matcher.match(second, {}, STRANGERS))
+
+
+def test_a_known_start_makes_no_place_of_another_room(visits):
+    matcher = visits.matcher()
+    first = visits.visit("a", 0, room(), POSE_A)
+    matcher.match(first, {}, STRANGERS)
+    assert not matcher.match_at(visits.visit("c", 0, other_room(), POSE_B), {first.id: np.zeros(3)})
 
 
 def test_a_robot_alone_is_never_compared(visits):

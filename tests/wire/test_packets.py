@@ -130,7 +130,7 @@ def test_the_largest_packets_fit():
     keypoints = np.full((2048, 2), 327.67, np.float32)
     place = replace(LIDAR_PLACE, keypoints=keypoints, descriptors=np.full((2048, 32), 255, np.uint8))
     assert same(decode(encode(packet(place))).body, place)
-    ranges = np.resize(np.array([0.0, 131.07], np.float32), 4096)
+    ranges = np.resize(np.array([0.0, 131.068, np.inf], np.float32), 4096)
     keyscan = Keyscan(LIDAR_PLACE.id, 0.0, ranges)
     assert same(decode(encode(packet(keyscan))).body, keyscan)
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFile, Fusion, MissionSeed, NoFuse, PresetName, mission_config
+from fcslam.cli.mission_options import (
+    ConfigFile,
+    Fusion,
+    MissionSeed,
+    NoFuse,
+    PresetName,
+    Starts,
+    StartSigma,
+    mission_config,
+)
 from fcslam.cli.options import (
     Force,
     Quiet,
@@ -100,6 +109,8 @@ def map_recordings(
     laser_pose: LaserPose = None,
     cloud_band: CloudHeights = None,
     seed: MissionSeed = None,
+    start: Starts = None,
+    start_sigma: StartSigma = None,
     live: Live = False,
     port: Port = 0,
     open_browser: OpenBrowser = None,
@@ -124,7 +135,9 @@ def map_recordings(
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = None if onto is None else read_mission(onto)
-        settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier), preset)
+        settings = mission_config(
+            config, seed, no_fuse, fusion, continued_config(earlier), preset, start or (), start_sigma
+        )
         vetoes = read_vetoes(veto) if veto else ()
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
         if not logs and earlier is None:

@@ -1,5 +1,6 @@
 """Options that choose the configuration of a mission, and the configuration that follows from them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,6 +40,24 @@ Fusion = Annotated[
     ),
 ]
 
+Starts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--start",
+        metavar="NAME=X,Y,THETA",
+        help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
+        "forces nothing. Can be repeated.",
+    ),
+]
+StartSigma = Annotated[
+    str | None,
+    typer.Option(
+        metavar="M,RAD",
+        help="Standard deviations of the starts: of x and y, and of the heading.",
+        show_default=_FROM_CONFIG,
+    ),
+]
+
 
 def mission_config(
     file: Path | None,
@@ -47,12 +66,15 @@ def mission_config(
     fusion: FusionStrategy | None = None,
     default: "MissionConfig | None" = None,
     preset: Preset | None = None,
+    starts: Sequence[str] = (),
+    start_sigma: str | None = None,
 ) -> "MissionConfig":
     """The configuration in ``file`` over the preset, or else the default one, with the changes of the command line.
 
     Raises:
         ConfigError: the file cannot be read or is invalid, or options of the command line do not fit the rest.
     """
+    from fcslam.cli.recordings import pose
     from fcslam.config import changed, load
     from fcslam.errors import ConfigError
     from fcslam.mission import MissionConfig
@@ -64,6 +86,13 @@ def mission_config(
         raise ConfigError("--no-fuse fuses no maps, so --fusion has no effect; give only one of them")
     fleet: dict[str, object] = {"join_maps": False} if no_fuse else {}
     fleet |= {"fusion": fusion} if fusion is not None else {}
+    if starts:
+        named = [start.partition("=")[::2] for start in starts]
+        fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+        if len(dict(named)) < len(named):
+            raise ConfigError("--start: a robot is given two starts; give one for each")
+    if start_sigma is not None:
+        fleet["start_sigma"] = start_sigma.split(",")
     changes: dict[str, object] = {"fleet": fleet} if fleet else {}
     changes |= {"seed": seed} if seed is not None else {}
     return changed(config, changes, "the command line")

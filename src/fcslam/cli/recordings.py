@@ -185,5 +185,5 @@ def pose(option: str, text: str) -> tuple[float, float, float]:
     except ValueError:
         x = y = theta = math.nan
     if not all(map(math.isfinite, (x, y, theta))):
-        raise InputError(f"{option} {text!r} is no pose; give metres and radians, as in {option} 0.12,0,3.14")
+        raise InputError(f"{option} {text!r} is not a pose; give X,Y,THETA in metres and radians, as in 0.12,0,3.14")
     return x, y, theta

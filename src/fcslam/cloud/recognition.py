@@ -1,7 +1,8 @@
 """Place recognition of the fleet: which stored places may a new one show again, and which are kept."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,8 @@ class VocabularyState(NamedTuple):
 _VocabularyKey = tuple[Channel, str, str]
 """Channel, detector version and floor; places that differ in one of these are never compared."""
 
+START_SIGMAS = 3.0
+"""A closure within so many standard deviations of the known starts agrees with them."""
 _NO_PLACES = np.empty((0, 2), np.int64)
 
 
@@ -66,9 +69,12 @@ class PlaceRecognition:
         """
         key = self._key(place)
         matcher = self._matcher(key)
+        by_start = list(self._by_start(place, mates))
         matches = matcher.match(place, self._predicted(place, mates), _outside(mates))
         self._enter(key, place.id)
-        return matches
+        verified = {match.i for match in matches if match.M}
+        at_start = {match.i: match for match in by_start if match.i not in verified}
+        return [*(match for match in matches if match.i not in at_start), *at_start.values()]
 
     def thin(self, place: Place, mates: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
@@ -162,6 +168,37 @@ class PlaceRecognition:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits, self._closures_near(visits), NEAR_VISITS)
         return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
+
+    def _by_start(self, place: Place, mates: Collection[str]) -> Iterator[PlaceMatch]:
+        """Matches with places of other maps that agree with the known starts.
+
+        Starts so far apart that their headings leave open which of two separate places it is tell nothing.
+        """
+        starts, (sigma_m, sigma_rad), key = self._config.starts, self._config.start_sigma, self._key(place)
+        if place.id.robot not in starts:
+            return
+        T_start_place = self._from_start(place.id.robot, np.array([place.id.number]))[0]
+        for session in starts:
+            numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
+            T_starts = se2.between(starts[session], starts[place.id.robot])
+            within_m = START_SIGMAS * float(np.sqrt(2.0) * sigma_m + sigma_rad * np.hypot(*T_starts[:2]))
+            if session in mates or not len(numbers) or within_m > self._config.consistency.separation_m:
+                continue
+            T_start_i = dict(zip(numbers.tolist(), self._from_start(session, numbers), strict=True))
+            T_start_j = se2.compose(T_starts, T_start_place)
+            visits = visits_near(session, numbers, np.array([*T_start_i.values()]), T_start_j[:2], self._config.sight_m)
+            nearest = [visit.nearest for visit in sorted(visits, key=attrgetter("distance_m"))]
+            expected = {i: se2.between(T_start_i[i.number], T_start_j) for i in nearest[:NEAR_VISITS]}
+            for match in self._matcher(key).match_at(place, expected):
+                T_start_found = se2.compose(T_start_i[match.i.number], match.T_i_j)
+                off = se2.between(T_starts, se2.compose(T_start_found, se2.inverse(T_start_place)))
+                if np.hypot(off[0], off[1]) < within_m and abs(off[2]) < START_SIGMAS * np.sqrt(2.0) * sigma_rad:
+                    yield match
+
+    def _from_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:
+        """Poses (N, 3) of keyscans from the first one of their session."""
+        poses = self._graph.trajectory(session)
+        return se2.between(poses[0], poses[numbers])
 
     def _closures_near(self, visits: Mapping[str, Sequence[Visit]]) -> Counter[frozenset[str]]:
         """Number of accepted closures at the newest places of each robot's visits, by pair of robots."""

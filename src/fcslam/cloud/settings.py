@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.fusion_strategy import FusionStrategy
@@ -43,6 +43,14 @@ class FleetConfig(Settings):
         description="strain above which one of the robots of a map contradicts the others: the chi-square that "
         "closures between two robots, or the measurements of one, share with their neighbours along the path. It is "
         "below 0.03 for robots that measure correctly, also with noisy scanners",
+    )
+    starts: dict[str, tuple[float, float, float]] = Field(
+        default={},
+        description="where robots started, by their names: x and y [m] and theta [rad], in one frame. Closures that "
+        "agree with the starts of both robots pass the loose gate with a third of its points",
+    )
+    start_sigma: tuple[PositiveFloat, PositiveFloat] = Field(
+        default=(0.3, 0.1), description="standard deviations of the starts, [m] in x and y and [rad] in theta"
     )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")

@@ -1,6 +1,6 @@
 """The beams of a laser: whether a scan can be of it, and how many of them a map needs."""
 
-from math import degrees, pi, radians, remainder, tau
+from math import copysign, degrees, pi, radians, remainder, tau
 
 from fcslam.records import Beams, LaserModel
 
@@ -61,6 +61,20 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     if not (abs(first_rad) <= tolerance_rad and abs(last_rad) <= tolerance_rad):
         return f"it looks over {_view(beams)}, the laser over {_view(declared)}"
     return None
+
+
+def spread(count: int, declared: Beams) -> Beams:
+    """Beams of one scan of a laser, evenly over its field of view, where their number differs from the declared one.
+
+    Args:
+        count: their number, 2 or more.
+        declared: the beams that the laser was declared with.
+    """
+    increment_rad = declared.angle_increment_rad
+    tolerance_rad = max(SAME_VIEW_RAD, SAME_VIEW_BEAMS * abs(increment_rad))
+    if abs(declared.span_rad + increment_rad) > FULL_TURN_RAD - tolerance_rad:
+        return Beams(count, declared.angle_min_rad, copysign(FULL_TURN_RAD, increment_rad) / count)
+    return Beams(count, declared.angle_min_rad, declared.span_rad / (count - 1))
 
 
 def beam_step(beams: Beams) -> int:

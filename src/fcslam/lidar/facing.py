@@ -26,6 +26,8 @@ MOST_SCANS: Final = 3000
 """Scans that are read at most."""
 MOST_PAIRS: Final = 40
 """Pairs with a move that are compared, and as many with a turn."""
+SCANS_WATCHED: Final = 60
+"""Scans of a live laser that are compared."""
 FEWEST_PAIRS: Final = 10
 """Fewer pairs say nothing."""
 FEWEST_POINTS: Final = 20
@@ -71,6 +73,27 @@ class Contradiction(NamedTuple):
     """Mean agreement of the points with the odometry, 0 to 1, as the laser faces."""
     stated_agreement: float
     """The same with the stated mounting."""
+
+    def __str__(self) -> str:
+        """Why the mounting or the odometry cannot be right, and what to do."""
+        (turned_deg, upside_down, distance), claims = self.facing, []
+        if upside_down:
+            claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")
+        if turned_deg:
+            side = "left" if turned_deg > 0.0 else "right"
+            claims.append(f"the laser is turned by about {abs(turned_deg):.0f} deg to the {side} of what is stated")
+        if distance != 1.0:
+            claims.append(f"the robot's distance is {distance:.2f} of what odometry says")
+        remedy = (
+            "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the "
+            "odometry"
+            if distance == 1.0
+            else "correct the radius of the wheels in its driver"
+        )
+        return (
+            f"the scans contradict the odometry: {', and '.join(claims)} (then {100 * self.agreement:.0f} % of the "
+            f"points agree, and {100 * self.stated_agreement:.0f} % as stated); {remedy}"
+        )
 
 
 Pair = tuple[LaserScan, LaserScan]
@@ -118,6 +141,20 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated))
 
 
+class FacingWatch:
+    """Decides how a live laser faces, once its robot has moved enough."""
+
+    def __init__(self) -> None:
+        self._scans: list[LaserScan] = []
+
+    def add(self, scan: LaserScan) -> Contradiction | None:
+        """Add the next scan of the laser; returns a contradiction once."""
+        if len(self._scans) == SCANS_WATCHED or (self._scans and not any(_moved(self._scans[-1], scan))):
+            return None
+        self._scans.append(scan)
+        return contradicted_facing(self._scans) if len(self._scans) == SCANS_WATCHED else None
+
+
 class _Trial:
     """Pairs of scans on which mountings are compared; those with a turn count as much as those with a move."""
 
@@ -157,15 +194,21 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[Pair], list[Pair]]:
         if first is None or not 0.0 <= scan.stamp - first.stamp <= LONGEST_S:
             first = scan
             continue
-        x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
-        if abs(theta) > LEAST_TURN_RAD or math.hypot(x, y) > LEAST_MOVE_M:
-            pairs = turns if abs(theta) > LEAST_TURN_RAD else moves
+        has_moved, has_turned = _moved(first, scan)
+        if has_moved or has_turned:
+            pairs = turns if has_turned else moves
             if len(pairs) < MOST_PAIRS:
                 pairs.append((first, scan))
             first = scan
         if len(moves) == len(turns) == MOST_PAIRS:
             break
     return moves, turns
+
+
+def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
+    """Whether the robot has moved and turned enough between two scans."""
+    x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
+    return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
 
 
 def _agreement(pair: Pair, facing: Facing) -> float:

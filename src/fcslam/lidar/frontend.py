@@ -274,6 +274,6 @@ def least_sigmas(moved_m: float, turned_rad: float) -> tuple[float, float]:
 
 
 def _valid_ranges(ranges_m: Ranges, max_range_m: float) -> Ranges:
-    """Ranges of a keyscan, metres; invalid ones become 0."""
-    valid = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m < max_range_m)
+    """Ranges of a keyscan, metres, inf for no return; invalid ones become 0."""
+    valid = (ranges_m > 0.0) & (ranges_m < max_range_m) | np.isposinf(ranges_m)
     return frozen(np.where(valid, ranges_m, 0.0), np.float32)

@@ -7,6 +7,7 @@ cell, their counts are dropped. A cell that a period did not observe stays as it
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,9 @@ Counts = NDArray[np.uint32]
 CLEAR_RATIO = 0.05
 """Ratio of hits to passes up to which a period calls a cell free that was occupied. It is far below ``occupied_ratio``:
 beams that graze a wall hit its cells seldom, too."""
+SEEN_FARTHER = 1.25
+"""A beam without return says nothing about a surface that is farther than this many times the largest range at which
+others measured it."""
 FARTHEST_M = 1e7
 """Poses farther from the origin are refused: floats no longer resolve cells there."""
 
@@ -34,6 +38,13 @@ class OccupancyConfig(Settings):
     resolution_m: float = Field(default=0.05, ge=0.001, le=10.0, description="side of a cell [m]")
     usable_range_m: float = Field(
         default=30.0, gt=0, le=1000.0, description="longer beams clear cells up to this range and hit nothing [m]"
+    )
+    no_return_range_m: float = Field(
+        default=30.0,
+        ge=0,
+        le=1000.0,
+        description="beams that report no return (inf) clear cells up to this range, at most to the laser's maximum "
+        "[m]; 0: they clear none",
     )
     minimum_passes: int = Field(default=2, ge=1, description="least number of beams through a known cell")
     occupied_ratio: float = Field(
@@ -92,6 +103,8 @@ class _Beams(NamedTuple):
     max_range_m: float
 
 
+_UNCOUNTED = np.zeros((0, 0), np.uint32)
+_NOTHING = np.zeros((0, 0), np.bool_)
 _AT_ONCE = Sweep(0.0, 0.0)
 """A scan whose beams were all measured at the stamp."""
 
@@ -115,12 +128,17 @@ class _Counts(NamedTuple):
     """Scans with a beam through the cell; empty if they are not counted."""
     newest: Counts
     """The last of these scans, counted from 1; empty if scans are not counted."""
+    seen_from: NDArray[np.float32]
+    """Largest range, in cells, of a return in the cell or beside it, in all periods so far; empty if every beam has a
+    return."""
 
 
 def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
-    """Count hits and passes of all beams. Invalid ranges (0, not finite, at the maximum) add nothing.
+    """Count hits and passes of all beams. Invalid ranges (0, NaN, at the maximum) add nothing.
 
-    The grid spans all hits and all lasers; beams without a hit in usable range clear cells inside of it only.
+    The grid spans all hits, all lasers and what beams without return clear; longer beams clear cells inside of it only.
+    A beam without return (inf) ends at cells that remain occupied, and at those that others saw only from nearer, as
+    black surfaces and windows.
 
     Args:
         keyscans: the scans.
@@ -154,15 +172,20 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
         ValueError: as ``cast``.
     """
     groups = [_by_laser(keyscans) for keyscans in periods]
-    layout = _layout([beams for period in groups for beams in period], config)
-    shape, side = (layout.height, layout.width), layout.resolution_m
-    hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
-    uncounted = np.zeros((0, 0), np.uint32)
+    everything = [beams for period in groups for beams in period]
+    layout = _layout(everything, config)
+    is_open = config.no_return_range_m > 0.0 and any(np.isposinf(beams.ranges_m).any() for beams in everything)
+    if is_open:  # where the beams without return end is known only when they are cast
+        counts = _counts(layout, is_open)
+        _cast_all(everything, layout, config, counts)
+        layout = _trimmed(layout, counts.passes)
+    side, first = layout.resolution_m, _counts(layout, is_open)
+    hits, passes = first.hits, first.passes
     for number, period in enumerate(groups):
         if number == 0:
-            _cast_all(period, layout, config, _Counts(hits, passes, uncounted, uncounted))
+            _cast_all(period, layout, config, first)
         else:
-            counts = _Counts(*(np.zeros(shape, np.uint32) for _ in range(4)))
+            counts = _counts(layout, is_open, by_scan=True)._replace(seen_from=first.seen_from)
             _cast_all(period, layout, config, counts)
             _supersede(
                 hits, passes, counts, config.contradicting_scans, CLEAR_RATIO, config.occupied_ratio,
@@ -183,10 +206,20 @@ def _by_laser(keyscans: Sequence[Casting]) -> list[_Beams]:
 
 
 def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
-    first = 1
-    for beams in groups:
+    """Cast the beams with a return, then those without."""
+    numbered = list(zip(groups, accumulate((len(beams.ranges_m) for beams in groups), initial=1), strict=False))
+    for beams, first in numbered:
         _cast(beams, layout, config.usable_range_m, counts, first)
-        first += len(beams.ranges_m)
+    if not counts.seen_from.size:
+        return
+    # All beams without return together decide which cells stay occupied although such beams pass.
+    trial = counts._replace(passes=counts.passes.copy(), scans=_UNCOUNTED, newest=_UNCOUNTED)
+    occupied = np.zeros(counts.hits.shape, np.bool_)
+    for beams, first in numbered:
+        _clear(beams, layout, config.no_return_range_m, trial, first, occupied)
+    occupied = counts.hits > config.occupied_ratio * trial.passes
+    for beams, first in numbered:
+        _clear(beams, layout, config.no_return_range_m, counts, first, occupied)
 
 
 def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
@@ -216,7 +249,7 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams
 def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
     if not groups:
         return _Layout(config.resolution_m, 0, 0, 1, 1)
-    boxes = [_bounds(beams, config.usable_range_m) for beams in groups]
+    boxes = [_bounds(beams, config.usable_range_m, config.no_return_range_m) for beams in groups]
     low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
     resolution_m = config.resolution_m
     while True:
@@ -229,9 +262,25 @@ def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
         resolution_m *= 2.0
 
 
+def _counts(layout: _Layout, is_open: bool, by_scan: bool = False) -> _Counts:
+    """Zeros; ``is_open``: some beams have no return."""
+    shape, none = (layout.height, layout.width), (0, 0)
+    hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+    scans, newest = (np.zeros(shape if by_scan else none, np.uint32) for _ in range(2))
+    return _Counts(hits, passes, scans, newest, np.zeros(shape if is_open else none, np.float32))
+
+
+def _trimmed(layout: _Layout, passes: Counts) -> _Layout:
+    """The part of the grid that beams pass, with a cell to spare on each side, as at the margins of ``_layout``."""
+    rows, columns = (np.flatnonzero(passes.any(axis=axis)) for axis in (1, 0))
+    top, left = rows[0] - 1, columns[0] - 1
+    height, width = rows[-1] + 2 - top, columns[-1] + 2 - left
+    return _Layout(layout.resolution_m, layout.column + int(left), layout.row + int(top), int(width), int(height))
+
+
 @njit
-def _bounds(beams, usable):  # type: ignore[no-untyped-def]
-    """Lowest and highest (x, y) of the lasers and of all returns in usable range."""
+def _bounds(beams, usable, open_range):  # type: ignore[no-untyped-def]
+    """Lowest and highest (x, y) of the lasers, of all returns in usable range and of the beams without return."""
     reach = min(usable, beams.max_range_m)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in range(len(beams.ranges_m)):
@@ -239,6 +288,8 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
             x, y, dx, dy = _ray(beams, k, i)
             r = beams.ranges_m[k, i]
             reached = r if r > 0.0 and r < reach else 0.0  # 0 for NaN
+            if r == np.inf:
+                reached = min(open_range, beams.max_range_m)
             low[0], high[0] = min(low[0], x, x + reached * dx), max(high[0], x, x + reached * dx)
             low[1], high[1] = min(low[1], y, y + reached * dy), max(high[1], y, y + reached * dy)
     return low, high
@@ -266,15 +317,34 @@ def _cast(beams, layout, usable, counts, first):  # type: ignore[no-untyped-def]
             x0, y0 = x / layout.resolution_m - layout.column, y / layout.resolution_m - layout.row
             length = min(r, usable) / layout.resolution_m
             x1, y1 = x0 + length * dx, y0 + length * dy
-            if _traverse(x0, y0, x1, y1, counts, np.uint32(first + k)) and r < usable:
-                counts.hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
+            if _traverse(x0, y0, x1, y1, counts, np.uint32(first + k), _NOTHING) and r < usable:
+                column, row = int(np.floor(x1)), int(np.floor(y1))
+                counts.hits[row, column] += np.uint32(1)
+                if counts.seen_from.size > 0:
+                    around = counts.seen_from[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+                    for cell in np.ndindex(around.shape):
+                        around[cell] = max(around[cell], np.float32(length))
 
 
 @njit(allocates=False)
-def _traverse(x0, y0, x1, y1, counts, scan):  # type: ignore[no-untyped-def]
+def _clear(beams, layout, open_range, counts, first, occupied):  # type: ignore[no-untyped-def]
+    """Count the passes of the beams without return."""
+    length = min(open_range, beams.max_range_m) / layout.resolution_m
+    for k in range(len(beams.ranges_m)):
+        for i in range(len(beams.times_s)):
+            if beams.ranges_m[k, i] == np.inf:
+                x, y, dx, dy = _ray(beams, k, i)
+                x0, y0 = x / layout.resolution_m - layout.column, y / layout.resolution_m - layout.row
+                _traverse(x0, y0, x0 + length * dx, y0 + length * dy, counts, np.uint32(first + k), occupied)
+
+
+@njit(allocates=False)
+def _traverse(x0, y0, x1, y1, counts, scan, occupied):  # type: ignore[no-untyped-def]
     """Count a pass for each cell of a beam, including the first and the last; returns whether the last is in the grid.
 
-    Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987.
+    A beam without return stops before cells that are ``occupied`` or were seen only from nearer; that of a return has
+    an empty ``occupied``. Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray
+    tracing", 1987.
     """
     height, width = counts.passes.shape
     counts_scans = counts.scans.size > 0
@@ -286,6 +356,11 @@ def _traverse(x0, y0, x1, y1, counts, scan):  # type: ignore[no-untyped-def]
     per_y = 1.0 / (y1 - y0) if y1 != y0 else 0.0
     edge_x, edge_y = column + int(right) - x0, row + int(up) - y0
     while 0 <= column < width and 0 <= row < height:
+        if occupied.size > 0:
+            seen_from = counts.seen_from[row, column]
+            nearest = np.hypot(column + 0.5 - x0, row + 0.5 - y0) - 1.0
+            if occupied[row, column] or 0.0 < SEEN_FARTHER * seen_from < nearest:
+                return False
         counts.passes[row, column] += np.uint32(1)
         if counts_scans and counts.newest[row, column] != scan:
             counts.newest[row, column] = scan

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from fcslam.cloud.sessions import check_robot
 from fcslam.errors import InputError, PacketError
-from fcslam.geometry.beams import is_field_of_view
+from fcslam.geometry.beams import is_field_of_view, misfit, spread
 from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan, frozen
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
@@ -63,25 +63,30 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
     """A scan as a record; negative ranges are made invalid.
 
     Args:
-        ranges_m: shape (beam_count,).
+        ranges_m: shape (N,); N may vary from scan to scan, the field of view does not.
         stamp: checked, seconds.
         T_odom_base: checked, shape (3,).
         laser: the laser.
 
     Raises:
-        InputError: the ranges are no numbers, or not as many as the laser has beams.
+        InputError: the ranges are no numbers, or not as many as the laser can have beams.
     """
     try:
         ranges = np.array(ranges_m, np.float32)
     except (TypeError, ValueError) as error:
         raise InputError(f"ranges_m: not an array of numbers ({error})") from error
+    beams = laser.beams
     if ranges.shape != (laser.beam_count,):
-        raise InputError(
-            f"ranges_m: shape {ranges.shape}, but the laser has {laser.beam_count} beams; give one range for each"
-        )
+        is_row = ranges.ndim == 1 and len(ranges) >= 2
+        beams = spread(len(ranges), laser.beams) if is_row else beams
+        if not is_row or misfit(beams, laser.beams) is not None:
+            raise InputError(
+                f"ranges_m: shape {ranges.shape}, but the laser has about {laser.beam_count} beams; give one range for "
+                "each"
+            )
     ranges[ranges < 0.0] = np.nan
     ranges.setflags(write=False)
-    return LaserScan(stamp, ranges, laser, T_odom_base)
+    return LaserScan(stamp, ranges, laser.with_beams(beams), T_odom_base)
 
 
 def checked_camera(camera: CameraModel | None) -> CameraModel | None:

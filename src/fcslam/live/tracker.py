@@ -4,6 +4,7 @@ import logging
 import math
 import threading
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.errors import InputError
+from fcslam.lidar.facing import FacingWatch
 from fcslam.live.inputs import Lasers, checked_lasers, checked_pose, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
 from fcslam.mission import MissionConfig
@@ -54,6 +56,8 @@ class LiveTracker(ABC):
         self._determined_s = -math.inf
         """Stamp of the newest scan that fixed the position; infinity after the event that none does."""
         self._is_finished = False
+        self._facing: defaultdict[tuple[float, float, float], FacingWatch] = defaultdict(FacingWatch)
+        """By the mounting of a laser."""
         self._told: set[str] = set()
         """Failures that were reported."""
 
@@ -83,8 +87,9 @@ class LiveTracker(ABC):
         """Localize the next scan.
 
         Args:
-            ranges_m: metres, shape (beam_count,). NaN or negative: invalid; inf, or at least ``max_range_m``: no
-                return.
+            ranges_m: metres, one for each beam. NaN, negative, or at least ``max_range_m``: invalid; inf: no return,
+                which clears the floor. If their number varies from scan to scan, they are spread over the laser's field
+                of view.
             stamp: seconds. It may step back by 2 s at most, as clocks of several sensors disagree.
             odometry: pose (x, y, theta) of ``base`` by wheel odometry at the stamp, metres and radians; its origin does
                 not matter. None for all scans: there is no odometry, and scan matching alone gives the motion; an event
@@ -167,6 +172,8 @@ class LiveTracker(ABC):
             self._tell_undetermined(pose)
         if self._frontend.odometry_fault is not None:
             self._tell_failure(f"the odometry {self._frontend.odometry_fault}; scan matching alone gives the motion")
+        if (found := self._facing[scan.laser.T_base_laser].add(scan)) is not None:
+            self._tell_failure(f"{found}; not corrected")
         self._tell()
         return pose
 

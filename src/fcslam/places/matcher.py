@@ -6,7 +6,7 @@ the overlap of the two submaps under this motion decides. To the letter of the p
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple, Self
 
@@ -27,6 +27,8 @@ from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, ReasonCode, frozen
 from fcslam.storage.state_file import State
 
+START_SHARE = 1.0 / 3.0
+"""Share of the points of the loose gate that is enough where known starts predict a closure."""
 NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
 
 
@@ -221,6 +223,24 @@ class PlaceMatcher:
         self._backlog.append(place)
         self._forget_oldest()
         return matches
+
+    def match_at(self, place: Place, expected: Mapping[KeyscanId, FloatArray]) -> list[PlaceMatch]:
+        """The stored places that a new place overlaps about where known starts of their robots put it.
+
+        Args:
+            place: the new place, j, which is not stored here.
+            expected: T_i_j, shape (3,), of the stored places i; forgotten places are ignored.
+        """
+        kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
+        pairs = [self._pair(self._places[i], place, T_i_j, NO_PRIOR) for i, T_i_j in kept]
+        loose = self._config.verification.loose
+        fewer = loose.model_copy(update={"count": round(START_SHARE * loose.count)})
+        checks = self._verify_pairs(pairs, self._config.verification.model_copy(update={"loose": fewer}))
+        matches = [
+            PlaceMatch.verified(i, place.id, place.channel, 0.0, check, predicted=True)
+            for (i, _), check in zip(kept, checks, strict=True)
+        ]
+        return [replace(match, predicted=False) for match in matches if match.M]
 
     def _similar(
         self, place: Place, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]

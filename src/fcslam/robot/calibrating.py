@@ -38,6 +38,8 @@ corrected."""
 LEAST_SCALE: Final = 0.01
 LEAST_SHARE: Final = 0.1
 """Smaller differences from what the bag says are not corrected."""
+SHORT_SHARE: Final = 0.2
+"""Beams that are said to take a smaller share of this time may take longer."""
 AT_ONCE_SHARE: Final = 0.15
 """Beams that take a smaller share of the time between scans are measured at once."""
 WHOLE_SHARE: Final = 0.05
@@ -65,7 +67,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     contradictions = [_contradiction_of(bag, laser) for laser in bag.survey().lasers]
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
-        lines = (f"{laser.name}: {_facing_line(found)}; not corrected" for laser, found in named if found)
+        lines = (f"{laser.name}: {found}; not corrected" for laser, found in named if found)
         return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
     found = contradictions[0]
     if found is None:
@@ -73,7 +75,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     turned_deg, upside_down, distance = found.facing
     if distance != 1.0:
         fine = _calibrate_finely(bag, config)
-        lines_before = () if fine.calibration.distance_scale else (_facing_line(found),)
+        lines_before = () if fine.calibration.distance_scale else (str(found),)
         return replace(fine, lines=(*lines_before, *fine.lines))
     T_base_laser = np.array(bag.survey().lasers[0].T_base_laser)
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
@@ -83,33 +85,12 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
     done = "--laser-pose is kept" if bag.has_given_pose else "corrected"
     correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
-    return Calibrated(fine.calibration, correction, (f"{_facing_line(found)}; {done}", *fine.lines))
+    return Calibrated(fine.calibration, correction, (f"{found}; {done}", *fine.lines))
 
 
 def _contradiction_of(bag: RosBag, laser: LaserModel) -> Contradiction | None:
     scans = (record for record in bag.records() if isinstance(record, LaserScan))
     return contradicted_facing(scan for scan in scans if is_same_laser(scan.laser, laser))
-
-
-def _facing_line(found: Contradiction) -> str:
-    """Why the mounting or the odometry cannot be right, and what to do."""
-    (turned_deg, upside_down, distance), claims = found.facing, []
-    if upside_down:
-        claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")
-    if turned_deg:
-        side = "left" if turned_deg > 0.0 else "right"
-        claims.append(f"the laser is turned by about {abs(turned_deg):.0f} deg to the {side} of what is stated")
-    if distance != 1.0:
-        claims.append(f"the robot's distance is {distance:.2f} of what odometry says")
-    remedy = (
-        "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the odometry"
-        if distance == 1.0
-        else "correct the radius of the wheels in its driver"
-    )
-    return (
-        f"the scans contradict the odometry: {', and '.join(claims)} (then {100 * found.agreement:.0f} % of the points "
-        f"agree, and {100 * found.stated_agreement:.0f} % as stated); {remedy}"
-    )
 
 
 def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
@@ -131,7 +112,7 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
-    found = _corrected(calibration, assumed, bag.stream.states_sweep)
+    found = _corrected(calibration, assumed, _stated_share(bag.stream.stated_sweep, assumed_s))
     sweep = found.correction.sweep
     if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
         found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
@@ -184,7 +165,7 @@ def _tracked(
             continue
         if len(stamps) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break
-        beams = Sweep(0.0, assumed_s) if record.sweep is None else Sweep(record.sweep.first_s, record.sweep.last_s)
+        beams = Sweep(*_times(record.sweep, assumed_s))
         scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
         tracked = frontend.localize(scan)
         frontend.process(scan, tracked)
@@ -200,6 +181,23 @@ def _tracked(
     first_s, last_s = np.array(times).reshape(-1, 2).T
     motions = ScanMotions(np.array(stamps), np.array(poses).reshape(-1, 3), np.array(turned), first_s, last_s)
     return motions, _track_of(odometry)
+
+
+def _times(stated: Sweep | None, assumed_s: float) -> tuple[float, float]:
+    """Times of the first and the last beam with which a scan is tracked.
+
+    Some drivers state times that are far too short, which say as little as none.
+    """
+    is_said = stated is not None and abs(stated.last_s - stated.first_s) > SHORT_SHARE * assumed_s
+    return (stated.first_s, stated.last_s) if stated is not None and is_said else (0.0, assumed_s)
+
+
+def _stated_share(stated: Sweep | None, assumed_s: float) -> float:
+    """The stated duration of a scan per duration with which it is tracked."""
+    if stated is None:
+        return 0.0
+    first_s, last_s = _times(stated, assumed_s)
+    return (stated.last_s - stated.first_s) / (last_s - first_s)
 
 
 def _track_of(odometry: list[Odometry]) -> OdometryTrack | None:
@@ -221,19 +219,19 @@ def _unwrapped(poses: FloatArray) -> FloatArray:
     return known
 
 
-def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], states_sweep: bool) -> Calibrated:
+def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nominal: float) -> Calibrated:
     """The significant estimates as a correction and in words.
 
     Args:
         calibration: the estimates.
         assumed: times of the first and the last beam after the stamp with which the scans were tracked, seconds.
-        states_sweep: whether the bag says these times; otherwise it says that all beams are measured at once.
+        nominal: duration of a scan as the bag states it, per assumed duration; 0: all beams at once.
     """
     if calibration.mounting is not None:
         x, y, _ = calibration.mounting
         if math.hypot(x.value, y.value) > LARGEST_OFFSET_M:
             return Calibrated(calibration, BagCorrection(), ())
-    share, nominal = _share(calibration), 1.0 if states_sweep else 0.0
+    share = _share(calibration)
     is_late = calibration.delay is not None and calibration.delay.differs(0.0, LEAST_DELAY_S)
     is_other = share is not None and share.differs(nominal, LEAST_SHARE)
     if not is_late and not is_other:
@@ -278,9 +276,15 @@ def _stamped(first_s: float, last_s: float) -> str | None:
 
 
 def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: list[str]) -> Calibrated:
-    for name, scale in (("distance", calibration.distance_scale), ("turn", calibration.turn_scale)):
+    for name, scale, what in (
+        ("distance", calibration.distance_scale, "radius"),
+        ("turn", calibration.turn_scale, "distance"),
+    ):
         if scale is not None and scale.differs(1.0, 5.0 * LEAST_SCALE):
-            lines.append(f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f})")
+            lines.append(
+                f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); correct the "
+                f"{what} of the wheels in its driver"
+            )
     if calibration.mounting is None:
         return Calibrated(calibration, correction, tuple(lines))
     x, y, yaw = calibration.mounting

@@ -26,7 +26,7 @@ class MappedScans:
         """The scan as it is mapped.
 
         Its ranges, shape (mapped beams,), metres, are those of the wire, so that robot and cloud see the same numbers.
-        A missing return and an invalid range are 0.
+        No return is inf; an invalid range, or one at the maximum, is 0.
         """
         index = self._lasers.index(scan.laser)
         step = beam_step(self._lasers.known[index].beams)
@@ -53,9 +53,10 @@ def _mapped_sweep(sweep: Sweep, beam_count: int, step: int) -> Sweep:
 
 
 def _returns(ranges_m: Ranges, max_range_m: float) -> Ranges:
-    """The ranges below the maximum, and 0 for the others, shape (N,), metres.
+    """The ranges below the maximum, inf for no return, and 0 for the others, shape (N,), metres.
 
     The maximum is rounded as the ranges are: 5.6 m in single precision is below 5.6 m, and it is no return. It is
     compared before the ranges are rounded to the steps of the wire, which may take it below the maximum as well.
     """
-    return np.where(ranges_m < np.float32(max_range_m), ranges_m, np.float32(0.0))
+    is_known = (ranges_m < np.float32(max_range_m)) | np.isposinf(ranges_m)
+    return np.where(is_known, ranges_m, np.float32(0.0))

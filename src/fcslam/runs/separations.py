@@ -1,8 +1,10 @@
 """Why maps of a run are separate: for every two maps, the closures between them and the binding reason."""
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
+
+import numpy as np
 
 from fcslam.records import ClosureStatus, Reason, ReasonCode
 from fcslam.runs.folder import Run
@@ -16,8 +18,14 @@ _GATES = (
     ReasonCode.LITTLE_OVERLAP,
 )
 """Tests of verification in their order: a candidate that fails a later one came closer."""
-
-
+_FINAL = (
+    ReasonCode.MAPS_CONTRADICT,
+    ReasonCode.PATHS_CONTRADICT,
+    ReasonCode.SEPARATED,
+    ReasonCode.FALSE_BRIDGE,
+    ReasonCode.VETOED,
+)
+"""More drives do not help against these."""
 _JOINS_NONE = "\n  join_maps: false\n"
 """Line of the configuration ``fleet.join_maps``, as ``fcslam.config.dump`` writes it."""
 
@@ -35,14 +43,20 @@ class Separation:
     """Closures between the maps that passed it."""
     reason: Reason | None
     """The condition that keeps the maps apart; None if no two of their places are similar."""
+    near: tuple[float, float] | None = None
+    """Where a closure that failed by it ends in the first map, metres."""
 
     def __str__(self) -> str:
         first, second = (f"map {k} ({', '.join(robots)})" for k, robots in zip(self.maps, self.robots, strict=True))
+        apart, driver = f"{first} and {second}", self.robots[1][0]
         if self.reason is None:
-            return f"{first} and {second}: no two of their places look alike"
-        if self.verified:
-            return f"{first} and {second}: {_count(self.verified, 'verified closure')}, but {self.reason}"
-        return f"{first} and {second}: {_count(self.candidates, 'candidate')}, none verified: {self.reason}"
+            return f"{apart}: no two of their places look alike; drive {driver} through a part of map {self.maps[0]}"
+        has = _count(self.verified, "verified closure") if self.verified else _count(self.candidates, "candidate")
+        why = f"{apart}: {has}, {'but' if self.verified else 'none verified:'} {replace(self.reason, setting='')}"
+        if self.near is None or self.reason.code in _FINAL:
+            return why
+        x, y = self.near
+        return f"{why}; drive {driver} through map {self.maps[0]} around ({x:.1f}, {y:.1f}) again, and beyond"
 
 
 def separations(run: Run) -> list[Separation]:
@@ -58,32 +72,39 @@ def separations(run: Run) -> list[Separation]:
         ends = {run.trajectories[robot].map_index for robot in (closure.robot_i, closure.robot_j)}
         between[tuple(sorted(ends))].append(closure)
     return [
-        _separation((a, b), (tuple(members[a]), tuple(members[b])), between[a, b])
+        _separation(run, (a, b), (tuple(members[a]), tuple(members[b])), between[a, b])
         for a, b in combinations(sorted(members), 2)
         if floors[a] == floors[b]
     ]
 
 
 def _separation(
-    maps: tuple[int, int], robots: tuple[tuple[str, ...], tuple[str, ...]], closures: list[ClosureRow]
+    run: Run, maps: tuple[int, int], robots: tuple[tuple[str, ...], tuple[str, ...]], closures: list[ClosureRow]
 ) -> Separation:
     verified = [closure for closure in closures if closure.status is not ClosureStatus.CANDIDATE]
     candidates = len(closures) - len(verified)
-    reason = _reason_of_verified(verified) if verified else _reason_of_candidates(closures)
-    return Separation(maps, robots, candidates, len(verified), reason)
+    if not closures:
+        return Separation(maps, robots, 0, 0, None)
+    closure = _typical(verified) if verified else min(closures, key=lambda each: _distance(each.reason))
+    return Separation(maps, robots, candidates, len(verified), closure.reason, _end_in(run, closure, robots[0]))
 
 
-def _reason_of_verified(closures: list[ClosureRow]) -> Reason:
-    """The most frequent reason of the two robots with the most verified closures."""
+def _end_in(run: Run, closure: ClosureRow, robots: tuple[str, ...]) -> tuple[float, float]:
+    """Position of the closure's end on the path of one of the robots."""
+    ends = ((closure.robot_i, closure.stamp_i), (closure.robot_j, closure.stamp_j))
+    robot, stamp = next(end for end in ends if end[0] in robots)
+    path = run.trajectories[robot]
+    x, y, _ = path.T_map_base[int(np.argmin(np.abs(path.stamps - stamp)))].tolist()
+    return x, y
+
+
+def _typical(closures: list[ClosureRow]) -> ClosureRow:
+    """The first with the most frequent reason, of the two robots with the most closures."""
     pairs = Counter(frozenset((closure.robot_i, closure.robot_j)) for closure in closures)
     strongest = pairs.most_common(1)[0][0]
-    reasons = Counter(closure.reason for closure in closures if {closure.robot_i, closure.robot_j} == strongest)
-    return reasons.most_common(1)[0][0]
-
-
-def _reason_of_candidates(closures: list[ClosureRow]) -> Reason | None:
-    """The reason of the candidate that came closest to being verified."""
-    return min((closure.reason for closure in closures), key=_distance, default=None)
+    between = [closure for closure in closures if {closure.robot_i, closure.robot_j} == strongest]
+    reason = Counter(closure.reason for closure in between).most_common(1)[0][0]
+    return next(closure for closure in between if closure.reason == reason)
 
 
 def _distance(reason: Reason) -> tuple[int, float]:

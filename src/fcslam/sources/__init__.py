@@ -3,7 +3,7 @@
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.faults import Fault, FaultCount, Faults
-from fcslam.sources.formats import FORMATS, Format, open_fleet, open_source
+from fcslam.sources.formats import FORMATS, Format, check_copies, open_fleet, open_source
 from fcslam.sources.logs.carmen_writer import write_carmen
 from fcslam.sources.recording.reader import Recording
 from fcslam.sources.recording.writer import RecordingWriter, write_recording
@@ -24,6 +24,7 @@ __all__ = [
     "ScanRange",
     "Source",
     "Survey",
+    "check_copies",
     "open_fleet",
     "open_source",
     "split",

@@ -1,11 +1,13 @@
 """The known formats of recordings, and opening a recording by its content."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 from fcslam.errors import SourceError
+from fcslam.records import LaserScan
 from fcslam.sources.bags.container import ZSTD, is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag, as_fleet
@@ -21,6 +23,7 @@ from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
 
 _BAG = "ROS bag"
+_SCANS_COMPARED = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +87,25 @@ def open_fleet(
 def _is_same(a: Path, b: Path) -> bool:
     """Whether two recordings have the same files."""
     return [part.resolve() for part in parts_of(a)] == [part.resolve() for part in parts_of(b)]
+
+
+def check_copies(sources: Sequence[Source]) -> None:
+    """Refuse a recording that is there twice, whatever the names and formats of its files are.
+
+    Raises:
+        SourceError: two recordings have the same scans.
+    """
+    known: dict[tuple[int, float, float], Source] = {}
+    for source in sources:
+        survey = source.survey()
+        other = known.setdefault((survey.scan_count, survey.duration_s, survey.path_length_m), source)
+        if other is not source and _first_scans(other) == _first_scans(source):
+            raise SourceError(f"{source.name} and {other.name} are copies of one recording; give each recording once")
+
+
+def _first_scans(source: Source) -> list[tuple[float, bytes]]:
+    scans = (record for record in source.records() if isinstance(record, LaserScan))
+    return [(scan.stamp, scan.ranges_m.tobytes()) for scan in islice(scans, _SCANS_COMPARED)]
 
 
 def robot_in(path: Path) -> tuple[Path, str | None]:

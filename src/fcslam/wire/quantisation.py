@@ -14,20 +14,25 @@ from fcslam.wire.streams import KeypointCodes, RangeCodes
 
 RANGE_STEP_M = 0.002
 """Rounding adds a standard deviation of 0.6 mm to the 10-30 mm of a 2D LiDAR; 16 bits then reach 131 m."""
-MAXIMUM_RANGE_M = 65535 * RANGE_STEP_M
+_NO_RETURN = 65535
+MAXIMUM_RANGE_M = (_NO_RETURN - 1) * RANGE_STEP_M
 KEYPOINT_STEP_M = 0.01
 MAXIMUM_KEYPOINT_M = 32767 * KEYPOINT_STEP_M
 
 _RANGE_OF_CODE = (RANGE_STEP_M * np.arange(65536)).astype(np.float32)
+_RANGE_OF_CODE[_NO_RETURN] = np.inf
 _UPPER_TRIANGLE = np.array([0, 1, 2, 4, 5, 8])
 _MIRROR = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 
 
 def quantise(ranges_m: ArrayLike) -> RangeCodes:
-    """Ranges (N,) in metres as steps of 2 mm (N,); 0 for no return (NaN, infinite, not positive, over 131.07 m)."""
+    """Ranges (N,) in metres as steps of 2 mm (N,).
+
+    65535 stands for no return (inf), 0 for an invalid range (NaN, not positive, over 131.068 m).
+    """
     ranges = np.asarray(ranges_m, dtype=np.float64)
     steps = np.where((ranges > 0.0) & (ranges < MAXIMUM_RANGE_M + RANGE_STEP_M / 2), ranges, 0.0) / RANGE_STEP_M
-    return np.rint(steps).astype(np.uint16)
+    return np.where(np.isposinf(ranges), _NO_RETURN, np.rint(steps)).astype(np.uint16)
 
 
 def dequantise(codes: RangeCodes) -> Ranges:

@@ -49,7 +49,7 @@ _NEIGHBOURS: Final = _STATES**5
 
 
 def pack_ranges(codes: RangeCodes) -> bytes:
-    """Encode ranges (N,) in steps of 2 mm, 0 for no return."""
+    """Encode ranges (N,) in steps of 2 mm, 0 for an invalid one."""
     return _pack(codes.astype("<u2").tobytes(), _code_ranges, codes.astype(np.int64))
 
 
@@ -185,7 +185,7 @@ def _unpack(data: bytes, plain: int, what: str, code: Callable[..., Coder], *con
 
 @njit(nogil=True)
 def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Coder:
-    """Code whether each range is a return, in the context of the beam before, and its difference from the last one."""
+    """Code whether each range is valid, in the context of the beam before, and its difference from the last one."""
     model = fresh_model(2 + CONTEXTS_OF_NUMBER)
     last, none = np.int64(0), 0
     for k in range(len(codes)):

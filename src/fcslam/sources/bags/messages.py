@@ -1,7 +1,7 @@
 """Converts the messages of a bag and checks them; invalid messages raise ValueError."""
 
 from collections.abc import Callable, Iterator
-from math import degrees, inf, isfinite, nan, radians, remainder
+from math import degrees, isfinite, nan, radians, remainder
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,12 +142,12 @@ def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: 
 def measured_ranges(scan: ScanMessage) -> Ranges:
     """Ranges of a scan by REP 117, metres, shape (beam_count,).
 
-    At or beyond the maximum: inf (no return). Below the minimum or not a number: NaN (invalid).
+    inf: no return. A number that is not between the limits: NaN (invalid). Drivers that send the maximum, or more,
+    for no return send it for faults, too.
     """
     raw = scan.raw_ranges_m
-    ranges: Ranges = np.where(raw >= np.float32(scan.range_max_m), np.float32(inf), raw)
-    ranges[~(raw >= np.float32(scan.range_min_m))] = np.nan
-    return ranges
+    is_known = (raw >= np.float32(scan.range_min_m)) & (raw < np.float32(scan.range_max_m)) | np.isposinf(raw)
+    return np.where(is_known, raw, np.float32(nan))
 
 
 def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from itertools import islice
-from math import tau
+from math import degrees, tau
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,7 +35,7 @@ from fcslam.sources.bags.messages import (
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry, without_odometry
 from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
-from fcslam.sources.bags.sectors import SectorJoiner, are_sectors
+from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad
 from fcslam.sources.bags.topics import Candidates, Topics, calibration_beside, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
@@ -188,6 +188,12 @@ class BagStream:
                 f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read"
                 f"{self._reason(topic)}; correct the laser's driver, or copy the bag again"
             )
+        sector_rad = None if topic.type in LASER_SCANS else cloud_sector_rad(scans)
+        if sector_rad is not None:
+            raise SourceError(
+                f"{self.path}: each cloud of {topic.name} is a sector of about {degrees(sector_rad):.0f} deg; let the "
+                "driver publish whole turns, or record its laser scans"
+            )
         is_in_sectors = are_sectors(scans)
         if is_in_sectors:
             joiner = SectorJoiner()
@@ -291,10 +297,10 @@ class BagStream:
         return scan._replace(sweep=Sweep(*times) if times[0] != times[1] else None)
 
     @property
-    def states_sweep(self) -> bool:
-        """Whether the messages of the first laser say when the beams are measured."""
+    def stated_sweep(self) -> Sweep | None:
+        """When the beams are measured by a message of the first laser, if it says so."""
         first = self.lasers[0].first
-        return first.sweep is not None and first.ranges_at_stamp is None
+        return first.sweep if first.ranges_at_stamp is None else None
 
     @cached_property
     def odometry(self) -> "OdometryInput | None":

@@ -79,8 +79,12 @@ def choose_topics(
     """
     heard, scans = _heard(robot), _scans(robot)
     if not scans:
+        packed = [topic.name for topic in heard if topic.type == COMPRESSED_IMAGE and is_depth(topic.name)]
+        remedy = "record them"
+        if packed:
+            remedy = f"the compressed depth images of {packed[0]} are not read, record {packed[0].rpartition('/')[0]}"
         raise SourceError(
-            f"{robot.bag.path}: no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images; record them; "
+            f"{robot.bag.path}: no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images; {remedy}; "
             f"{_known(robot.topics)}"
         )
     readable = [*scans, *_images(robot)]

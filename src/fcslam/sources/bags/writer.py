@@ -188,8 +188,7 @@ class _Bag:
 
     def _scan(self, header: Any, scan: LaserScan) -> Any:
         count, first_rad, increment_rad = scan.laser.beams
-        last_rad, far_m = first_rad + scan.laser.beams.span_rad, scan.laser.max_range_m
-        ranges_m = np.where(scan.ranges_m >= far_m, np.float32(np.inf), scan.ranges_m)
+        last_rad, ranges_m = first_rad + scan.laser.beams.span_rad, scan.ranges_m
         beam_s = 0.0 if scan.sweep is None else scan.sweep.duration_s / (count - 1)
         if scan.sweep is not None and scan.sweep.last_s < scan.sweep.first_s:
             first_rad, last_rad, increment_rad, ranges_m = last_rad, first_rad, -increment_rad, ranges_m[::-1]
@@ -202,7 +201,7 @@ class _Bag:
             time_increment=beam_s,
             scan_time=count * beam_s,
             range_min=0.0,
-            range_max=far_m,
+            range_max=scan.laser.max_range_m,
             ranges=np.ascontiguousarray(ranges_m),
             intensities=np.zeros(0, dtype=np.float32),
         )

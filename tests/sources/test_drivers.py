@@ -1,0 +1,324 @@
+"""Recordings with the conventions of drivers: the path is right, or a line says why not."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.geometry import se2
+from fcslam.lidar.frontend import LidarConfig
+from fcslam.metrics.trajectory import align
+from fcslam.robot.calibrating import calibrated
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.sources import open_source
+from tests.robot import spinning
+from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
+from tests.sources.clouds import Measured, cloud, header, plan_ranges, rotation, said, xyz
+from tests.sources.clouds import spinning as spinning_cloud
+
+START, SCANS = 1_700_000_000.0, 90
+TICKS = np.arange(0.0, 20.0, 0.01)
+POSES = spinning.pose_at(TICKS) - (0.0, 0.5, 0.0)
+NAN, INF = math.nan, math.inf
+
+
+class Scanner(NamedTuple):
+    """How a 2D scanner measures, and what its driver says."""
+
+    beams: int = 360
+    first_rad: float = -math.pi
+    step_deg: float = 1.0
+    """Between the beams, in the order of the message."""
+    hz: float = 10.0
+    turns_s: float | None = None
+    """Time from the first beam of the message to the last; below 0: the last one is measured first."""
+    stated_s: float | None = None
+    """The same as the message says; None: as it is."""
+    stamped: float = 0.0
+    """When the stamp is, in shares of a turn after its begin."""
+    reach_m: float = 12.0
+    nothing: float = INF
+    """What the driver sends without a return."""
+    shortest_m: float = 0.1
+    range_max: float | None = None
+    grid_m: float = 0.001
+    noise_m: float = 0.005
+    yaw_rad: float = 0.0
+    """Of the laser, in tf."""
+    roll_rad: float = 0.0
+    varies: int = 0
+    """Beams by which the scans differ."""
+    unit: float = 1.0
+    frame: str = "laser"
+    line: str = ""
+    """What is said of it."""
+
+
+def pose_at(times):
+    """A winding drive in the room."""
+    return np.stack([np.interp(times, TICKS, axis) for axis in POSES.T], axis=-1)
+
+
+def scans_of(its: Scanner):
+    rng = np.random.default_rng(1)
+    period = 1.0 / its.hz
+    duration = its.turns_s or 0.0
+    for number in range(SCANS):
+        count = its.beams + int(rng.integers(-its.varies, its.varies + 1)) if its.varies else its.beams
+        step = math.radians(its.step_deg) * its.beams / count
+        begin = number * period
+        share = np.arange(count) / (count - 1)
+        times = begin + np.abs(duration) * (share if duration >= 0.0 else 1.0 - share)
+        angles = its.first_rad + step * np.arange(count)
+        x, y, heading = pose_at(times).T
+        at = x + 0.12 * np.cos(heading), y + 0.12 * np.sin(heading)
+        seen = plan_ranges(*at, heading + its.yaw_rad + (-angles if its.roll_rad else angles))
+        seen = np.round((seen + rng.normal(0.0, its.noise_m, count)) / its.grid_m) * its.grid_m
+        ranges = np.where(seen < its.reach_m, its.unit * seen, its.nothing)
+        stated = duration if its.stated_s is None else its.stated_s
+        farthest = its.reach_m if its.range_max is None else its.range_max
+        yield scan(
+            START + begin + its.stamped * period, ranges, frame=its.frame, angle_min=its.first_rad,
+            angle_increment=step, range_min=its.shortest_m, range_max=farthest,
+            time_increment=stated / (count - 1), bag_time=START + begin + period,
+        )  # fmt: skip
+
+
+def readings(seconds, every_s=0.08, late_s=0.0, scale=1.0):
+    for t in np.arange(0.0, seconds + 0.5, every_s).tolist():
+        x, y, heading = pose_at(t)
+        yield odom(START + t + late_s, (scale * x, scale * y, heading), bag_time=START + t)
+
+
+def recording(its: Scanner) -> list[Said]:
+    mounting = tf(
+        START, "base_link", its.frame, (0.12, 0.0, 0.2), quaternion(its.yaw_rad, its.roll_rad), topic="/tf_static"
+    )
+    return [mounting, *readings(SCANS / its.hz), *scans_of(its)]
+
+
+def outcome(path, options=None):
+    """The lines that are said, and the error of the path in metres, or None if it is refused."""
+    try:
+        source = calibrated(open_source(path, options), LidarConfig())
+        frontend = RobotFrontend("r", RobotConfig())
+        for record in source.records():
+            frontend.process(record)
+        notes = " ".join(source.survey().notes)
+    except SourceError as error:
+        return str(error), None
+    frontend.finish()
+    (track,) = frontend.tracks
+    stamps = np.array(track.stamps) - START
+    true, estimated = pose_at(stamps), track.T_odom_base()
+    off = se2.compose(align(true, estimated), estimated) - true
+    return notes, float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
+
+
+MILLIMETRES = "they seem to be millimetres"
+SLOW, FAST = 0.2 * 359 / 360, 0.1 * 359 / 360
+WIDE = {"beams": 811, "first_rad": math.radians(-135.0), "step_deg": 1.0 / 3.0}
+SCANNERS = {
+    # spins clockwise; the driver turns the order of the ranges and states times as if it had not
+    "rplidar A1": Scanner(turns_s=-FAST, stated_s=FAST, shortest_m=0.15, yaw_rad=math.pi),
+    "rplidar A3, beams by the speed of the motor": Scanner(
+        turns_s=-FAST, stated_s=FAST, varies=6, beams=720, step_deg=0.5
+    ),
+    "sllidar, upside down": Scanner(turns_s=FAST, roll_rad=math.pi),
+    "sick TiM571": Scanner(**WIDE, hz=15.0, turns_s=0.05, shortest_m=0.05, range_max=25.0),
+    "sick LMS1xx, 0 for no return": Scanner(
+        541, math.radians(-135.0), 0.5, hz=25.0, turns_s=0.03, nothing=0.0, shortest_m=0.01
+    ),
+    "sick nanoScan3, NaN": Scanner(**WIDE, hz=12.5, turns_s=0.06, nothing=NAN),
+    "hokuyo URG-04LX, a code below the least range": Scanner(
+        683, math.radians(-120.0), 0.3516, turns_s=0.067, nothing=0.02, reach_m=5.6, shortest_m=0.06
+    ),
+    "hokuyo UTM-30LX, a value beyond range_max": Scanner(
+        541, math.radians(-135.0), 0.5, hz=20.0, turns_s=0.025, nothing=65.533, range_max=30.0, reach_m=9.0
+    ),
+    "hokuyo_node, range_max for no return": Scanner(
+        541, math.radians(-135.0), 0.5, turns_s=0.03, nothing=5.6, reach_m=5.6
+    ),
+    "ydlidar X4, negative increment": Scanner(
+        first_rad=math.pi, step_deg=-0.5, beams=720, turns_s=0.1, nothing=0.0, varies=5
+    ),
+    "ydlidar G2, stamp at the end": Scanner(
+        beams=500, step_deg=0.72, turns_s=FAST, stamped=1.0, nothing=0.0, line="stamp is that of the last beam"
+    ),
+    "ld19, from 0 to a turn, NaN": Scanner(
+        first_rad=0.0, beams=450, step_deg=0.8, turns_s=-0.0998, stated_s=0.0998, nothing=NAN, varies=2, shortest_m=0.02
+    ),
+    "turtlebot3 LDS-01, wrong time_increment": Scanner(
+        first_rad=0.0,
+        hz=5.0,
+        turns_s=SLOW,
+        stated_s=0.01,
+        nothing=0.0,
+        reach_m=3.5,
+        shortest_m=0.12,
+        noise_m=0.01,
+        line="a scan takes 200 ms",
+    ),
+    "turtlebot3 LDS-02, no times": Scanner(
+        first_rad=0.0,
+        hz=5.0,
+        beams=230,
+        step_deg=360 / 230,
+        turns_s=SLOW,
+        stated_s=0.0,
+        varies=8,
+        nothing=0.0,
+        reach_m=8.0,
+        line="a scan takes",
+    ),
+    "turtlebot4, laser to the left": Scanner(
+        beams=540, step_deg=2.0 / 3.0, turns_s=-FAST, stated_s=FAST, yaw_rad=math.pi / 2, frame="rplidar_link"
+    ),
+    "xv-11 of neato": Scanner(
+        first_rad=0.0, hz=5.0, turns_s=SLOW, nothing=0.0, reach_m=5.0, shortest_m=0.06, grid_m=0.005
+    ),
+    "gazebo, both ends of the turn": Scanner(beams=361, step_deg=1.0),
+    "gazebo classic, range_max for no return": Scanner(nothing=3.5, reach_m=3.5, noise_m=0.01),
+    "isaac sim, -1 for no return": Scanner(nothing=-1.0, reach_m=6.0),
+    "depthimage_to_laserscan": Scanner(
+        320, math.radians(-43.0), 86.0 / 319, hz=15.0, nothing=NAN, shortest_m=0.45, reach_m=10.0
+    ),
+    "pepperl R2000": Scanner(beams=720, step_deg=0.5, hz=20.0, turns_s=0.0499, noise_m=0.002),
+    "lslidar N10, range_max 0": Scanner(
+        first_rad=0.0, turns_s=-FAST, nothing=0.0, range_max=0.0, shortest_m=0.0, line="states no range_max"
+    ),
+    "a microcontroller, millimetres": Scanner(unit=1000.0, range_max=12000.0, shortest_m=100.0, line=MILLIMETRES),
+    "a microcontroller, millimetres with limits in metres": Scanner(unit=1000.0, grid_m=0.001, line=MILLIMETRES),
+}
+
+
+@pytest.mark.parametrize("its", SCANNERS.values(), ids=SCANNERS)
+def test_a_scanner(tmp_path, its):
+    said, error_m = outcome(save(tmp_path / "run.mcap", recording(its)))
+    assert its.line in said
+    assert error_m is None if its.line is MILLIMETRES else error_m < 0.005
+
+
+class Cloud(NamedTuple):
+    """How a 3D LiDAR measures, and what its driver says."""
+
+    layout: tuple
+    first_rad: float = -math.pi
+    clockwise: bool = True
+    parts: int = 1
+    """Messages of a turn."""
+    holes: float = 0.0
+    """What the driver sends for a beam without return."""
+
+
+def clouds_of(its: Cloud):
+    R = rotation(yaw=0.4)
+    yield tf(START, "base_link", "lidar", (0.1, 0.0, 0.4), quaternion(0.4), topic="/tf_static")
+    for number in range(30):
+        begin = 0.1 * number
+        turn = spinning_cloud(
+            lambda times, begin=begin: pose_at(begin + times), (0.1, 0.0, 0.4), R, 4, 360, its.clockwise, its.first_rad
+        )
+        turn.points[::50] = its.holes
+        for rows in np.array_split(np.arange(len(turn.points)), its.parts):
+            first_s = turn.times[rows[0]]
+            part = Measured(turn.points[rows], turn.times[rows] - first_s)
+            yield said(
+                "/points", START + begin + first_s, cloud(START + begin + first_s, part, its.layout(START + begin))
+            )
+
+
+def times(kind, unit=1.0, since=0.0, name="timestamp"):
+    """A layout whose field has the times of the points in ``unit``."""
+    return 24, [*xyz(), (name, kind, 16, lambda measured: np.round((since + measured.times) * unit, 9))]
+
+
+CLOUDS = {
+    "velodyne": Cloud(lambda _: times("f4", name="time")),
+    "ouster, ns and zeros": Cloud(lambda _: times("u4", 1e9, name="t"), first_rad=0.0),
+    "hesai, absolute": Cloud(lambda begin: times("f8", 1.0, begin)),
+    "robosense, NaN": Cloud(lambda begin: times("f8", 1.0, begin), holes=NAN),
+    "livox, absolute ns": Cloud(lambda begin: times("f8", 1e9, begin), clockwise=False),
+    "sick multiScan, sectors": Cloud(lambda _: times("u4", 1e9, name="t"), parts=10),
+    "velodyne, packets": Cloud(lambda _: times("f4", name="time"), parts=60),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_a_3d_lidar(tmp_path, name):
+    its = CLOUDS[name]
+    messages, error_m = outcome(save(tmp_path / "run.mcap", [*readings(3.0), *clouds_of(its)]))
+    if its.parts > 1:
+        assert "let the driver publish whole turns" in messages
+    else:
+        assert error_m < 0.005
+
+
+LASER = Scanner(turns_s=FAST)
+
+
+def in_tf():
+    for each in recording(LASER):
+        if each.topic != "/odom":
+            yield each
+            continue
+        x, y, z = each.fields["at"]
+        yield tf(each.fields["stamp"], "odom", "base_footprint", (x, y, z), each.fields["rotation"])
+    yield tf(START, "base_footprint", "base_link", topic="/tf_static")
+
+
+def unstamped():
+    """A microcontroller without a clock: all stamps are 0."""
+    for each in recording(LASER._replace(turns_s=None)):
+        late = 0.1 if each.topic == "/scan" else 0.0
+        yield each._replace(fields={**each.fields, "stamp": 0.0}, bag_time=each.bag_time - late)
+
+
+def late(seconds):
+    """Odometry by a clock of its own."""
+    mounting, *_ = recording(LASER)
+    return [mounting, *readings(9.0, late_s=seconds), *scans_of(LASER)]
+
+
+def namespaced():
+    return [each._replace(topic=f"/robot1{each.topic}") for each in recording(LASER)]
+
+
+def slashed():
+    """Frames of old ROS 1."""
+    for each in recording(LASER):
+        names = {key: f"/{each.fields[key]}" for key in ("frame", "parent", "child") if key in each.fields}
+        yield each._replace(fields={**each.fields, **names})
+
+
+def scaled():
+    mounting, *_ = recording(LASER)
+    return [mounting, *readings(9.0, scale=1 / 1.2), *scans_of(LASER)]
+
+
+def packed_depth():
+    message = ROS2.types["sensor_msgs/msg/CompressedImage"](
+        header=header(ROS2, START, "camera"), format="16UC1; compressedDepth png", data=np.zeros(20, np.uint8)
+    )
+    return [*readings(1.0), said("/depth/image_raw/compressedDepth", START, message, "sensor_msgs/msg/CompressedImage")]
+
+
+ROBOTS = {
+    "turtlebot4: odometry in tf": (in_tf, ""),
+    "micro-ROS: no stamps": (unstamped, ""),
+    "micro-ROS: a clock of its own": (lambda: late(0.25), "the clock of the odometry is 250 ms ahead"),
+    "micro-ROS: a clock since boot": (lambda: late(-START), "have no odometry within 1 s"),
+    "namespace": (namespaced, ""),
+    "frames with a slash": (slashed, ""),
+    "wheels of another radius": (scaled, "the robot's distance is 1.2"),
+    "compressed depth images": (packed_depth, "record /depth/image_raw;"),
+}
+
+
+@pytest.mark.parametrize(("make", "line"), ROBOTS.values(), ids=ROBOTS)
+def test_a_robot(tmp_path, make, line):
+    messages, error_m = outcome(save(tmp_path / "run.mcap", make()))
+    assert line in messages
+    assert error_m is None or error_m < 0.005
