@@ -96,6 +96,14 @@ def logs(drawn, tmp_path_factory):
     return [folder / f"{robot.name}.clf" for robot in drawn.robots]
 
 
+@pytest.fixture(scope="module")
+def brief_validation():
+    """Small views to validate networks on: validation takes most of a short training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fcslam.learning.trainer.VALIDATION_VIEW", (96, 96))
+        yield
+
+
 @pytest.fixture
 def scripted(monkeypatch):
     """Makes a cloud whose place matcher finds what the given scripts say."""
