@@ -7,6 +7,7 @@ from fcslam.cli import BAD_INPUT, main
 from tests.learning.textures import textured
 
 OPTIONS = ["--device", "cpu"]
+pytestmark = pytest.mark.usefixtures("brief_validation")
 
 
 @pytest.fixture
