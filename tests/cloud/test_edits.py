@@ -28,6 +28,7 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
+from tests import small_fleet
 from tests.scripted import ALIAS, closures, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
@@ -164,10 +165,10 @@ def test_a_veto_that_is_undone_leaves_no_trace_in_the_result(scripted):
 
 
 @pytest.fixture(scope="module")
-def two(packets):
-    """Packets of two robots."""
-    first, second, *_ = sorted({packet.robot for packet in packets})
-    return [packet for packet in packets if packet.robot in (first, second)]
+def two():
+    """Packets of two robots on short ways."""
+    robots = small_fleet.draw(2, path_length_m=15.0).robots
+    return in_order(packet for robot in robots for packet in small_fleet.sent_by(robot))
 
 
 @pytest.fixture(scope="module")
