@@ -20,7 +20,8 @@ from tests.postgres import HAS_POSTGRES, WHY_NOT, Server
 from tests.scripted import ScriptedMatcher
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
-settings.register_profile("fcslam", deadline=None)
+# More examples find little that these do not; `make fuzz` tries thousands of broken inputs.
+settings.register_profile("fcslam", deadline=None, max_examples=40)
 settings.load_profile("fcslam")
 
 
@@ -94,6 +95,14 @@ def logs(drawn, tmp_path_factory):
         write_carmen(folder / f"{robot.name}.clf", robot.scans())
     write_ground_truth(drawn, folder, np.random.default_rng(0))
     return [folder / f"{robot.name}.clf" for robot in drawn.robots]
+
+
+@pytest.fixture(scope="module")
+def brief_validation():
+    """Small views to validate networks on: validation takes most of a short training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fcslam.learning.trainer.VALIDATION_VIEW", (96, 96))
+        yield
 
 
 @pytest.fixture

@@ -8,12 +8,14 @@ import sys
 import pytest
 
 WITHOUT_FOLDER = """
+import numpy as np
 from numba.core.caching import FunctionCache
 FunctionCache._impl_class._locator_classes = []  # as where nothing can be written
 from fcslam.cli.warm_up import tell_uncached
 from fcslam.cli.output import notices
-from fcslam.service.warmup import warm_up_searching, warm_up_matching, is_cold
-warm_up_matching()
+from fcslam.features.codes import hamming
+from fcslam.service.warmup import is_cold
+assert hamming(*np.zeros((2, 4), np.uint64)) == 0
 assert is_cold()
 assert tell_uncached(notices(False))
 """

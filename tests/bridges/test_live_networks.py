@@ -131,6 +131,18 @@ def mounting(scans):
     return "--laser-pose=" + ",".join(map(str, scans[0].laser.T_base_laser))
 
 
+def until_there(port):
+    """Wait until something listens at the port."""
+    end = time.monotonic() + LONGEST_S
+    while True:
+        try:
+            socket.create_connection(("localhost", port)).close()
+            return
+        except ConnectionError:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
+
 @pytest.fixture
 def roscore():
     with socket.socket() as probe:
@@ -143,7 +155,7 @@ def roscore():
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    time.sleep(4.0)
+    until_there(port)
     yield environment
     process.send_signal(signal.SIGINT)
     process.wait(10.0)

@@ -14,7 +14,7 @@ from fcslam.simulation import engine
 from fcslam.sources import open_source
 from tests.simulation.gl import require_gl
 
-TINY = ["demo", "--robots", "2", "--path-length", "30"]
+TINY = ["demo", "--robots", "2", "--path-length", "20"]
 TINIEST = ["--no-camera", "--building", "flat", "--robots", "1", "--path-length", "3"]
 
 
@@ -43,7 +43,7 @@ def shown(tmp_path_factory):
 def test_it_ends_with_a_run_a_figure_and_a_table(shown):
     run = open_run(shown / "run")
     assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
-    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 20.0
+    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 15.0
     assert cv2.imread(str(shown / "figure.png")).shape[1] == 2000
     figures = told(shown)
     assert figures["maps"] == 1
@@ -56,7 +56,7 @@ def test_it_ends_with_a_run_a_figure_and_a_table(shown):
 def test_it_replaces_itself_and_nothing_else(shown):
     assert (shown / "notes").read_text() == "mine"
     assert not (shown / "recordings" / "stale").exists()
-    assert "path_length_m: 30.0" in (shown / "recordings" / "simulation.yaml").read_text()
+    assert "path_length_m: 20.0" in (shown / "recordings" / "simulation.yaml").read_text()
 
 
 @pytest.mark.slow

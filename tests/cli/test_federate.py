@@ -1,6 +1,8 @@
 """`fcslam federate`: a whole run of real robots, its resuming, and what bad input is answered."""
 
+import contextlib
 import csv
+import io
 
 import cv2
 import pytest
@@ -18,15 +20,9 @@ TINY = {
     "local_steps": 2,
     "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
 }
+pytestmark = pytest.mark.usefixtures("brief_validation")
 JOIN_FILES = ("--ca", "{fleet}/tiny.yaml", "--robot-key", "{fleet}/tiny.yaml")
 SERVE_FILES = (*JOIN_FILES, "--certificate", "{fleet}/tiny.yaml", "--key", "{fleet}/tiny.yaml")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def brief():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fcslam.learning.trainer.VALIDATION_PAIRS", 1)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +46,13 @@ def federate(fleet, output, *more, robots=("one", "two", "bare")):
 
 
 @pytest.fixture(scope="module")
-def run(fleet, tmp_path_factory):
-    output = tmp_path_factory.mktemp("run") / "fleet"
-    assert federate(fleet, output, "--public", str(fleet / "public")) == 0
-    return output
+def run(fleet, tmp_path_factory, brief_validation):
+    """The folder of one round, in which the same command with two rounds went on, and what that command said."""
+    output, public = tmp_path_factory.mktemp("run") / "fleet", ("--public", str(fleet / "public"))
+    assert federate(fleet, output, *public, "--rounds", "1") == 0
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        assert federate(fleet, output, *public) == 0
+    return output, said.getvalue()
 
 
 def rows_of(folder):
@@ -63,6 +62,7 @@ def rows_of(folder):
 
 @pytest.mark.slow
 def test_a_run_folder_holds_everything(run, fleet):
+    run, _ = run
     for name in ("config.yaml", "rounds.csv", "checkpoint.npz", "rounds.png", "card.md"):
         assert (run / name).stat().st_size > 100
     rows = rows_of(run)
@@ -74,6 +74,7 @@ def test_a_run_folder_holds_everything(run, fleet):
 
 @pytest.mark.slow
 def test_the_delivered_detectors_run(run, fleet, tmp_path):
+    run, _ = run
     for name in ("detector.onnx", "detector-int8.onnx"):
         arguments = ["extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
         assert main([*arguments, "--weights", str(run / name)]) == 0
@@ -82,19 +83,21 @@ def test_the_delivered_detectors_run(run, fleet, tmp_path):
 
 @pytest.mark.slow
 def test_labels_are_all_that_is_kept_of_images(run):
+    run, _ = run
     suffixes = {file.suffix for file in run.rglob("*") if file.is_file()}
     assert suffixes <= {".yaml", ".csv", ".npz", ".onnx", ".png", ".md"}
     assert {file.name for file in run.rglob("*.png")} == {"rounds.png"}
 
 
 @pytest.mark.slow
-def test_the_same_command_with_more_rounds_goes_on(fleet, tmp_path, capsys):
-    assert federate(fleet, tmp_path / "run", "--rounds", "1", robots=("one", "two")) == 0
-    assert federate(fleet, tmp_path / "run", "--rounds", "2", robots=("one", "two")) == 0
-    assert "round 1/2" not in capsys.readouterr().err.partition("round 2/2")[2]
-    assert [row["round"] for row in rows_of(tmp_path / "run")] == ["1", "2"]
+def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
+    run, said = run
+    assert "round 2/2" in said
+    assert "round 1/2" not in said.partition("round 2/2")[2]
+    assert [row["round"] for row in rows_of(run)] == ["1", "2"]
     begun = tmp_path / "begun"
-    assert federate(fleet, begun, "--start", str(tmp_path / "run" / "checkpoint.npz"), robots=("one", "two")) == 0
+    start = ("--start", str(run / "checkpoint.npz"), "--rounds", "1")
+    assert federate(fleet, begun, *start, robots=("one", "two")) == 0
     assert not (begun / "shapes").exists()
 
 
@@ -152,6 +155,7 @@ def test_each_subcommand_has_its_own_options_only(arguments, fleet, tmp_path, ca
 
 
 @pytest.mark.slow
-def test_a_fleet_without_images_is_said(fleet, tmp_path, capsys):
-    assert federate(fleet, tmp_path / "run", robots=("bare",)) == BAD_INPUT
+def test_a_fleet_without_images_is_said(run, fleet, tmp_path, capsys):
+    start = ("--start", str(run[0] / "checkpoint.npz"))
+    assert federate(fleet, tmp_path / "run", *start, robots=("bare",)) == BAD_INPUT
     assert "no round can be completed: bare: " in capsys.readouterr().err

@@ -104,7 +104,7 @@ def stretched():
     return packets, fed(packets).finalize()
 
 
-@pytest.mark.parametrize(("scale", "evil"), [(0.97, 1), (0.99, 0), (1.01, 0), (1.02, 1), (1.03, 1)])
+@pytest.mark.parametrize(("scale", "evil"), [(0.97, 1), (1.01, 0), (1.02, 1)])
 def test_a_copy_at_a_false_scale_moves_others_by_centimetres_at_most(stretched, scale, evil):
     """At 1 % it contradicts the others by no more than honest robots contradict each other, and it stays."""
     honest, alone = stretched

@@ -39,7 +39,7 @@ TINY = {
 
 
 @pytest.fixture(scope="module", autouse=True)
-def brief():
+def brief(brief_validation):
     """Short validation, and one export of each network: several studies train the same ones."""
     files, lock = {}, Lock()
 
@@ -51,7 +51,6 @@ def brief():
         path.write_bytes(files[version])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fcslam.learning.trainer.VALIDATION_PAIRS", 1)
         patch.setattr("fcslam.evaluation.federated.study.export_onnx", export_once)
         yield
 

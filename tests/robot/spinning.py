@@ -1,5 +1,7 @@
 """A made-up robot with a scanner that spins, in a room with furniture: an oracle for motion during scans."""
 
+from functools import cache
+
 import numpy as np
 
 from fcslam.geometry import se2
@@ -28,13 +30,19 @@ WALLS = np.array(
 )
 
 
-def pose_at(stamps):
-    """True pose in ``odom`` at ``stamps``: a winding drive that turns at up to 1.6 rad/s."""
+@cache
+def _way():
     dense = np.arange(0.0, 40.0, 0.002)
     turn = 0.9 * np.sin(0.8 * dense) + 0.7 * np.sin(1.9 * dense)
     heading = np.cumsum(turn) * 0.002
     x, y = np.cumsum(0.3 * np.cos(heading)) * 0.002, np.cumsum(0.3 * np.sin(heading)) * 0.002
-    return np.stack([np.interp(stamps, dense, axis) for axis in (x, y, heading)], axis=-1)
+    return dense, (x, y, heading)
+
+
+def pose_at(stamps):
+    """True pose in ``odom`` at ``stamps``: a winding drive that turns at up to 1.6 rad/s."""
+    dense, axes = _way()
+    return np.stack([np.interp(stamps, dense, axis) for axis in axes], axis=-1)
 
 
 def ranges_at(stamps, rng):

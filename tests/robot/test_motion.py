@@ -46,6 +46,10 @@ def reset(odometry, at=(6.0, 11.0)):
     )
 
 
+def without_heading(odometry):
+    return lambda stamp: odometry(stamp) * (1.0, 1.0, 0.0)
+
+
 READINGS = np.arange(0.0, 20.5, 0.02)
 
 
@@ -60,7 +64,7 @@ READINGS = np.arange(0.0, 20.5, 0.02)
         (held(integrated()), 0.0),
         (reset(integrated()), 0.0),
         (integrated(), 0.2),
-        (lambda stamp: integrated()(stamp) * (1.0, 1.0, 0.0), 0.0),
+        (without_heading(integrated()), 0.0),
         (lambda _: np.zeros(3), 0.0),
         (None, 0.0),
     ],

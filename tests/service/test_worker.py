@@ -94,8 +94,8 @@ def two_robots():
 @pytest.mark.slow
 def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs, rng_order):
     config = MissionConfig(seed=3)
-    packets = in_order(packet for log in logs for packet in sent(open_source(log), config.robot))
-    expected = run_mission([open_source(log) for log in logs], config)
+    packets = in_order(packet for log in logs[:2] for packet in sent(open_source(log), config.robot))
+    expected = run_mission([open_source(log) for log in logs[:2]], config)
     cloud = Cloud(tmp_path / "mission", CloudConfig(seed=3, fleet=config.fleet, map=config.map))
     for batch in rng_order(packets):
         cloud.put(batch)

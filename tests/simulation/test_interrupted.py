@@ -61,14 +61,22 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(items, tmp_path, m
     assert len(made) == max(0, len(robot.stamps) - (items + 1) // 2)
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("items", [9, 60, 61, 10_000])
-def test_images_that_are_there_are_not_rendered_again(items, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    """A robot with a camera, and the files of its whole recording."""
     require_gl()
     (robot,) = simulate_fleet(SEEING, 1).robots
-    record_robot(robot, tmp_path / "whole")
+    folder = tmp_path_factory.mktemp("seen") / "whole"
+    record_robot(robot, folder)
+    return robot, files(folder)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("items", [9, 60, 61, 10_000])
+def test_images_that_are_there_are_not_rendered_again(seen, items, tmp_path, monkeypatch):
+    robot, whole = seen
     made = interrupted_and_resumed(robot, tmp_path / "cut", items, b"\xff\xd8\xff", monkeypatch)
-    assert files(tmp_path / "cut") == files(tmp_path / "whole")
+    assert files(tmp_path / "cut") == whole
     assert len(made) == max(0, len(robot.stamps) + len(robot.image_stamps) - (items + 1) // 2)
 
 

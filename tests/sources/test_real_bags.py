@@ -1,7 +1,6 @@
 """Real recordings as bags: the published ones, and the logs written as bags of every kind."""
 
 import os
-import time
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ pytestmark = [
     [("fr079", (4934, 360), 392, 1061, 0.04), ("mit-csail", (1988, 361), 374, 424, 0.0)],
 )
 def test_published_bags_hold_what_their_description_says(bag, shape, path_m, duration_s, laser_x_m):
-    start = time.process_time()
     source = open_source(DATA / f"rosbag1/{bag}.sort.bag")
     survey = source.survey()
     assert (survey.scan_count, survey.lasers[0].beam_count) == shape
@@ -33,7 +31,6 @@ def test_published_bags_hold_what_their_description_says(bag, shape, path_m, dur
     assert survey.lasers[0].T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)
     assert survey.notes == ()
     scans = scans_of(source)
-    assert time.process_time() - start < 10.0
     log = scans_of(open_source(DATA / f"slam-benchmark/{bag}.clf.xz"))
     assert len(scans) == len(log)
     apart = np.array([a.T_odom_base - b.T_odom_base for a, b in zip(scans, log, strict=True)])

