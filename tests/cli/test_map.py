@@ -272,7 +272,7 @@ def test_a_bad_recording_is_refused(tmp_path, log, capsys, make, reason, first):
 
 def test_two_recordings_of_one_name_are_refused(tmp_path, log, capsys):
     (tmp_path / "other").mkdir()
-    twin = save(tmp_path / "other" / "healthy.clf", drive(40))
+    twin = save(tmp_path / "other" / "healthy.clf", drive(41))
     assert "'healthy'" in refused(capsys, tmp_path, log, twin, "--output", tmp_path / "run")
     assert "'healthy'" in refused(capsys, tmp_path, log, log, "--output", tmp_path / "run")
     assert not (tmp_path / "run").exists()

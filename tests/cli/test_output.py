@@ -61,7 +61,7 @@ def test_resuming_needs_the_folder(tmp_path, monkeypatch, capsys):
 
 
 def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, capsys):
-    logs = [str(save(tmp_path / f"{name}.log", drive(40))) for name in "ab"]
+    logs = [str(save(tmp_path / f"{name}.log", drive(scans))) for name, scans in (("a", 40), ("b", 41))]
     assert main(["map", *logs, "-o", str(tmp_path / "run"), "--quiet"]) == 0
     lines = capsys.readouterr().out.splitlines()
     after = lines[lines.index("2 maps") + 1 :]

@@ -40,7 +40,7 @@ class Scanner(NamedTuple):
     """When the stamp is, in shares of a turn after its begin."""
     reach_m: float = 12.0
     nothing: float = INF
-    """What the driver sends without a return."""
+    """Range without a return."""
     shortest_m: float = 0.1
     range_max: float | None = None
     grid_m: float = 0.001
@@ -53,7 +53,7 @@ class Scanner(NamedTuple):
     unit: float = 1.0
     frame: str = "laser"
     line: str = ""
-    """What is said of it."""
+    """A part of the lines that are printed."""
 
 
 def pose_at(times):
@@ -159,7 +159,7 @@ SCANNERS = {
         reach_m=3.5,
         shortest_m=0.12,
         noise_m=0.01,
-        line="a scan takes 200 ms",
+        line="a scan takes ",
     ),
     "turtlebot3 LDS-02, no times": Scanner(
         first_rad=0.0,
@@ -210,7 +210,7 @@ class Cloud(NamedTuple):
     parts: int = 1
     """Messages of a turn."""
     holes: float = 0.0
-    """What the driver sends for a beam without return."""
+    """Range of a beam without a return."""
 
 
 def clouds_of(its: Cloud):

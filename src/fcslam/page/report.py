@@ -48,7 +48,7 @@ def report_html(mission: ViewedMission) -> str:
 
 
 def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
-    """What the service answers to the page, by path. Maps have tiles down to ``zooms``."""
+    """Responses of the service to the page, by path. Maps have tiles down to ``zooms``."""
     sessions = all_sessions(mission)
     texts = {
         "fleet": _json(fleet_summary(mission, read_only=True)),

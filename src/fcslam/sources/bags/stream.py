@@ -298,7 +298,7 @@ class BagStream:
 
     @property
     def stated_sweep(self) -> Sweep | None:
-        """When the beams are measured by a message of the first laser, if it says so."""
+        """Times of the beams by a message of the first laser; None if it states none."""
         first = self.lasers[0].first
         return first.sweep if first.ranges_at_stamp is None else None
 

@@ -82,7 +82,7 @@ def choose_topics(
         packed = [topic.name for topic in heard if topic.type == COMPRESSED_IMAGE and is_depth(topic.name)]
         remedy = "record them"
         if packed:
-            remedy = f"the compressed depth images of {packed[0]} are not read, record {packed[0].rpartition('/')[0]}"
+            remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
         raise SourceError(
             f"{robot.bag.path}: no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images; {remedy}; "
             f"{_known(robot.topics)}"
