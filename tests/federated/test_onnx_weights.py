@@ -8,8 +8,8 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
-from fcslam.federated.codec import network_to_weights, weights_to_network  # noqa: E402
 from fcslam.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
+from fcslam.federated.networks import network_to_weights, weights_to_network  # noqa: E402
 from fcslam.federated.onnx_weights import with_batch_statistics  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names  # noqa: E402

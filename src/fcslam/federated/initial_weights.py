@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import OutputError, TrainingError
 from fcslam.features.detector import GreyImage
-from fcslam.federated.codec import network_to_weights, weights_to_network, weights_version
+from fcslam.federated.networks import network_to_weights, weights_to_network, weights_version
 from fcslam.federated.onnx_weights import SUFFIX, read_onnx_weights, with_batch_statistics
 from fcslam.federated.public_images import calibration_images
 from fcslam.federated.settings import FederatedSettings

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from fcslam.errors import TrainingError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
-from fcslam.federated.codec import network_to_weights, weights_to_network
+from fcslam.federated.networks import network_to_weights, weights_to_network
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import Encoder
