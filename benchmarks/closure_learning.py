@@ -63,10 +63,10 @@ from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.lidar_depth import LidarView
 from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
 from fcslam.federated.client_app import build_client_app
-from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import InProcessGrid
 from fcslam.federated.initial_weights import prepare_initial_weights
+from fcslam.federated.networks import weights_to_network, weights_version
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.geometry import se2

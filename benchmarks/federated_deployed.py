@@ -183,9 +183,9 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
 
     from fcslam.federated import client
     from fcslam.federated.client_app import build_client_app
-    from fcslam.federated.codec import network_to_weights, weights_version
     from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
     from fcslam.federated.flower import InProcessGrid
+    from fcslam.federated.networks import network_to_weights, weights_version
     from fcslam.federated.public_images import public_evaluation, read_public_images
     from fcslam.federated.settings import FederatedSettings
     from fcslam.learning.network import KeypointNetwork

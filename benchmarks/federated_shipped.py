@@ -76,8 +76,8 @@ def main() -> None:
 
 def exported(folder: Path, arm: str) -> Path:
     """What an arm came to, as robots run it."""
-    from fcslam.federated.codec import weights_to_network
     from fcslam.federated.initial_weights import read_detector_weights
+    from fcslam.federated.networks import weights_to_network
     from fcslam.learning.export import export_onnx
 
     target = folder / f"{arm}.onnx"

@@ -40,8 +40,8 @@ from closure_learning import (
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.federated.codec import weights_to_network
 from fcslam.federated.initial_weights import prepare_initial_weights
+from fcslam.federated.networks import weights_to_network
 from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.batches import draw_batch
 from fcslam.learning.export import export_onnx

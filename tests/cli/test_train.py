@@ -1,6 +1,7 @@
 """`fcslam train`: one small run from images to files, and what it says of bad input."""
 
 import cv2
+import numpy as np
 import pytest
 
 from fcslam.cli import BAD_INPUT, main
@@ -59,6 +60,38 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
     more = [photos, "-o", output, "--config", settings, "--steps", "3"]
     assert "was trained on other images" in complaint(capsys, *more)
     assert kept == ((output / "detector.onnx").read_bytes(), (output / "card.md").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", ["joint/checkpoint.npz", "detector.onnx"])
+def test_training_starts_from_given_weights(file, photos, tmp_path, capsys):
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    from fcslam.federated.initial_weights import read_detector_weights
+    from fcslam.learning.arrays import read_arrays
+    from fcslam.learning.training_step import LAST_RATE
+
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(
+        f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1, learning_rate: {LAST_RATE}}}"
+    )
+    first, second, third = (tmp_path / name for name in ("first", "second", "third"))
+    arguments = ["train", str(photos), "--config", str(settings), *OPTIONS, "--output"]
+    assert main([*arguments, str(first)]) == 0
+    assert main([*arguments, str(second), "--start", str(first / file)]) == 0
+    assert not (second / "shapes").exists()
+    kept = next(second.glob("start-*.npz"), None)  # of an ONNX file, with statistics of the batches
+    before = read_detector_weights(first / file, "light") if kept is None else read_arrays(kept)
+    after = read_detector_weights(second / "joint" / "checkpoint.npz", "light")
+    kernels = [name for name, array in before.items() if array.ndim == 4]
+    # A step of Adam changes no weight by more than the rate, once its moments are those of one sign.
+    moved = max(np.abs(after[name] - before[name]).max() for name in kernels)
+    assert 0.0 < moved <= 2.1 * LAST_RATE
+    capsys.readouterr()
+    assert "from another start" in complaint(
+        capsys, photos, "-o", second, "--config", settings, "--start", second / file
+    )
+    assert "is no checkpoint" in complaint(capsys, photos, "-o", third, "--start", photos / "0.png")
+    assert "holds no body" in complaint(capsys, photos, "-o", third, "--start", "vgg")
 
 
 def test_bad_input_is_one_line(photos, tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Networks as detectors: the contract, images of any size, and what breaks the contract."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,6 +129,22 @@ def test_without_weights_one_is_told_so(tmp_path, monkeypatch):
 def test_weights_that_come_with_the_package_are_the_default(weights, monkeypatch):
     monkeypatch.setattr("fcslam.features.detector.BUNDLED_NETWORK", weights)
     assert OnnxDetector(OnnxConfig()).version == "tiny-1"
+
+
+def test_a_bare_name_is_a_bundled_network_and_finds_corners():
+    image = np.kron(np.indices((8, 10)).sum(0) % 2, np.full((32, 32), 160)).astype(np.uint8) + 40
+    detector = OnnxDetector(OnnxConfig(weights=Path("vgg"), most_features=40))
+    found = detector.detect(image)
+    assert detector.version.startswith("vgg-")
+    # A corner of the board lies between four pixels, whole multiples of 32 less a half.
+    off = (found.keypoints_px + 0.5 + 16.0) % 32.0 - 16.0
+    assert len(off) == 40
+    assert np.abs(off).max() < 4.0
+
+
+def test_a_bare_name_of_no_bundled_network_is_a_file(tmp_path, weights, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert OnnxDetector(OnnxConfig(weights=Path(weights.name))).version == "tiny-1"
 
 
 def test_the_kind_chooses(weights):

@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.federated.client import RobotClient, robot_seed, secret_noise, seeded_noise  # noqa: E402
-from fcslam.federated.codec import network_to_weights, weights_to_network, weights_version  # noqa: E402
+from fcslam.federated.networks import network_to_weights, weights_to_network, weights_version  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
 from fcslam.learning.arrays import read_arrays, write_arrays  # noqa: E402

@@ -67,8 +67,8 @@ def awaited(condition, processes, logs):
 
 def weak_detector(folder):
     """Announce a detector whose codes are bad, so that few steps of training improve it."""
-    from fcslam.federated.codec import weights_to_network
     from fcslam.federated.initial_weights import read_detector_weights
+    from fcslam.federated.networks import weights_to_network
     from fcslam.learning.export import export_onnx
 
     weights = read_detector_weights(BUNDLED_NETWORK, "light")

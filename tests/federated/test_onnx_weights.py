@@ -1,5 +1,7 @@
 """A released detector read back gives what it gave, and can be trained on."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,9 @@ torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
-from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
-from fcslam.federated.codec import network_to_weights, weights_to_network  # noqa: E402
+from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector, network_file  # noqa: E402
 from fcslam.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
+from fcslam.federated.networks import network_to_weights, weights_to_network  # noqa: E402
 from fcslam.federated.onnx_weights import with_batch_statistics  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names  # noqa: E402
@@ -50,10 +52,11 @@ def test_it_is_the_same_function(encoder, tmp_path):
                 assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
 
 
-def test_the_network_that_comes_with_fcslam_can_be_trained_on():
-    read = weights_to_network(read_detector_weights(BUNDLED_NETWORK, "light"), "light")
+@pytest.mark.parametrize(("encoder", "name"), [("light", None), ("vgg", Path("vgg"))])
+def test_the_networks_that_come_with_fcslam_can_be_trained_on(encoder, name):
+    read = weights_to_network(read_detector_weights(network_file(name), encoder), encoder)
     picture = np.random.default_rng(0).integers(0, 256, (64, 96), np.uint8)
-    scores, logits = OnnxDetector(OnnxConfig()).infer(picture)
+    scores, logits = OnnxDetector(OnnxConfig(weights=name)).infer(picture)
     with torch.inference_mode():
         maps = read(torch.from_numpy(picture)[None, None].float() / 255.0)
         assert np.allclose(read.scores(maps)[0], scores, atol=1e-4)

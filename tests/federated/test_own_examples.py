@@ -12,13 +12,13 @@ torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
-from fcslam.federated.codec import weights_to_network  # noqa: E402
 from fcslam.federated.fleet_grid import FleetGrid  # noqa: E402
 from fcslam.federated.fleet_server import FleetApp  # noqa: E402
 from fcslam.federated.held_out import judge  # noqa: E402
 from fcslam.federated.identity import ROBOT_HEADER, RobotAuthenticator  # noqa: E402
 from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
+from fcslam.federated.networks import weights_to_network  # noqa: E402
 from fcslam.federated.own_examples import SPLIT_FILE, own_examples  # noqa: E402
 from fcslam.federated.robot_learning import BusyRobotError, Idleness, LearningEndError, LearningRobot, checked_lessons  # noqa: E402
 from fcslam.records import Channel, Place, frozen  # noqa: E402

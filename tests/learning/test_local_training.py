@@ -18,7 +18,7 @@ from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, local_
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.training_step import LegacyDetector, ProximalTerm  # noqa: E402
+from fcslam.learning.training_step import LegacyDetector, ProximalTerm, reduced_precision  # noqa: E402
 
 SMALL = TrainingSettings(steps=40, pairs=1, side_px=64, points=32)
 CPU = torch.device("cpu")
@@ -119,7 +119,7 @@ def bits(network):
 def test_a_network_is_not_pulled_away_from_its_own_codes(examples, start):
     network = network_from_state("light", start)
     batch = draw_batch(examples, SMALL, 0)
-    with torch.autocast("cpu", torch.bfloat16):
+    with reduced_precision(CPU):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     logits = maps.code_logits.float().detach().requires_grad_()
     loss = LegacyDetector(1.0, network).loss(maps._replace(code_logits=logits), batch)

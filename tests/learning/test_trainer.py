@@ -1,6 +1,7 @@
 """The training loop: it learns, resumes as if nothing had happened, keeps what it has, and sounds its alarms."""
 
 import errno
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,10 +27,11 @@ from fcslam.learning.trainer import (  # noqa: E402
     trained_network,
     validation_pairs,
 )
-from fcslam.learning.training_step import learning_rate  # noqa: E402
+from fcslam.learning.training_step import learning_rate, reduced_precision  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate  # noqa: E402
 from fcslam.storage.files import replacing  # noqa: E402
 
+CPU_FLAGS = Path("/proc/cpuinfo")
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
 PACE = ExecutionOptions(validate_every=100, checkpoint_every_s=0.0, log_every=1)
 
@@ -195,6 +197,21 @@ def test_the_rate_rises_stays_and_falls():
     assert rates[0] == pytest.approx(1e-5)
     assert set(rates[1000:6900]) == {1e-3}
     assert rates[-1] == pytest.approx(1e-5, rel=0.1)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_processors_without_bfloat16_compute_in_float32(native, monkeypatch):
+    monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: native)
+    with reduced_precision(torch.device("cpu")):
+        product = torch.ones(2, 2) @ torch.ones(2, 2)
+    assert product.dtype == (torch.bfloat16 if native else torch.float32)
+
+
+@pytest.mark.skipif(not CPU_FLAGS.exists(), reason="needs Linux")
+def test_whether_a_processor_has_bfloat16_is_what_its_kernel_says():
+    with reduced_precision(torch.device("cpu")):
+        product = torch.ones(2, 2) @ torch.ones(2, 2)
+    assert (product.dtype == torch.bfloat16) == ("avx512_bf16" in CPU_FLAGS.read_text().split())
 
 
 def test_neighbours_in_either_view_are_no_negatives():

@@ -12,6 +12,7 @@ from fcslam.cli.training_options import (
     TRAINING_OUTPUT,
     Device,
     Quick,
+    Start,
     TrainingSeed,
     compute_budget,
     require_training_libraries,
@@ -21,11 +22,12 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.learning.network import KeypointNetwork
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.stages import StageCallback
-    from fcslam.learning.trainer import TrainingProgress
+    from fcslam.learning.trainer import ExecutionOptions, TrainingProgress
 
-QUICK = {"steps": 40, "shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
+QUICK = {"steps": 20, "shape_steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
 QUICK_IMAGES = 4
 """Images of ``--quick``: labelling one, and finding the ranges of int8 with it, takes vgg some seconds."""
@@ -57,6 +59,7 @@ def train(
     teacher: Annotated[
         Path | None, typer.Option(help="Folder with the keypoints of a teacher network; see docs/howto/training.md.")
     ] = None,
+    start: Start = None,
     device: Device = "auto",
     quick: Quick = False,
     quiet: Quiet = False,
@@ -73,15 +76,16 @@ def train(
     output = output or new_folder(TRAINING)
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {output}") as display:
-        watch = _watch(display, console)
+        watch, options = _watch(display, console), compute_budget(device, quick)
         network, found = train_detector(
             images,
             output,
             settings,
-            compute_budget(device, quick),
+            options,
             teacher,
             watch,
             QUICK_IMAGES if quick else None,
+            None if start is None else _start_network(start, output, settings, options, images),
         )
     files = write_training_artifacts(network, output, settings, found, teacher)
     for file in files:
@@ -98,6 +102,19 @@ def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "Train
     base = TrainingSettings() if config is None else load(TrainingSettings, config)
     changes = (QUICK if quick else {}) | {name: value for name, value in given.items() if value is not None}
     return changed(base, changes, "the command line")
+
+
+def _start_network(
+    start: Path, output: Path, settings: "TrainingSettings", options: "ExecutionOptions", images: list[Path]
+) -> "KeypointNetwork":
+    from fcslam.federated.initial_weights import prepare_initial_weights
+    from fcslam.federated.networks import weights_to_network
+    from fcslam.federated.public_images import read_public_images
+    from fcslam.federated.settings import FederatedSettings
+
+    rounds = FederatedSettings(training=settings)
+    weights = prepare_initial_weights(start, output, rounds, options, lambda *_: None, read_public_images(images))
+    return weights_to_network(weights, settings.encoder)
 
 
 def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":

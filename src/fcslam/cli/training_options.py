@@ -2,6 +2,7 @@
 
 import os
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,6 +14,13 @@ TRAINING_OUTPUT = "Folder for everything that training writes. If it holds an un
 
 TrainingSeed = Annotated[
     int | None, typer.Option("--seed", min=0, help="Seed of the training.", show_default="that of the settings")
+]
+Start = Annotated[
+    Path | None,
+    typer.Option(
+        help="Weights to start from: a checkpoint.npz, a detector.onnx, or vgg, which comes with fcslam.",
+        show_default="training on synthetic shapes",
+    ),
 ]
 Device = Annotated[str, typer.Option(help="cpu or cuda; auto uses cuda if there is one.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to see that everything works.")]

@@ -87,11 +87,20 @@ class FeatureDetector(KeypointDetector, Protocol):
         """Features of an image (H, W), the strongest first; K = 0 without any."""
 
 
+def network_file(weights: Path | None) -> Path:
+    """The ONNX file that ``weights`` names; None is the bundled network, and a bare name like `vgg` another one."""
+    if weights is None:
+        return BUNDLED_NETWORK
+    bundled = BUNDLED_NETWORK.with_name(f"{weights.name}.onnx")
+    return bundled if weights == Path(weights.name) and bundled.is_file() else weights
+
+
 class OnnxConfig(Settings):
     """The network detector. Places from different weights cannot be compared."""
 
     weights: Path | None = Field(
-        default=None, description="ONNX file with the network weights; null: the bundled network"
+        default=None,
+        description="ONNX file with the network weights; null: the bundled network; vgg: the paper's, also bundled",
     )
     most_features: int = Field(
         default=300, ge=1, le=2000, description="most network features of an image, the strongest first"
@@ -115,7 +124,7 @@ class OnnxDetector:
         self._config = config
         if config.weights is None and not BUNDLED_NETWORK.is_file():
             raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or choose orb")
-        path = BUNDLED_NETWORK if config.weights is None else config.weights
+        path = network_file(config.weights)
         self._session, metadata = _load(path, config.threads)
         if metadata.get("fcslam_format") != NETWORK_FORMAT:
             found = metadata.get("fcslam_format", "none")

@@ -9,8 +9,8 @@ from fcslam.config import dump
 from fcslam.errors import OutputError, TrainingError
 from fcslam.features.detector import GreyImage
 from fcslam.federated.checkpoint import CoordinatorState
-from fcslam.federated.codec import weights_to_network
 from fcslam.federated.history import LOSS, ROUNDS_FILE, Row
+from fcslam.federated.networks import weights_to_network
 from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
 from fcslam.federated.client_state import legacy_weights, load_optimiser_state, save_optimiser_state
-from fcslam.federated.codec import network_to_weights, weights_to_network
 from fcslam.federated.evaluation import SCORE_METRICS
 from fcslam.federated.held_out import HeldOutPairs, Judgement, judge
+from fcslam.federated.networks import network_to_weights, weights_to_network
 from fcslam.federated.privacy import privatise_update
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names

@@ -24,7 +24,6 @@ from fcslam.errors import FcslamError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.federated.artifacts import DETECTOR
-from fcslam.federated.codec import weights_version
 from fcslam.federated.gate import is_worse
 from fcslam.federated.history import RoundReport
 from fcslam.federated.identity import RobotAuthenticator, read_robot_keys
@@ -34,6 +33,7 @@ from fcslam.federated.launch import open_port, waiting
 from fcslam.federated.lessons import lessons
 from fcslam.federated.live_settings import RELEASE, RELEASES, FleetLearningSettings
 from fcslam.federated.mission_places import MissionPlaces
+from fcslam.federated.networks import weights_version
 from fcslam.federated.releases import Releases
 from fcslam.federated.tls import Address, Certificates
 from fcslam.federated.weights import Weights

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import OutputError, TrainingError
-from fcslam.features.detector import GreyImage
-from fcslam.federated.codec import network_to_weights, weights_to_network, weights_version
+from fcslam.features.detector import GreyImage, network_file
+from fcslam.federated.networks import network_to_weights, weights_to_network, weights_version
 from fcslam.federated.onnx_weights import SUFFIX, read_onnx_weights, with_batch_statistics
 from fcslam.federated.public_images import calibration_images
 from fcslam.federated.settings import FederatedSettings
@@ -37,7 +37,7 @@ def prepare_initial_weights(
     ``folder``, so that other public images later do not change where the run started.
 
     Args:
-        start: checkpoint or ONNX file; None to train on synthetic shapes.
+        start: checkpoint, ONNX file, or name of a network that comes with fcslam; None to train on synthetic shapes.
         folder: of the run.
         settings: of the run.
         options: where and how to compute.
@@ -51,7 +51,7 @@ def prepare_initial_weights(
     """
     if start is None:
         return network_to_weights(train_on_shapes(folder / "shapes", settings.training, options, on_progress))
-    encoder = settings.training.encoder
+    start, encoder = network_file(start), settings.training.encoder
     weights = read_detector_weights(start, encoder)
     if start.suffix != SUFFIX:
         return weights

@@ -10,12 +10,12 @@ from fcslam.config import dump
 from fcslam.errors import OutputError, TrainingError
 from fcslam.federated.artifacts import DETECTOR, write_federated_artifacts
 from fcslam.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
-from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import RobotGrid
 from fcslam.federated.history import RoundReport
 from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.live_settings import GateSettings
+from fcslam.federated.networks import weights_to_network, weights_version
 from fcslam.federated.public_images import calibration_images, public_evaluation, read_public_images
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.strategies import StrategyFactory

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from fcslam.errors import TrainingError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
-from fcslam.federated.codec import network_to_weights, weights_to_network
+from fcslam.federated.networks import network_to_weights, weights_to_network
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import Encoder
@@ -25,7 +25,7 @@ MIN_DEVIATION: Final = 2.0**-8
 
 
 def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
-    """Weights of a network that computes the same as a float32 file.
+    """Weights of a network that computes the same as a file in float32, whose weights may be stored in float16.
 
     The export folded each batch normalisation into the convolution before it. Read back, the normalisation only holds
     the shift, so the network computes the same function. Before training, call ``with_batch_statistics``.
@@ -41,6 +41,9 @@ def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.floa
         raise TrainingError(f"{path}: is no ONNX file ({error})") from error
     weights = network_to_weights(KeypointNetwork(encoder))
     arrays = {array.name: np.array(onnx.numpy_helper.to_array(array)) for array in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Cast" and node.input[0] in arrays:  # stored in float16
+            arrays[node.output[0]] = arrays[node.input[0]].astype(np.float32)
     given: dict[str, NDArray[Any]] = {}
     for node in graph.node:
         found = [arrays[name] for name in node.input[1:] if name in arrays]

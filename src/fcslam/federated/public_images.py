@@ -8,8 +8,8 @@ import torch
 
 from fcslam.errors import TrainingError
 from fcslam.features.detector import GreyImage
-from fcslam.federated.codec import weights_to_network
 from fcslam.federated.evaluation import EvaluateFn, Metrics
+from fcslam.federated.networks import weights_to_network
 from fcslam.federated.weights import Weights
 from fcslam.learning.export import CALIBRATION_IMAGES
 from fcslam.learning.images import find_images, is_usable, read_image

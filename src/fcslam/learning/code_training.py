@@ -27,6 +27,7 @@ from fcslam.learning.objective import rehearsal_loss, revisit_objective
 from fcslam.learning.rehearsal import draw_rehearsal, draw_views
 from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
 from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_step import reduced_precision
 
 _IMAGES_AT_ONCE: Final = 8
 
@@ -116,7 +117,7 @@ def train_codes(
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:
     """Descriptions by both networks of inputs of the trained layers, shape (B, C, H/8, W/8)."""
     given = inputs.float().contiguous(memory_format=torch.channels_last)
-    with torch.autocast(given.device.type, torch.bfloat16):
+    with reduced_precision(given.device):
         described = network.describe(given)
         with torch.no_grad():
             return described, before.describe(given)

@@ -23,6 +23,7 @@ from fcslam.learning.network import cell_probabilities
 from fcslam.learning.objective import grid_shift, shift_grid
 from fcslam.learning.revisit_batches import RevisitExamples, VotedImage, draw_voted
 from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_step import reduced_precision
 from fcslam.records import FloatArray
 
 MOST_GAIN: Final = 20.0
@@ -68,7 +69,7 @@ def train_points(
         voted = draw_voted(revisits, settings.seed, step)
         grey = np.stack([revisits.images[each.image] for each in voted]).astype(np.float32) / 255.0
         images = torch.from_numpy(grey).unsqueeze(1).to(device).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(device.type, torch.bfloat16):
+        with reduced_precision(device):
             logits = network(images).point_logits
             with torch.no_grad():
                 initial = before(images).point_logits

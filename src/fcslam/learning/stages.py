@@ -1,8 +1,8 @@
 """From a folder of images to a trained network: shapes, labels, joint training. Each stage can be resumed.
 
-Without a teacher, a detector first learns corners on synthetic shapes. It then labels the images by homographic
-adaptation, together with Harris's measure. With a teacher, the teacher's keypoints replace those of this detector, and
-its descriptors determine the wanted bits.
+Without a teacher, a detector labels the images by homographic adaptation, together with Harris's measure: the one from
+which training starts, or one that first learns corners on synthetic shapes. With a teacher, the teacher's keypoints
+replace those of this detector, and its descriptors determine the wanted bits.
 """
 
 import zlib
@@ -14,11 +14,11 @@ from typing import Final, overload
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from fcslam.errors import OutputError, TrainingError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
+from fcslam.learning.export import detector_version
 from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
 from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
 from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse_keypoints, read_labels, read_teacher, write_labels
@@ -97,6 +97,7 @@ def train_detector(
     teacher: Path | None,
     on_progress: StageCallback,
     most_images: int | None = None,
+    start: KeypointNetwork | None = None,
 ) -> tuple[KeypointNetwork, TrainingImages]:
     """Train on the images below ``roots``.
 
@@ -108,6 +109,7 @@ def train_detector(
         teacher: folder of a teacher's files; None without a teacher.
         on_progress: called after every step.
         most_images: train on the first ones alone; None for all.
+        start: trained network from which training starts; None to start anew.
 
     Returns:
         The trained network, and the images that it was trained on.
@@ -120,13 +122,16 @@ def train_detector(
     own = folder.resolve()
     files = [file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)]
     _check_usable(files)
-    start: dict[str, Tensor] | None = None
-    detector: Callable[[GreyImage], Response] | None = None
-    if teacher is None:
+    first, device = start, torch.device(options.device)
+    if first is None and teacher is None:
         first = train_on_shapes(folder / "shapes", settings, options, on_progress)
-        start, detector = first.state_dict(), keypoint_response(first, torch.device(options.device))
+    detector = None if first is None or teacher is not None else keypoint_response(first.to(device), device)
     images = read_labelled_images(files, folder / "labels", settings, detector, teacher, on_progress, most_images)
-    run = TrainingRun(settings, "joint", _created(folder / "joint"), options, start, images.checksum())
+    key = images.checksum()
+    if start is not None:
+        key = zlib.crc32(detector_version(start).encode(), key)
+    state = None if first is None else first.state_dict()
+    run = TrainingRun(settings, "joint", _created(folder / "joint"), options, state, key)
     return run.train(
         images.train, images.held_out, _teacher_bits(images.train, settings.seed), partial(on_progress, "joint")
     ), images
@@ -178,7 +183,8 @@ def read_labelled_images(
             )
         else:
             skipped += 1
-        on_progress("labels", TrainingProgress(index + 1, len(files), {}))
+        missing = len(files) if most is None else most - len(train)
+        on_progress("labels", TrainingProgress(index + 1, min(index + 1 + missing, len(files)), {}))
         if len(train) == most:
             break
     if len(train) < FEWEST_IMAGES:

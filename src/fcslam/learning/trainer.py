@@ -87,7 +87,7 @@ class TrainingRun:
         start: dict[str, Tensor] | None = None,
         examples: int = 0,
     ) -> None:
-        """``examples`` is a checksum of what is trained on; a checkpoint of something else is refused."""
+        """``examples`` is a checksum of what is trained on and from; a checkpoint of something else is refused."""
         self.settings, self.stage, self.folder, self.options = settings, stage, folder, options
         self.device = torch.device(options.device)
         with torch.random.fork_rng(devices=[]):
@@ -174,7 +174,9 @@ class TrainingRun:
         if checkpoint.settings != fixed or checkpoint.stage != self.stage:
             raise TrainingError(f"{path}: belongs to a run with other settings; give the same or another --output")
         if checkpoint.examples != self._examples:
-            raise TrainingError(f"{path}: was trained on other images or by another teacher; give another --output")
+            raise TrainingError(
+                f"{path}: was trained on other images, by another teacher or from another start; give another --output"
+            )
         if checkpoint.step > self.settings.steps:
             raise TrainingError(
                 f"{path}: has {checkpoint.step} steps already, more than {self.settings.steps}; give another --output"

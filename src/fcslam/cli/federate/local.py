@@ -11,7 +11,6 @@ from fcslam.cli.federate.options import (
     Public,
     Rounds,
     SettingsFile,
-    Start,
     Strategy,
     federated_settings,
 )
@@ -22,6 +21,7 @@ from fcslam.cli.training_options import (
     TRAINING_OUTPUT,
     Device,
     Quick,
+    Start,
     TrainingSeed,
     compute_budget,
     require_training_libraries,

@@ -22,12 +22,6 @@ _TOO_MUCH = "--insecure, but certificates or keys are given; leave out one or th
 SettingsFile = Annotated[
     Path | None, typer.Option("--config", help="YAML file of federated settings; see docs/howto/federated.md.")
 ]
-Start = Annotated[
-    Path | None,
-    typer.Option(
-        help="Weights to start from: a checkpoint.npz or a detector.onnx.", show_default="training on synthetic shapes"
-    ),
-]
 Public = Annotated[
     list[Path] | None,
     typer.Option(help="Folder of public images, on which the server evaluates detectors. Can be repeated."),

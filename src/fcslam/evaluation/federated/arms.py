@@ -12,9 +12,9 @@ from fcslam.config import Settings, parse
 from fcslam.evaluation.federated.poison import Poison, PoisonedClient
 from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
 from fcslam.federated.client_app import build_client_app
-from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import Context, InProcessGrid
+from fcslam.federated.networks import weights_to_network, weights_version
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork

@@ -40,8 +40,8 @@ from fcslam.evaluation.federated.pairs import (
     measure_pair,
 )
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.federated.codec import weights_to_network
 from fcslam.federated.initial_weights import prepare_initial_weights
+from fcslam.federated.networks import weights_to_network
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.learning.arrays import read_arrays, write_arrays
