@@ -26,15 +26,14 @@ FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 COMMANDS = """\
 # Commands
 
-With this page you find the command and the option that you need. `make docs` writes the page from the code;
+The command `fcslam` has the subcommands and options below. `make docs` writes the page from the code;
 the option `--help` of each command prints the same.
 """
 
 REST = """\
 # REST interface
 
-With this page you find the request that answers your question about a running service. `make docs` writes the page from
-the code.
+A running service answers these HTTP requests for its state, maps and edits. `make docs` writes the page from the code.
 
 - A service on your machine: `fcslam serve --data cloud` listens at `http://127.0.0.1:8340`.
 - `/openapi.json` describes all requests, parameters and answers for programs. `fcslam serve --docs` shows them at

@@ -52,8 +52,8 @@ NO_UNIT = "-"
 HEAD = """\
 # Settings
 
-With these pages you find the setting that you want to change, its default value and its effect. `make docs` writes the
-pages from the code.
+fcslam works with its defaults; change a setting only for a special robot or building. `make docs` writes the pages from
+the code.
 
 ## How to set them
 
@@ -92,21 +92,21 @@ with each mission, so that it can rebuild the mission from its packets.
 ROBOT = """\
 # Settings of the robots
 
-With this page you find the settings that apply on each robot. Commands that map or run a robot read them with
-`--config`. [Settings](settings.md) shows how.
+These settings apply on each robot. Commands that map or run a robot read them with `--config`.
+[Settings](settings.md) shows how.
 """
 
 LIDAR = """\
 # Settings of LiDAR SLAM
 
-With this page you find the settings with which each robot tracks its scans and closes its own loops. Commands that map
-or run a robot read them with `--config`. [Settings](settings.md) shows how.
+With these settings, each robot tracks its scans and closes its own loops. Commands that map or run a robot read them
+with `--config`. [Settings](settings.md) shows how.
 """
 
 TRAINING = """\
 # Settings of training
 
-With this page you find the settings of training on one machine and on several robots.
+Training on one machine and on several robots has configuration files of its own.
 
 ## Training
 
