@@ -25,6 +25,7 @@ PATH = re.compile(r"(?<![\w./<-])(?:\.\./)*(?:[\w.-]+/)*[\w.-]+\.(?:py|md|proto|
 LINK = re.compile(r"\]\(([^)\s]+)\)|src=\"([^\"]+)\"")
 SYMBOL = re.compile(r"`(\w+)`(?:(?:,| and) `(\w+)`)? in `([\w/]+\.py)`")
 INLINE_COMMAND = re.compile(r"`(fcslam [^`\n]+)`")
+BLOCK = re.compile(r"^```.*?^```|^ {4}.*?$", re.MULTILINE | re.DOTALL)
 COMMAND_LINE = re.compile(r"^(?: {4})?(fcslam .+)$", re.MULTILINE)
 TARGET = re.compile(r"(?:^|`| {4})make ([a-z-]+)", re.MULTILINE)
 TEST = re.compile(r"`(test_\w+)`")
@@ -57,7 +58,7 @@ def read(path: str) -> str:
 
 def commands(text: str) -> Iterator[tuple[str, bool]]:
     """Every command named, and whether it stands on a line of its own: then it must be complete."""
-    yield from ((line, True) for line in COMMAND_LINE.findall(text))
+    yield from ((line, True) for block in BLOCK.findall(text) for line in COMMAND_LINE.findall(block))
     yield from ((line, False) for line in INLINE_COMMAND.findall(text))
 
 
