@@ -30,7 +30,7 @@ from fcslam.cli import main
 from fcslam.geometry import se2
 from fcslam.sources import open_source, write_carmen
 from tests.sources.test_bag_robots import fleet_bag
-from tests.test_docs import COMMAND_LINE, PAGES, ROOT
+from tests.test_docs import PAGES, ROOT, command_lines
 
 LISTED: dict[str, Any] = yaml.safe_load((ROOT / "tests" / "commands_of_docs.yaml").read_text(encoding="utf-8"))
 EXECUTED: dict[str, list[str]] = LISTED["executed"]
@@ -60,7 +60,7 @@ PATIENCE_S = 300.0
 
 def shown() -> set[str]:
     """Every command of fcslam on a line of its own in the README and docs/."""
-    lines = (line for page in PAGES_WITH_COMMANDS for line in COMMAND_LINE.findall(page.read_text(encoding="utf-8")))
+    lines = (line for page in PAGES_WITH_COMMANDS for line in command_lines(page.read_text(encoding="utf-8")))
     return {line.partition(" #")[0].strip() for line in lines}
 
 

@@ -56,9 +56,15 @@ def read(path: str) -> str:
     return next(folder / path for folder in (PACKAGE, ROOT) if (folder / path).is_file()).read_text(encoding="utf-8")
 
 
+def command_lines(text: str) -> Iterator[str]:
+    """Every command on a line of its own in a block of code."""
+    for block in BLOCK.findall(text):
+        yield from COMMAND_LINE.findall(block)
+
+
 def commands(text: str) -> Iterator[tuple[str, bool]]:
     """Every command named, and whether it stands on a line of its own: then it must be complete."""
-    yield from ((line, True) for block in BLOCK.findall(text) for line in COMMAND_LINE.findall(block))
+    yield from ((line, True) for line in command_lines(text))
     yield from ((line, False) for line in INLINE_COMMAND.findall(text))
 
 
