@@ -51,7 +51,7 @@ LOST_VIOLATION = 0.30
 LEAST_OVERLAP = 0.25
 """Least share of all points in known area; below it, nothing is decided."""
 LARGEST_UNSEEN_M = 15.0
-"""A robot that moved farther between two scans is lost: nobody saw the way, metres."""
+"""A robot that moved farther than this, in metres, between two scans is lost: nobody saw the way."""
 
 
 class LostConfig(Settings):

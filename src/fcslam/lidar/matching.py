@@ -43,9 +43,9 @@ WIDE_SCALE_M = 0.30
 NARROW_SCALE_M = 0.06
 """Scale of the robust loss at the last step, metres."""
 POINT_SIGMA_M = 0.03
-"""Standard deviation of a point's distance; wide, as errors of neighbours are correlated, metres."""
+"""Standard deviation of a point's distance, metres; wide, as errors of neighbours are correlated."""
 EXPLAINED_M = 0.10
-"""A point this close to its surface lies on it, metres."""
+"""Distance, in metres, up to which a point lies on its surface."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,11 +38,10 @@ _NO_INFORMATION = np.zeros((3, 3))
 
 
 STILL_M = 0.005
-"""A robot that moved less than this and turned less than ``STILL_RAD`` since the last match stands still; its scans
-are not matched, metres."""
+"""Motion since the last match, in metres, below which a robot stands still if it also turned less than ``STILL_RAD``.
+Its scans are not matched then."""
 STILL_RAD = 0.003
-"""A robot that turned less than this and moved less than ``STILL_M`` since the last match stands still; its scans are
-not matched, radians."""
+"""Turn since the last match, in radians, below which a robot stands still if it also moved less than ``STILL_M``."""
 POINT_SPACING_M = 0.05
 """Least distance between consecutive points of a scan that are matched, metres."""
 POINT_LIMIT = 180

@@ -24,9 +24,9 @@ MINIMUM_INLIERS = 4
 MOST_HYPOTHESES = 2
 """Most motion hypotheses of a pair of places."""
 DISTINCT_M = 1.0
-"""Two motion hypotheses are distinct if their positions differ by more, metres."""
+"""Distance of two motion hypotheses, in metres, from which on they are distinct."""
 DISTINCT_RAD = 0.26
-"""Two motion hypotheses are distinct if their angles differ by more, radians."""
+"""Angle between two motion hypotheses, in radians, from which on they are distinct."""
 
 
 @dataclass(frozen=True, slots=True)

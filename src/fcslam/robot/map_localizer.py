@@ -50,7 +50,7 @@ SUPPORTED = 0.30
 CHECK_EVERY_M = 2.0
 """Travel between two comparisons with the map, metres."""
 CHECKED_M = 5.0
-"""The walls that are compared are of the last metres, metres."""
+"""Travel, in metres, whose walls are compared with the map."""
 LEAST_OVERLAP = 0.25
 """Least share of the walls in known area; below it, nothing is compared."""
 DOUBTED = 0.80

@@ -16,7 +16,7 @@ LEAST_BRIDGE_M, LEAST_BRIDGE_RAD = 0.02, 0.02
 WITHOUT_CLOCK_S = 2.0
 """Scans with equal stamps may be so far apart: some logs were recorded without a clock, a scan every two metres."""
 SLACK_M = 1.0
-"""Length allowed to any step, as stamps may be wrong, metres."""
+"""Length allowed to any step, metres, as stamps may be wrong."""
 SLACK_RAD = 1.5
 """Turn allowed to any step, radians."""
 

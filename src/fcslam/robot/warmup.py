@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fcslam.lidar.facing import contradicted_facing
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.lost import FEWEST_SCANS, is_lost
 from fcslam.records import LaserModel, LaserScan, Sweep, frozen
@@ -20,8 +21,9 @@ _ROOM, _OTHER_ROOM = (6.0, 4.5), (5.7, 4.2)
 def warm_up_tracking(config: RobotConfig) -> None:
     """Compile, or load from the cache, all code that the pose of a scan may need.
 
-    A simulated robot crosses a room and is put down in another one, so it is lost and searches. Garbage collection
-    would take longer than a scan, so it excludes all objects that are in memory then.
+    A simulated robot crosses a room and is put down in another one, so it is lost and searches. Its laser is
+    compared with the odometry. Garbage collection would take longer than a scan, so it excludes all objects that are in
+    memory then.
     """
     frontend = LidarFrontend("warm-up", config.lidar)
     scans = list(_scans(_ROOM, 0.0))
@@ -30,6 +32,7 @@ def warm_up_tracking(config: RobotConfig) -> None:
     elsewhere = list(_scans(_OTHER_ROOM, scans[-1].stamp))[:FEWEST_SCANS]
     first = frontend.localize(elsewhere[0]).tracked
     is_lost(elsewhere, first.T_local_base, frontend)
+    contradicted_facing(scans)
     gc.collect()
     gc.freeze()
 
