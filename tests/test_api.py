@@ -176,7 +176,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_th
         ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
         ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),
         ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.ConfigError, "nobody"),
-        ({"output": "LOG"}, fcslam.OutputError, "no run folder"),
+        ({"output": "LOG"}, fcslam.OutputError, "is not a run folder"),
         ({"bag_options": fcslam.BagOptions(scan_topics=("/scan",))}, fcslam.SourceError, "ROS bags only"),
     ],
 )

@@ -129,7 +129,7 @@ def test_a_second_run_needs_force_and_leaves_nothing_of_the_first(tmp_path, run)
 def test_a_folder_that_is_no_run_is_never_replaced(tmp_path, run, force):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
-    with pytest.raises(OutputError, match="no run folder"):
+    with pytest.raises(OutputError, match="is not a run folder"):
         run.save(tmp_path / "thesis", force=force)
     assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
 
@@ -215,9 +215,9 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
         ("trajectories/robot_1.tum", "1 2 3 0 0 0 0 x\n", "robot_1.tum"),
         ("trajectories/robot_1.tum", None, "robot_1.tum"),
         ("robots.csv", "robot,map\nrobot_1,0\n", "line 2"),
-        ("robots.csv", "robot,map,path_length_m,scans\n../../x,0,1,1\n", "no robot's name"),
+        ("robots.csv", "robot,map,path_length_m,scans\n../../x,0,1,1\n", "is not a robot's name"),
         ("robots.csv", "robot,map,path_length_m,scans\nrobot_1,zero,1,1\n", "zero"),
-        ("robots.csv", "robot,map,path_length_m,scans,floor\nrobot_1,0,1,1,<b>\n", "'<b>' is no floor"),
+        ("robots.csv", "robot,map,path_length_m,scans,floor\nrobot_1,0,1,1,<b>\n", "'<b>' is not a floor"),
         ("closures.csv", "robot_i\nrobot_1\n", "closures.csv, line 2"),
         ("closures.csv", None, "closures.csv"),
         ("local/robot_1.tum", None, "robot_1.tum"),
@@ -326,8 +326,8 @@ def test_a_broken_description_of_a_map_is_refused(description):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [("resolution: 0.05", "res: 0.05", "`resolution` in the description is missing"),
-     ("0.05", "fine", "`resolution` in the description is no finite number"),
-     ("0.65", "[1]", "`occupied_thresh` in the description is no finite number"),
+     ("0.05", "fine", "`resolution` in the description is not a finite number"),
+     ("0.65", "[1]", "`occupied_thresh` in the description is not a finite number"),
      ("3.5, 0.0", "3.5", "`origin` in the description must be"), ("negate: 0", "negate: 1", "needs `negate` 0")],
 )  # fmt: skip
 def test_the_message_names_the_key_that_is_wrong(old, new, message):

@@ -47,7 +47,7 @@ def changed(settings: SettingsType, content: dict[str, Any], where: str) -> Sett
     """The settings with the keys of ``content`` changed, checked as a whole; ``where`` names its origin in messages.
 
     Raises:
-        ConfigError: as of ``parse``.
+        ConfigError: see ``parse``.
     """
     return parse(type(settings), _merged(settings.model_dump(), content), where)
 

@@ -37,7 +37,7 @@ class Leg:
     robot: str
     packets: tuple[SizedPacket, ...]
     stamps: tuple[float, ...]
-    """Of the scans, seconds."""
+    """Stamps of the scans, seconds."""
     tracks: Mapping[str, Track] = field(default_factory=dict)
     """All scans, by the name of the session; empty before the last leg."""
     faults: Faults | None = None
@@ -122,7 +122,7 @@ def on_floor(legs: Iterator[Leg], floor: str) -> Iterator[Leg]:
 
 
 def continued(legs: Iterator[Leg], first_epoch: int) -> Iterator[Leg]:
-    """The legs of a robot that had so many sessions before."""
+    """The legs of a robot, with sessions renumbered from ``first_epoch``."""
     if first_epoch == 0:
         yield from legs
         return

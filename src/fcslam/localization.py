@@ -46,7 +46,7 @@ class LocalizationProgress:
     scans: int
     is_localized: bool
     quality: float
-    """Of the newest pose; 0 where the robot is not localised."""
+    """Quality of the newest pose; 0 where the robot is not localised."""
 
 
 def read_map(path: Path, floor: str = "") -> OccupancyMap:
@@ -165,7 +165,7 @@ class LocalizedDrive:
 
     @property
     def quality(self) -> float:
-        """Of the newest pose; 0 without one."""
+        """Quality of the newest pose; 0 without one."""
         return self._rows[-1] if self._rows else 0.0
 
     def add(self, stamp: float, travel_m: float, T_odom_base: FloatArray, estimate: MapEstimate | None) -> None:

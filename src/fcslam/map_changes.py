@@ -50,7 +50,7 @@ def find_changes(folder: Path, since: str | None = None, until: str | None = Non
         map_index: number of the map.
 
     Raises:
-        EvaluationError: ``folder`` is no run folder, or it is broken.
+        EvaluationError: ``folder`` is not a run folder, or it is broken.
         SourceError: it has no mission file or no such map, its robots sent words only, or a time is unknown or before
             the first period.
     """

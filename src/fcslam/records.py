@@ -79,7 +79,7 @@ class LaserModel:
         return Beams(self.beam_count, self.angle_min_rad, self.angle_increment_rad)
 
     def with_beams(self, beams: Beams) -> "LaserModel":
-        """The same laser with other beams, as of another scan."""
+        """The same laser with other beams, for example of another scan."""
         return self if beams == self.beams else LaserModel(*beams, self.max_range_m, self.T_base_laser)
 
 
@@ -473,7 +473,7 @@ class Removal:
 
     robot: str
     epoch: int | None = None
-    """Of the session; None: all sessions of the robot, later ones as well."""
+    """Epoch of the session; None: all sessions of the robot, later ones as well."""
 
     def covers(self, robot: str, epoch: int) -> bool:
         """Whether it removes this session."""
@@ -504,7 +504,7 @@ class Pin:
     robot_i: str
     robot_j: str
     stamps: tuple[float, float]
-    """Of the keyscans of i and j."""
+    """Stamps of keyscans i and j."""
 
     def confirms(self, robot_i: str, stamp_i: float, robot_j: str, stamp_j: float) -> bool:
         """Whether the pin is of this closure, in either order of its ends."""
@@ -572,7 +572,7 @@ class Undo:
     """A user's statement that an earlier edit is not in force any more."""
 
     number: int
-    """Of the edit."""
+    """Number of the edit."""
 
 
 Change = Veto | Removal | Cut | Pin | ManualClosure | Placement | MapRegion | FloorLabel

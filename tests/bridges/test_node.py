@@ -214,7 +214,7 @@ def test_nobody_on_the_network_chooses_a_folder(network, robot, tmp_path, monkey
         save(network, name)
         wait_for(lambda: said)
     assert list(tmp_path.iterdir()) == []
-    assert "is no name; give letters" in said[0]
+    assert "is not a name; give letters" in said[0]
 
 
 def test_the_finish_service_ends_the_drive(network, robot):

@@ -92,13 +92,13 @@ def test_addresses():
     assert parse_address("ros2:/robot1") == RosAddress("ros2", "/robot1")
     assert parse_address("ros1:/").namespace == parse_address("ros2:").namespace == ""
     assert parse_address("ros2:/fleet/anna/").robot == "anna"
-    with pytest.raises(NetworkError, match="'robot1' is no namespace; give one as in ros2:/robot1"):
+    with pytest.raises(NetworkError, match="'robot1' is not a namespace; give one as in ros2:/robot1"):
         parse_address("ros2:robot1")
 
 
 @pytest.mark.parametrize("domain", [233, -1])
 def test_a_domain_out_of_range(domain):
-    with pytest.raises(NetworkError, match="no domain of ROS 2"):
+    with pytest.raises(NetworkError, match="is not a domain of ROS 2"):
         open_network(RosAddress("ros2", ""), domain, {})
 
 

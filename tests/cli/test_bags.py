@@ -155,7 +155,7 @@ def test_a_pose_that_is_none(tmp_path, bag, capsys, pose):
 @pytest.mark.parametrize("band", ["0.6,0.1", "0.1", "low,high", "0.1,0.6,-1", "0.1,nan", "0.1,0.6,0.4,2"])
 def test_a_band_of_heights_that_is_none(tmp_path, bag, capsys, band):
     said = refused(capsys, "map", bag, "--cloud-band", band, "-o", tmp_path / "run")
-    assert f"--cloud-band '{band}' is no band of heights" in said
+    assert f"--cloud-band '{band}' is not a band of heights" in said
 
 
 def test_bad_bags_leave_nothing(tmp_path, capsys):

@@ -209,5 +209,5 @@ def test_a_number_that_is_none_is_refused(tmp_path, capsys, number):
     arguments = ["simulate", "-o", str(tmp_path / "s"), f"--path-length={number}", "--robots", "1"]
     assert main(arguments) == BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"{number}: is no finite number" in line
+    assert f"{number}: is not a finite number" in line
     assert not (tmp_path / "s").exists()

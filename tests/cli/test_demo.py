@@ -82,7 +82,7 @@ def refused(output, capsys, *more):
 def test_what_is_no_demo_is_left_alone(tmp_path, capsys):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "notes").write_text("mine")
-    assert "holds something that is no demo" in refused(tmp_path, capsys, "--no-camera")
+    assert "holds something that is not a demo" in refused(tmp_path, capsys, "--no-camera")
     assert (tmp_path / "run" / "notes").read_text() == "mine"
     assert "cannot be used as the output folder" in refused(tmp_path / "run" / "notes", capsys, "--no-camera")
 

@@ -176,7 +176,7 @@ TOLERATED = {
     "a cut last line": ([*drive(40), flaser(108.2, pose_at(41))[:30]], ["broken lines skipped: 1 (first: line 81)"]),
     "ranges that are no number": (
         damaged(drive(40), line_21=flaser(102.0, pose_at(10), ranges=(1.0,) * 5 + (float("nan"),) * 3)),
-        ["no finite number made invalid: 3 (first: line 22"],
+        ["not finite made invalid: 3 (first: line 22"],
     ),
     "negative ranges": (
         damaged(drive(40), line_21=flaser(102.0, pose_at(10), ranges=(-1.0,) * 8)),
@@ -324,7 +324,7 @@ def test_a_veto_of_robots_that_are_not_there_is_refused(tmp_path, log, capsys):
     assert "a veto names 'nobody'" in refused(capsys, tmp_path, log, "--veto", vetoes, "--output", tmp_path / "run")
 
 
-@pytest.mark.parametrize(("force", "reason"), [((), "no run folder"), (("--force",), "no run folder")])
+@pytest.mark.parametrize(("force", "reason"), [((), "not a run folder"), (("--force",), "not a run folder")])
 def test_a_folder_that_is_not_a_run_is_never_touched(tmp_path, log, capsys, force, reason):
     run = tmp_path / "run"
     run.mkdir()
@@ -344,7 +344,7 @@ def test_a_run_is_only_replaced_with_force(tmp_path, log, capsys):
 
 def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
     assert "output folder" in refused(capsys, tmp_path, log, "--output", log / "run")
-    assert "no run folder" in refused(capsys, tmp_path, log, "--output", log, "--force")
+    assert "not a run folder" in refused(capsys, tmp_path, log, "--output", log, "--force")
     assert log.read_text().startswith("ODOM")
 
 

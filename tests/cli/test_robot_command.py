@@ -76,11 +76,11 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
     ("arguments", "reason"),
     [
         (["--server", "cloud"], "not the address of a cloud"),
-        (["--speed", "fast"], "--speed 'fast' is no speed"),
-        (["--speed", "-1"], "no speed"),
-        (["--speed", "nan"], "no speed"),
+        (["--speed", "fast"], "--speed 'fast' is not a speed"),
+        (["--speed", "-1"], "is not a speed"),
+        (["--speed", "nan"], "is not a speed"),
         (["--name", "r+2"], "how a later start of 'r' is called"),
-        (["--name", "r/2"], "is no name"),
+        (["--name", "r/2"], "is not a name"),
         (["--token-file", "nowhere"], "no token can be read"),
         (["--certificate", "nowhere"], "--certificate and --key belong together"),
         (

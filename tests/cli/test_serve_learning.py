@@ -17,10 +17,10 @@ from fcslam.robot.frontend import RobotConfig
     [
         (["--learn-server", "localhost:1"], "need --learn"),
         (["--robot-key", "r.pub"], "need --learn"),
-        (["--learn", "--learn-server", "localhost"], "is no HOST:PORT"),
+        (["--learn", "--learn-server", "localhost"], "is not a HOST:PORT"),
         (["--learn", "--learn-server", "192.0.2.1:8341"], "everybody who reaches 192.0.2.1:8341 could train"),
         (["--learn", "--learn-ca", "ca.pem"], "--learn-ca and --robot-key belong together"),
-        (["--learn", "--robot-key", "nowhere.pub"], "is no public key"),
+        (["--learn", "--robot-key", "nowhere.pub"], "is not a public key"),
         (["--learn", "--learn-config", "all.yaml"], "set federated.trained to codes"),
         (["--learn", "--learn-config", "few.yaml"], "fewest_pairs"),
         (["--learn", "--store", "postgresql://u@h/d"], "leave out --store"),

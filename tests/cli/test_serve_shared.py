@@ -87,7 +87,7 @@ def test_a_name_that_is_taken_or_none_is_told(postgres, postgres_server, tmp_pat
     assert Registry(postgres, "hall", "another process").register(1)
     line = refused([postgres_server.url, "--instance", "hall"], tmp_path, capsys)
     assert "another instance is called 'hall'" in line
-    assert "is no name" in refused([postgres_server.url, "--instance", "two words"], tmp_path, capsys)
+    assert "is not a name" in refused([postgres_server.url, "--instance", "two words"], tmp_path, capsys)
 
 
 @pytest.mark.slow

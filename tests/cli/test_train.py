@@ -90,7 +90,7 @@ def test_training_starts_from_given_weights(file, photos, tmp_path, capsys):
     assert "from another start" in complaint(
         capsys, photos, "-o", second, "--config", settings, "--start", second / file
     )
-    assert "is no checkpoint" in complaint(capsys, photos, "-o", third, "--start", photos / "0.png")
+    assert "is not a checkpoint" in complaint(capsys, photos, "-o", third, "--start", photos / "0.png")
     assert "holds no body" in complaint(capsys, photos, "-o", third, "--start", "vgg")
 
 
@@ -98,7 +98,7 @@ def test_bad_input_is_one_line(photos, tmp_path, capsys):
     pytest.importorskip("torch", reason="needs fcslam[train]")
     output = tmp_path / "out"
     (tmp_path / "empty").mkdir()
-    assert "is no folder" in complaint(capsys, tmp_path / "nowhere", "-o", output)
+    assert "is not a folder" in complaint(capsys, tmp_path / "nowhere", "-o", output)
     assert "holds no image" in complaint(capsys, tmp_path / "empty", "-o", output)
     assert "encoder" in complaint(capsys, photos, "-o", output, "--encoder", "huge")
     assert "x.npz" not in complaint(capsys, photos, "-o", output, "--teacher", tmp_path / "empty")

@@ -149,6 +149,6 @@ def test_a_file_of_another_kind_is_not_replaced(with_descriptors, tmp_path, caps
     recording.write_bytes(b"a recording")
     assert main(["vocabulary", str(with_descriptors), "-o", str(recording)]) == 2
     assert recording.read_bytes() == b"a recording"
-    assert "is no vocabulary, so it stays" in capsys.readouterr().err
+    assert "is not a vocabulary, so it stays" in capsys.readouterr().err
     words = tmp_path / "building.words"
     assert [main(["vocabulary", str(with_descriptors), "-o", str(words), "--words", "16"]) for _ in range(2)] == [0, 0]

@@ -154,7 +154,7 @@ def test_images_whose_pose_is_not_known_are_left_out(tmp_path):
     ("name", "content", "message"),
     [
         ("nothing.txt", "", "no set of places"),
-        ("dataset.csv", "image,label\nclip.jpg,1\n", "no <clip>_frame_<number>"),
+        ("dataset.csv", "image,label\nclip.jpg,1\n", "not a <clip>_frame_<number>"),
         ("dataset.csv", "picture\nclip_frame_1.jpg\n", "KeyError"),
         ("loop_pairs.txt", "1 2 30\n", "image 1, which is not there"),
         ("matches.csv", "query,gallery,relation\na.png,b.png,match\n", "not both there"),

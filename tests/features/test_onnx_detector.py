@@ -99,8 +99,8 @@ def test_settings_bound_what_is_kept(weights):
     [
         ({"form": "2"}, "its format is 2, not 1"),
         ({"form": None}, "its format is none"),
-        ({"version": None}, "is no detector version"),
-        ({"version": "a b"}, "'a b' is no detector version"),
+        ({"version": None}, "is not a detector version"),
+        ({"version": "a b"}, "'a b' is not a detector version"),
         ({"bits": 128}, r"\(128, 3, 5\) logits"),
         ({"stride": 4}, r"\(256, 6, 10\) logits"),
         ({"outputs": ("heat", "codes")}, "does not run"),

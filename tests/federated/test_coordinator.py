@@ -400,7 +400,7 @@ def test_a_checkpoint_of_a_version_without_some_setting_is_told_as_such(tmp_path
     with pytest.raises(TrainingError, match=r"comes from another version of fcslam \(smoothing\)"):
         run([Fake("a")], tmp_path)
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
-    with pytest.raises(TrainingError, match="is no checkpoint"):
+    with pytest.raises(TrainingError, match="is not a checkpoint"):
         run([Fake("a")], tmp_path)
 
 

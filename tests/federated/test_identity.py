@@ -87,7 +87,7 @@ def test_keys_are_named_after_their_robots(tmp_path):
     assert known["one"] == read_private_key(tmp_path / "one").public_key()
     with pytest.raises(TrainingError, match=r"one\.pub: another key is that of one too"):
         read_robot_keys([tmp_path / "one.pub", tmp_path / "one.pub"])
-    with pytest.raises(TrainingError, match="is no public key"):
+    with pytest.raises(TrainingError, match="is not a public key"):
         read_robot_keys([tmp_path / "one"])
-    with pytest.raises(TrainingError, match="is no private key"):
+    with pytest.raises(TrainingError, match="is not a private key"):
         read_private_key(tmp_path / "one.pub")

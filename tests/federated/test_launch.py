@@ -51,7 +51,7 @@ def test_an_output_folder_that_cannot_be_written_is_told(tmp_path):
 def test_an_ipv6_address_keeps_its_brackets_outside():
     assert parse_address("[::1]:8000") == Address("::1", 8000)
     assert str(parse_address("[::1]:8000")) == "[::1]:8000"
-    with pytest.raises(TrainingError, match="is no HOST:PORT"):
+    with pytest.raises(TrainingError, match="is not a HOST:PORT"):
         parse_address("[]:8000")
 
 

@@ -67,7 +67,7 @@ def test_training_goes_on_from_the_version_in_use(releases):
 
 def test_a_folder_with_something_else_is_one_line(releases):
     (releases.folder / "releases.json").write_text("[]")
-    with pytest.raises(TrainingError, match="is no list of releases"):
+    with pytest.raises(TrainingError, match="is not a list of releases"):
         Releases.opened(releases.folder, b"", "light-0")
 
 

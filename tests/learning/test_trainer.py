@@ -132,7 +132,7 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeyp
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])
 def test_a_foreign_checkpoint_is_said(examples, tmp_path, content):
     (tmp_path / CHECKPOINT_FILE).write_bytes(content)
-    with pytest.raises(TrainingError, match=r"checkpoint\.npz: is no checkpoint"):
+    with pytest.raises(TrainingError, match=r"checkpoint\.npz: is not a checkpoint"):
         TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
 
 

@@ -144,7 +144,7 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_p
     assert "leave the floor out" in refusal(tmp_path / "wide.yaml", floor="2")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "robots.csv").write_text("robot,map,path_length_m,scans,floor\na,0,1,1,two words\n")
-    assert "broken run folder ('two words' is no floor)" in refusal(tmp_path / "run", floor="2")
+    assert "broken run folder ('two words' is not a floor)" in refusal(tmp_path / "run", floor="2")
 
 
 def test_a_mission_file_is_a_map(fleet, tmp_path):

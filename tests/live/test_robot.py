@@ -274,7 +274,7 @@ def test_the_number_of_beams_may_vary_from_scan_to_scan():
         ({"ranges_m": [1.0]}, r"ranges_m: shape \(1,\), but the laser has about 180 beams"),
         ({"ranges_m": np.ones(90)}, r"ranges_m: shape \(90,\), but the laser has about 180 beams"),
         ({"ranges_m": "far"}, "ranges_m: not an array of numbers"),
-        ({"stamp": math.nan}, "stamp: nan is no time"),
+        ({"stamp": math.nan}, "stamp: nan is not a time"),
         ({"odometry": (0.0, 0.0)}, "odometry: .* is not a pose"),
         ({"odometry": (0.0, math.nan, 0.0)}, "odometry: .* is not a pose"),
         ({"laser": "rear"}, "laser 'rear' is not known"),
@@ -294,7 +294,7 @@ def test_a_scan_that_cannot_be_is_refused_and_the_next_one_is_not(robot, scans, 
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        ({"name": "a/b"}, "'a/b' is no name"),
+        ({"name": "a/b"}, "'a/b' is not a name"),
         ({"name": "a+1"}, "give the robot another name"),
         ({"laser": fcslam.LaserModel(360, 0.0, 1.0, 10.0)}, "are not of one turn"),
         ({"laser": fcslam.LaserModel(1, 0.0, 0.1, 10.0)}, "are not of one turn"),
@@ -374,7 +374,7 @@ def test_an_image_without_a_camera_is_one_line(robot, scans):
     ("change", "reason"),
     [
         ({"fx": 0.0}, "a focal length above 0"),
-        ({"T_base_camera": fcslam.Transform((0, 0, 0), (0, 0, 0, 2))}, "no unit"),
+        ({"T_base_camera": fcslam.Transform((0, 0, 0), (0, 0, 0, 2))}, "not a unit"),
     ],
 )
 def test_a_camera_that_cannot_be_is_one_line(change, reason):

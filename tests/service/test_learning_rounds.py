@@ -31,7 +31,7 @@ def test_before_the_first_round_there_is_none(tmp_path):
 )
 def test_a_damaged_table_is_refused(tmp_path, content):
     (tmp_path / ROUNDS_FILE).write_bytes(content)
-    with pytest.raises(EvaluationError, match="no table of rounds"):
+    with pytest.raises(EvaluationError, match="not a table of rounds"):
         read_rounds(tmp_path)
 
 

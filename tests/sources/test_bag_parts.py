@@ -100,7 +100,7 @@ def test_what_is_no_part(tmp_path):
     log.write_text("FLASER 2 1 1 0 0 0 0 0 0 1 host 1\n")
     assert "a file is given twice" in refusal_of_parts([bag, tmp_path / "." / "run.bag"])
     assert "bags of ROS 1 and of ROS 2" in refusal_of_parts([bag, save(tmp_path / "run.mcap", drive(20))])
-    assert "a CARMEN log is no part of several" in refusal_of_parts([bag, log])
+    assert "a CARMEN log is not a part of several" in refusal_of_parts([bag, log])
     assert "no such file" in refusal_of_parts([bag, tmp_path / "run_2.bag"])
 
 

@@ -81,7 +81,7 @@ def missing(step, values, value, share=0.4):
 @pytest.mark.parametrize("value", [10.0, 0.15, 1.0, 5.6])
 def test_a_placeholder_is_no_range(tmp_path, value):
     source = open_source(bag(tmp_path / "run.bag", lambda step, values: missing(step, values, value)))
-    assert f"{value:g} m repeats exactly in many beams of /scan everywhere, so it is no range" in " ".join(
+    assert f"{value:g} m repeats exactly in many beams of /scan everywhere, so it is not a range" in " ".join(
         source.survey().notes
     )
     for step, one in enumerate(scans_of(source)):

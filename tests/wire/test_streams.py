@@ -193,5 +193,5 @@ def test_keypoints_out_of_order_are_refused():
 
 
 def test_the_smallest_16_bit_number_is_no_keypoint():
-    with pytest.raises(PacketError, match="no 16-bit number of steps"):
+    with pytest.raises(PacketError, match="is not a 16-bit number of steps"):
         unpack_keypoints(np.array([[-32768, 0]], "<i2").tobytes(), 1, 2)

@@ -42,7 +42,9 @@ def parse_address(text: str) -> RosAddress:
     assert match is not None  # as is_address says
     namespace = match[2].rstrip("/")
     if not _NAMESPACE.fullmatch(namespace):
-        raise NetworkError(f"{text}: {match[2]!r} is no namespace; give one as in {match[1]}:/robot1, or {match[1]}:/")
+        raise NetworkError(
+            f"{text}: {match[2]!r} is not a namespace; give one as in {match[1]}:/robot1, or {match[1]}:/"
+        )
     return RosAddress(match[1], namespace)
 
 
@@ -60,7 +62,7 @@ def open_network(
         return Ros1Network()
     text = environment.get("ROS_DOMAIN_ID") or "0" if domain is None else str(domain)
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
-        raise NetworkError(f"{text!r} is no domain of ROS 2; give a number from 0 to {_LARGEST_DOMAIN}")
+        raise NetworkError(f"{text!r} is not a domain of ROS 2; give a number from 0 to {_LARGEST_DOMAIN}")
     if address.network == "zenoh":
         from fcslam.bridges.ros2_zenoh import ZenohNetwork
 

@@ -1,6 +1,6 @@
 """The interface of a ROS network, whatever carries the messages.
 
-Messages are bytes here; ``sources.bags.codec`` decodes them, like those of bags.
+Messages are bytes here; ``sources.bags.codec`` decodes them, as for bags.
 """
 
 from collections.abc import Callable, Sequence
@@ -56,7 +56,7 @@ class RosNetwork(Protocol):
     """A connection to a ROS network."""
 
     ros1: bool
-    """Whether messages are those of ROS 1."""
+    """Whether messages are in the format of ROS 1."""
 
     def endpoints(self) -> Sequence[Endpoint]:
         """The publishers and subscriptions that are known now."""

@@ -342,7 +342,7 @@ class RobotNode:
         try:
             name = self._robot.name if payload is None else self._codec.decode(payload, STRING).data or self._robot.name
             if not NAME.fullmatch(name):  # anybody on the network may send it
-                raise ValueError(f"{name!r} is no name; give letters, digits and . _ -, without a folder")
+                raise ValueError(f"{name!r} is not a name; give letters, digits and . _ -, without a folder")
             occupancy = self._robot.map()
             write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
             write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))

@@ -30,7 +30,7 @@ TRANSFORMED: Final = Quality(reliable=True, depth=100)
 
 GRID_VALUES: Final = {Occupancy.UNKNOWN: -1, Occupancy.FREE: 0, Occupancy.OCCUPIED: 100}
 SMALL_MAP_CELLS: Final = 1_000_000
-"""A map of at most so many cells is published whole at every change."""
+"""Largest number of cells of a map that is published whole at every change."""
 PATH_STEP_M: Final = 0.1
 """Least distance between two poses of the published path."""
 LONGEST_PATH: Final = 5000

@@ -43,5 +43,7 @@ def load_parameters(path: Path | None) -> NodeParameters:
         raise ConfigError(f"{path}: has no parameters; write `fcslam: {{ros__parameters: {{...}}}}`")
     nodes = [node[_PARAMETERS] for node in content.values() if isinstance(node, dict) and _PARAMETERS in node]
     if len(nodes) > 1:
-        raise ConfigError(f"{path}: has parameters of {len(nodes)} nodes; give a file with those of fcslam only")
+        raise ConfigError(
+            f"{path}: has parameters of {len(nodes)} nodes; give a file with the parameters of fcslam only"
+        )
     return parse(NodeParameters, nodes[0] if nodes else content, str(path))

@@ -34,7 +34,7 @@ _MESSAGES_TAKEN = 64
 _WAIT_NS = 200_000_000
 _BLOCKING_NS = 100_000_000
 _HEADER_BYTES, _IDENTITY_BYTES = 4, 16
-"""Of a message: its encoding. Of a request: the caller and the number of the request."""
+"""Sizes of a message's encoding header, and of the caller and number in front of a request."""
 _TOPIC = re.compile(r"rt(/.+)")
 _PEER = re.compile(r"[\w.:-]+", re.ASCII)
 
@@ -207,14 +207,16 @@ def configuration(environment: Mapping[str, str]) -> str:
     comes last and overrides them.
 
     Raises:
-        NetworkError: a peer is no address.
+        NetworkError: a peer is not an address.
     """
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET").upper()
     local = reach in ("LOCALHOST", "OFF") or environment.get("ROS_LOCALHOST_ONLY") == "1"
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not _PEER.fullmatch(peer):
-            raise NetworkError(f"ROS_STATIC_PEERS has {peer!r}, which is no address; separate addresses by semicolons")
+            raise NetworkError(
+                f"ROS_STATIC_PEERS has {peer!r}, which is not an address; separate addresses by semicolons"
+            )
     # A node that is limited to this computer sends from the loopback interface, and Cyclone hears its own interfaces
     # only.
     interfaces = [f'address="{_LOOPBACK}"'] * (local and reach != "OFF")

@@ -105,11 +105,11 @@ class LiveSensors:
         """By the topic of camera_info."""
         self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]
         self._frames: dict[str, str] = {}
-        """Of the scans on each topic."""
+        """Coordinate frame of the scans on each topic."""
         self._awaited: dict[str, str] = {}
         """Topics whose messages cannot be scans before tf and a calibration are known, and a line that says it."""
         self._joiners: dict[int, SectorJoiner] = {}
-        """Of the lasers whose messages are sectors of a turn."""
+        """Joiner of each laser whose messages are sectors of a turn."""
         self._rig: Rig | None = None
         self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()

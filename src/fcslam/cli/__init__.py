@@ -175,11 +175,11 @@ def _finite(text: str) -> float:
 
     Raises:
         InputError: it is not finite.
-        ValueError: it is no number.
+        ValueError: it is not a number.
     """
     number = float(text)
     if not math.isfinite(number):
-        raise InputError(f"{text}: is no finite number; give one to the option")
+        raise InputError(f"{text}: is not a finite number; give one to the option")
     return number
 
 

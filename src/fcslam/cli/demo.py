@@ -113,7 +113,7 @@ def _prepare(output: Path) -> None:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():
             raise OutputError(
-                f"{output}: holds something that is no demo; remove it, or name another folder with --output"
+                f"{output}: holds something that is not a demo; remove it, or name another folder with --output"
             )
         names = (RECORDINGS, LEARNING, RUN, FIGURE, TABLE)
         (output / ABOUT).write_text(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 ROUNDS, STEPS, JUDGED = 6, 50, 2
 """Rounds, steps of each robot in a round, and rounds between two decisions: about two minutes of one processor."""
 HELD_OUT = 3
-"""One in so many squares of each robot's map is held out: of one in four, short drives have fewer than 200 pairs."""
+"""One in this many squares of each robot's map is held out: of one in four, short drives have fewer than 200 pairs."""
 
 
 def learn_together(

@@ -248,7 +248,7 @@ def place(
     map_index: MapIndex = 0,
     author: Author = None,
 ) -> None:
-    """Choose the map's coordinate frame: by walls or a motion, by a pose, or by points, as of a floor plan."""
+    """Choose the map's coordinate frame: by walls or a motion, by a pose, or by points, for example of a floor plan."""
     from fcslam.cli.recordings import pose as read_pose
     from fcslam.errors import InputError
     from fcslam.map_edits import moved_map
@@ -355,7 +355,7 @@ def _point(option: str, text: str) -> tuple[float, float]:
 
     numbers = text.split(",")
     if len(numbers) != 2:
-        raise InputError(f"{option} {text!r} is no point; give metres, as in 1.5,-2")
+        raise InputError(f"{option} {text!r} is not a point; give metres, as in 1.5,-2")
     return _number(numbers[0]), _number(numbers[1])
 
 
@@ -367,5 +367,5 @@ def _number(text: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise InputError(f"{text!r} is no number")
+        raise InputError(f"{text!r} is not a number")
     return number

@@ -104,7 +104,9 @@ class RobotLearning(NamedTuple):
         if self.ca is None and not is_loopback(address.host):
             raise InputError(f"{address} is another machine; give --learn-ca and --learn-key")
         if self.ca is not None and not self.ca.is_file():
-            raise InputError(f"{self.ca}: is no file; give the certificate of the authority that signed the service's")
+            raise InputError(
+                f"{self.ca}: is not a file; give the certificate of the authority that signed the service's"
+            )
         if self.key is not None:
             read_private_key(self.key)
             if self.key.stem != name:

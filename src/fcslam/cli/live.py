@@ -197,7 +197,7 @@ def record(
 
     console = notices(quiet)
     if not is_address(source):
-        raise InputError(f"{source}: is no address of a live robot; give one as in ros2:/robot1")
+        raise InputError(f"{source}: is not an address of a live robot; give one as in ros2:/robot1")
     place = parse_address(source)
     _prepare(output, place.network, force)
     options = bag_options(scan_topic, odom_topic, camera_topic, None) or BagOptions()

@@ -222,7 +222,7 @@ def _without_collection() -> Iterator[None]:
 
 
 def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") -> "Callable[[Progress], None]":
-    """Show the mission's progress: ``total`` scans, then the fusion; ``faults`` gets those of the recordings."""
+    """Show the mission's progress: ``total`` scans, then the fusion; ``faults`` receives the recordings' faults."""
     began = time.perf_counter()
 
     def watch(now: "Progress") -> None:

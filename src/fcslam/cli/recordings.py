@@ -93,7 +93,7 @@ def bag_options(
     """The options of bags; None if none is given.
 
     Raises:
-        InputError: one of ``laser_poses`` is no pose, or ``cloud_band`` no band.
+        InputError: one of ``laser_poses`` is not a pose, or ``cloud_band`` is not a band.
     """
     from fcslam.sources import BagOptions
 
@@ -126,7 +126,7 @@ def _cloud_band(text: str | None) -> "CloudBand":
     except (TypeError, ValueError):
         band = CloudBand(math.nan)
     if not (band.low_m < band.high_m and 0.0 <= band.body_radius_m < math.inf):  # false for NaN
-        raise InputError(f"--cloud-band {text!r} is no band of heights; give metres, as in --cloud-band 0.1,0.6")
+        raise InputError(f"--cloud-band {text!r} is not a band of heights; give metres, as in --cloud-band 0.1,0.6")
     return band
 
 
@@ -134,7 +134,7 @@ def open_recording(argument: str, options: "BagOptions | None") -> "Source":
     """Open the recording of an argument ``LOG`` or ``NAME=LOG``; an existing file is never read as ``NAME=LOG``.
 
     Raises:
-        SourceError: it is no recording.
+        SourceError: it is not a recording.
     """
     from fcslam.sources import open_source
 
@@ -146,7 +146,7 @@ def open_recordings(arguments: Iterable[str], options: "BagOptions | None") -> "
     """Open the recordings of a fleet, each as ``open_recording`` does, with topics chosen once for all bags.
 
     Raises:
-        SourceError: one is no recording, or is given twice.
+        SourceError: one is not a recording, or is given twice.
     """
     from fcslam.sources import open_fleet
 
@@ -178,7 +178,7 @@ def pose(option: str, text: str) -> tuple[float, float, float]:
     """The pose that an option gives as X,Y,THETA, metres and radians.
 
     Raises:
-        InputError: it is no pose.
+        InputError: it is not a pose.
     """
     try:
         x, y, theta = map(float, text.split(","))

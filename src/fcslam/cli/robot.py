@@ -262,7 +262,7 @@ def _play(
     live: "Robot", recording: "Source", scans: int, speed: float | None, plan: "RobotLearningPlan | None", state: Path,
     console: "Console",
 ) -> None:  # fmt: skip
-    """Play a recording of so many scans to its robot, which learns afterwards if there is a plan for it."""
+    """Play a recording of ``scans`` scans to its robot, which learns afterwards if there is a plan for it."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.live.playback import PlaybackPace, play
 
@@ -339,7 +339,7 @@ def _speed(text: str) -> float | None:
     except ValueError:
         speed = 0.0
     if not 0.0 < speed < float("inf"):
-        raise InputError(f"--speed {text!r} is no speed; give a factor above 0, or max")
+        raise InputError(f"--speed {text!r} is not a speed; give a factor above 0, or max")
     return speed
 
 

@@ -197,7 +197,7 @@ def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticato
 
 
 def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
-    """Read the tokens again at SIGHUP; those of before stay if the file is bad."""
+    """Read the tokens again at SIGHUP; keep the previous ones if the file is bad."""
     import logging
     import signal
 
@@ -212,7 +212,7 @@ def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
         try:
             changed = state.authenticator.replace(read_tokens(tokens))
         except FcslamError as error:
-            log.error("%s; the tokens of before stay valid", error)
+            log.error("%s; keeping the previous tokens", error)
         else:
             log.warning("read the tokens of %s again", tokens)
             state.audit.record("", "", "tokens read again", 200, {"changed": changed})

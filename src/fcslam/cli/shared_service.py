@@ -52,7 +52,7 @@ def shared_state(
     """
     name = _name(shared.instance)
     if not is_server(shared.store):
-        raise ServiceError("--store: this is no address of a database; write postgresql://USER@HOST:PORT/DATABASE")
+        raise ServiceError("--store: this is not an address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(shared.store)
     with ExitStack() as opened:
         server = opened.enter_context(closing(Postgres(url, name)))
@@ -81,7 +81,7 @@ def _name(given: str | None) -> str:
     """The instance's name.
 
     Raises:
-        ServiceError: it is no name.
+        ServiceError: it is not a name.
     """
     name = socket.gethostname() if given is None else given
     try:

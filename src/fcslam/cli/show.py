@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fcslam.page.shown_run import ShownRun
 
 LARGEST_BYTES = 2 * 2**30
-"""Of the files of a run folder: the page's server holds most of them in memory."""
+"""Largest total size of the files of a run folder: the page's server holds most of them in memory."""
 HOST = "127.0.0.1"
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")]

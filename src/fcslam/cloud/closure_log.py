@@ -79,7 +79,7 @@ class ClosureLog:
     def confirms(self, match: PlaceMatch) -> bool:
         """Whether a closure between these two places was verified before.
 
-        The same places seen by another detector are no independent evidence.
+        The same places seen by another detector are not independent evidence.
         """
         places = {match.i, match.j}
         found = (entry.closure for entry in self._at.get(match.j, ()))

@@ -27,7 +27,7 @@ class Cloud:
         self.fleet = Fleet(config, seed, verify_pairs)
         self._log = PacketLog()
         self._times: dict[PacketNumber, float] = {}
-        """Of all packets."""
+        """Time of each packet."""
         self._packets: dict[PacketNumber, Packet] = {}
         """Those that this cloud applied itself."""
         self._read: Callable[[PacketNumber], Packet] | None = None
@@ -63,7 +63,7 @@ class Cloud:
         """The cloud of a ``state``.
 
         Args:
-            config, seed: those of the state's own cloud.
+            config, seed: configuration and seed of the state's own cloud.
             state: from ``state``.
             times: of the packets that its cloud applied.
             read: gives these packets when the cloud needs them.

@@ -35,7 +35,7 @@ from fcslam.records import (
 from fcslam.wire.limits import MAXIMUM_EPOCH
 
 LARGEST_M: Final = 1e5
-"""Of a coordinate in an edit."""
+"""Largest magnitude of a coordinate in an edit."""
 LEAST_AREA_M2: Final = 1e-6
 """A smaller polygon has no inside."""
 MOST_CORNERS: Final = 1000
@@ -172,7 +172,7 @@ def check_edit(content: Change | Undo) -> None:
         raise EditError("a number of the edit is not finite")
     unnamed = next((name for name in sessions_of(content) if not NAME.fullmatch(name)), None)
     if unnamed is not None:
-        raise EditError(f"'{unnamed[:LONGEST_NAME]}' is no name of a session")
+        raise EditError(f"'{unnamed[:LONGEST_NAME]}' is not a name of a session")
     match content:
         case Removal() if not 0 <= (content.epoch or 0) <= MAXIMUM_EPOCH:
             raise EditError(f"epoch {content.epoch}: it is from 0 to {MAXIMUM_EPOCH}")

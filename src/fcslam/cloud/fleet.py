@@ -187,7 +187,7 @@ class Fleet:
         self._replayed = None
 
     def read_ahead(self, most: int) -> bool:
-        """After ``restored``: read at most so many keyscans, so that ``estimate`` need not; False: all are read."""
+        """After ``restored``: load up to ``most`` keyscans before ``estimate`` needs them; False: all are loaded."""
         return self._sessions.read_ahead(most)
 
     def estimate(self) -> FleetResult:

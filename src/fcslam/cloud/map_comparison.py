@@ -56,7 +56,7 @@ class _Compared:
     T_i_j: FloatArray
     """Pose of keyscan j in keyscan i, shape (3,), by the transform that was compared."""
     keyscans: int
-    """Of the map that has fewer."""
+    """Number of keyscans of the map that has fewer."""
     uniqueness: Uniqueness
 
     def reversed(self) -> "_Compared":

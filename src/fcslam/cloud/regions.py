@@ -13,7 +13,7 @@ from fcslam.records import FloatArray, RegionUse, frozen
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
 _FRACTION_BITS = 6
-"""Of the coordinates that OpenCV takes: polygons are exact to a 64th of a cell."""
+"""Fractional bits of the coordinates that OpenCV takes: polygons are exact to a 64th of a cell."""
 _MARGIN_CELLS = 1000
 """Polygons are cut off this far outside the map: 100 km in cells of 2 mm would overflow OpenCV's 32 bits."""
 

@@ -36,13 +36,13 @@ class MappedRobot:
     map_index: int
     """0 is the map of most robots."""
     stamps: FloatArray
-    """Of its keyscans, shape (N,)."""
+    """Stamps of its keyscans, shape (N,)."""
     keyscans: tuple[Keyscan, ...]
     """The keyscans that make the map, ascending; keyscans of forgotten places are released."""
     T_map_base: FloatArray
-    """Of each stamp, in the frame of its map, shape (N, 3)."""
+    """Pose at each stamp, in the frame of its map, shape (N, 3)."""
     T_local_base: FloatArray
-    """Of each stamp, in the robot's own map, made without other robots, shape (N, 3); the origin is its
+    """Pose at each stamp, in the robot's own map, made without other robots, shape (N, 3); the origin is its
     first keyscan."""
     variables: NDArray[np.int64]
     """Number of each keyscan in the result's pose graph, shape (N,)."""

@@ -36,7 +36,7 @@ class SessionStore:
         self._hello_sequences: dict[str, int] = {}
         """Number of the packet of the newest hello."""
         self._stamps: dict[str, list[float]] = {}
-        """Of every keyscan, in seconds."""
+        """Stamps of the keyscans, in seconds."""
         self._keyscans: dict[str, list[Keyscan | int | None]] = {}
         """None where it was released, the number of its packet where that was not read yet."""
         self._unread: list[KeyscanId] = []
@@ -52,7 +52,7 @@ class SessionStore:
         self._announced: dict[str, set[tuple[Channel, str]]] = {}
         """Channels and detector versions of all hellos."""
         self._tiles: dict[str, dict[tuple[int, int], MapTile]] = {}
-        """Of the session's own map, by column and row."""
+        """Tiles of the session's own map, by column and row."""
         self._tile_sequences: dict[str, list[int]] = {}
         """Numbers of their packets."""
         self._places: set[tuple[KeyscanId, Channel, str]] = set()
@@ -71,7 +71,7 @@ class SessionStore:
         ``sequence`` is the number of its packet.
 
         Raises:
-            PacketError: a laser of before is missing or different, or the floor is another one.
+            PacketError: an announced laser is missing or changed, or the floor is another one.
         """
         before = self._hellos.get(hello.robot)
         if before is not None and before.floor != hello.floor:
@@ -193,7 +193,7 @@ class SessionStore:
         return tuple(keyscan for keyscan in kept if len(keyscan.ranges_m))
 
     def read_ahead(self, most: int) -> bool:
-        """Read at most so many of the keyscans that ``restore`` named; False: all are read."""
+        """Read up to ``most`` of the keyscans that ``restore`` named; False: all are read."""
         chosen, self._unread = self._unread[-most:], self._unread[:-most]
         for robot, number in chosen:
             self._read_keyscan(robot, number)

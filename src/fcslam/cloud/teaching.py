@@ -29,9 +29,9 @@ FEWEST_PLACES: Final = 2
 FARTHEST_BITS: Final = 100
 """Taught codes are at most this far from the robot's own code; two codes at random differ in 128 bits."""
 RECORD_BYTES: Final = 2 + CODE_BYTES
-"""Of a taught point: its number in the place, and the code."""
+"""Size of a taught point: its number in the place, and the code."""
 HEAD_BYTES: Final = 6
-"""Of a taught place: the number of the keyscan, and the number of points."""
+"""Size of the head of a taught place: the number of the keyscan, and the number of points."""
 
 
 class PlacePoints(NamedTuple):

@@ -26,7 +26,7 @@ class Visit(NamedTuple):
     """Consecutive places of one session near a point."""
 
     distance_m: float
-    """Of the nearest one."""
+    """Distance of the nearest one."""
     nearest: KeyscanId
     places: tuple[KeyscanId, ...]
 

@@ -61,7 +61,7 @@ class BirdseyeConfig:
 
 
 BIRDSEYE = BirdseyeConfig()
-"""Of all robots: places with other values cannot be compared."""
+"""Settings of all robots: places with other values cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True)

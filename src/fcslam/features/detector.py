@@ -133,7 +133,7 @@ class OnnxDetector:
             )
         self._version = metadata.get("fcslam_version", "")
         if not NAME.fullmatch(self._version):
-            raise FeatureError(f"{path}: '{self._version}' is no detector version; export the network with one")
+            raise FeatureError(f"{path}: '{self._version}' is not a detector version; export the network with one")
         self._check(path)
 
     @property

@@ -87,7 +87,7 @@ def _rows(path: Path) -> list[Row]:
         with path.open(newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
     except (OSError, csv.Error) as error:
-        raise TrainingError(f"{path}: is no table of rounds ({error})") from error
+        raise TrainingError(f"{path}: is not a table of rounds ({error})") from error
 
 
 def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:

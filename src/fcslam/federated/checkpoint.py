@@ -109,7 +109,7 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
         return None
     checkpoint = read_checkpoint(path)
     if checkpoint.stage != STAGE:
-        raise TrainingError(f"{path}: is no checkpoint of federated training; give another --output")
+        raise TrainingError(f"{path}: is not a checkpoint of federated training; give another --output")
     groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "average": {}, "best": {}, "memory": {}}
     try:
         for key, tensor in checkpoint.tensors.items():
@@ -131,7 +131,7 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(
-            f"{path}: is no checkpoint of this version of fcslam ({error}); give another --output"
+            f"{path}: is not a checkpoint of this version of fcslam ({error}); give another --output"
         ) from error
     asked = _fixed(settings.model_dump(mode="json"))
     if odd := sorted(asked.keys() ^ fixed.keys()):

@@ -87,7 +87,7 @@ class RobotClient:
     revisits: RevisitExamples = field(default_factory=RevisitExamples)
     """Points that were seen again, on which ``codes`` and ``heads`` are trained."""
     inputs: CodeInputs = field(default_factory=CodeInputs)
-    """Of the images of ``revisits``."""
+    """Inputs from the images of ``revisits``."""
     held_out: HeldOutPairs = field(default_factory=HeldOutPairs)
     """Pairs of keyframes that are never trained on."""
 

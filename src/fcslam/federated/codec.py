@@ -19,7 +19,7 @@ def record_to_weights(record: object) -> dict[str, NDArray[np.float32]]:
     """Deserialise weights. Names, shapes, types and values are not checked, see ``weights_error``.
 
     Raises:
-        ValueError: this is no record of arrays, or one of its arrays cannot be read.
+        ValueError: this is not a record of arrays, or one of its arrays cannot be read.
     """
     checked = _array_record(record)
     try:
@@ -35,7 +35,7 @@ def record_bytes(record: object) -> int:
     """Size of the serialised arrays of a record [bytes].
 
     Raises:
-        ValueError: this is no record of arrays.
+        ValueError: this is not a record of arrays.
     """
     return sum(len(array.data) for array in _array_record(record).values())
 

@@ -23,7 +23,7 @@ EvaluateFn = Callable[[Weights], Metrics]
 
 @dataclass(frozen=True, slots=True)
 class PublicImages:
-    """The evaluator that is no robot: the coordinator, on public images."""
+    """The evaluator that is not a robot: the coordinator, on public images."""
 
 
 Evaluator = str | PublicImages

@@ -79,7 +79,7 @@ class RobotLink:
 
         Raises:
             TrainingError: the server does not accept the robot.
-            ConnectionError: the server cannot be reached, or is no server of a fleet.
+            ConnectionError: the server cannot be reached, or is not a server of a fleet.
         """
         status, headers, body = self._post(NEXT_PATH, b"")
         if status == httpx.codes.NO_CONTENT:

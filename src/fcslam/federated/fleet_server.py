@@ -56,7 +56,7 @@ Teach = Callable[[str], bytes]
 
 
 def teach_nothing(_robot: str) -> bytes:
-    """Of a fleet that does not map."""
+    """Default: teach nothing."""
     return b""
 
 

@@ -230,7 +230,7 @@ def request_from_bytes(data: bytes) -> Message:
     """Read the server's message on a robot.
 
     Raises:
-        ValueError: these bytes are no message.
+        ValueError: these bytes are not a message.
     """
     try:
         return message_from_proto(MessageProto.FromString(data))
@@ -242,7 +242,7 @@ def reply_from_bytes(data: bytes, request: Message) -> Message:
     """Read a robot's reply to a request. Only content or error are taken from the bytes, so nobody can forge a sender.
 
     Raises:
-        ValueError: these bytes are no message.
+        ValueError: these bytes are not a message.
     """
     reply = request_from_bytes(data)
     return Message(reply.error if reply.has_error() else reply.content, reply_to=request)

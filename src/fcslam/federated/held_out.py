@@ -24,8 +24,8 @@ from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
 from fcslam.records import FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")
-"""Of what a robot reports about each pair: right matches as a share of the shared points, and whether the pair is more
-similar than any two keyframes of different places."""
+"""Columns that a robot reports about each pair: right matches as a share of the shared points, and whether the pair is
+more similar than any two keyframes of different places."""
 APART_M: Final = 8.0
 """Keyframes farther apart than this show different places."""
 MOST_APART: Final = 300
@@ -51,7 +51,7 @@ class HeldOutPairs:
 
     @classmethod
     def of(cls, frames: Sequence[Keyframe], T_own_base: FloatArray) -> "HeldOutPairs":
-        """Of keyframes that are held out, at their estimated poses in the robot's map, shape (N, 3)."""
+        """Pairs of keyframes that are held out, at their estimated poses in the robot's map, shape (N, 3)."""
         revisits = [(i, j, len(rows)) for i, j, rows in revisits_in_map(frames, T_own_base).pairs]
         chosen = np.linspace(0, len(revisits) - 1, min(len(revisits), MOST_PAIRS)).astype(int)
         first, second = np.triu_indices(len(frames), 1)
@@ -86,7 +86,7 @@ def check_judgement(array: object) -> Judgement:
         ValueError: it is none; the text says why.
     """
     if not isinstance(array, np.ndarray) or array.dtype != np.float32:
-        raise ValueError("a report on pairs that is no array of float32")
+        raise ValueError("a report on pairs that is not an array of float32")
     if array.ndim != 2 or array.shape[1] != len(COLUMNS) or len(array) > MOST_PAIRS:
         raise ValueError(f"a report on pairs of shape {array.shape}, not (P, {len(COLUMNS)}) with P up to {MOST_PAIRS}")
     recall, found = array.T

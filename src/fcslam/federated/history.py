@@ -33,7 +33,7 @@ class RoundReport:
     losses: Mapping[str, float] = field(default_factory=dict)
     """Means over robots and steps."""
     metrics: Mapping[str, float] = field(default_factory=dict)
-    """Of the evaluation; empty if there was none."""
+    """Metrics of the evaluation; empty if there was none."""
     score: float = math.nan
     """By which versions are compared, in [0, 1]; NaN if there was no evaluation."""
     released: bool = False
@@ -41,7 +41,7 @@ class RoundReport:
     returned: bool = False
     """The version was so bad that training returned to the best one."""
     reason: str = ""
-    """Of the gate for releasing the version or not; empty without a gate."""
+    """The gate's reason for releasing the version or not; empty without a gate."""
     bytes_down: int = 0
     """Size of the weights that were sent to all robots."""
     bytes_up: int = 0
@@ -75,7 +75,7 @@ def read_rows(path: Path, last: int) -> list[Row]:
     """Rows up to round ``last``; none if there is no file.
 
     Raises:
-        TrainingError: the file is no table of rounds.
+        TrainingError: the file is not a table of rounds.
     """
     if not path.exists():
         return []
@@ -83,7 +83,7 @@ def read_rows(path: Path, last: int) -> list[Row]:
         with path.open(newline="", encoding="utf-8") as file:
             return [row for row in csv.DictReader(file) if int(row["round"]) <= last]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise TrainingError(f"{path}: is no table of rounds ({error}); remove it") from error
+        raise TrainingError(f"{path}: is not a table of rounds ({error}); remove it") from error
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:

@@ -112,16 +112,16 @@ def read_robot_keys(files: Sequence[Path]) -> dict[str, ec.EllipticCurvePublicKe
     """Public keys by robot: the key in ``robot1.pub`` is that of the robot called robot1.
 
     Raises:
-        TrainingError: a file is no public key, or two name the same robot.
+        TrainingError: a file is not a public key, or two name the same robot.
     """
     keys: dict[str, ec.EllipticCurvePublicKey] = {}
     for file in files:
         try:
             key = load_ssh_public_key(file.read_bytes())
         except (OSError, ValueError, UnsupportedAlgorithm) as error:
-            raise TrainingError(f"{file}: is no public key of a robot ({error}); {_MAKE_ONE}") from error
+            raise TrainingError(f"{file}: is not a public key of a robot ({error}); {_MAKE_ONE}") from error
         if not isinstance(key, ec.EllipticCurvePublicKey):
-            raise TrainingError(f"{file}: is no ECDSA key; {_MAKE_ONE}")
+            raise TrainingError(f"{file}: is not an ECDSA key; {_MAKE_ONE}")
         if file.stem in keys:
             raise TrainingError(f"{file}: another key is that of {file.stem} too; a robot has its key file's name")
         keys[file.stem] = key
@@ -132,16 +132,16 @@ def read_private_key(file: Path) -> ec.EllipticCurvePrivateKey:
     """A robot's private key.
 
     Raises:
-        TrainingError: the file is no private key, or is encrypted.
+        TrainingError: the file is not a private key, or is encrypted.
     """
     try:
         content = file.read_bytes()
         is_ssh = content.startswith(b"-----BEGIN OPENSSH")
         key = load_ssh_private_key(content, None) if is_ssh else load_pem_private_key(content, None)
     except (OSError, ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise TrainingError(f"{file}: is no private key without a passphrase ({error}); {_MAKE_ONE}") from error
+        raise TrainingError(f"{file}: is not a private key without a passphrase ({error}); {_MAKE_ONE}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise TrainingError(f"{file}: is no ECDSA key; {_MAKE_ONE}")
+        raise TrainingError(f"{file}: is not an ECDSA key; {_MAKE_ONE}")
     return key
 
 

@@ -78,7 +78,7 @@ def open_port(
     on_notice: OnNotice,
     teach: Teach = teach_nothing,
 ) -> Iterator[FleetGrid]:
-    """Let robots fetch requests at the address while the block runs; arguments as of ``serve`` and ``FleetApp``.
+    """Let robots fetch requests at the address while the block runs; arguments as for ``serve`` and ``FleetApp``.
 
     Raises:
         TrainingError: the certificates do not fit, or the address is taken or the robots cannot reach it.

@@ -21,7 +21,7 @@ class RobotLearningPlan:
     """Where and how a robot learns."""
 
     host: str
-    """Of the server's port of learning."""
+    """Host of the server's port of learning."""
     port: int
     settings: RobotLearningSettings
     state: Path

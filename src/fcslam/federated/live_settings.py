@@ -20,7 +20,7 @@ class HeldOutSettings(Settings):
     """Keyframes that a robot never trains on."""
 
     every: int = Field(
-        default=4, ge=2, le=20, description="one of so many squares of the robot's map is held out from training"
+        default=4, ge=2, le=20, description="one in this many squares of the robot's map is held out from training"
     )
     side_m: float = Field(default=4.0, gt=0.0, description="side of these squares [m]")
 

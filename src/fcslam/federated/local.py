@@ -36,7 +36,7 @@ def federate_locally(
         raise TrainingError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
     for folder in folders:
         if not folder.is_dir():
-            raise TrainingError(f"{folder}: is no folder; give one folder of images for each robot")
+            raise TrainingError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = [
         RobotClient(
             name,

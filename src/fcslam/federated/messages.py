@@ -20,7 +20,7 @@ MAX_NAME_LENGTH: Final = 64
 MAX_METRICS: Final = 32
 """A reply with more metrics than this is refused: fcslam's clients send fewer than ten."""
 LARGEST_METRIC: Final = 1e6
-"""Losses and metrics are of the order of 1. A larger one, or one that is no number, would spoil a mean."""
+"""Losses and metrics are of the order of 1. A larger one, or one that is not a number, would spoil a mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def read_request(content: RecordDict) -> ClientRequest:
     """Read a request on the robot.
 
     Raises:
-        TrainingError: the content is no request of this version of fcslam.
+        TrainingError: the content is not a request of this version of fcslam.
     """
     try:
         config = content[CONFIG_KEY]
@@ -97,8 +97,8 @@ def reply_metrics(content: RecordDict) -> dict[str, float]:
     """The metrics in a reply.
 
     Raises:
-        ValueError: the reply has no metrics, too many of them, some whose names are no identifiers, or some that are no
-            plausible numbers.
+        ValueError: the reply has no metrics, too many of them, some whose names are not identifiers, or some that are
+            not plausible numbers.
     """
     record = content[METRICS_KEY]
     if not isinstance(record, MetricRecord):

@@ -87,8 +87,8 @@ class MissionPlaces:
         }
 
     def found_again(self, version: str, before: str) -> FloatArray:
-        """Of each pair of places that both versions described: found (1) or not (0) with the version, less with the one
-        before, shape (N,). A pair is found if it is more similar than any two different places."""
+        """For each pair of places that both versions described: found (1) or not (0) with the version, less with the
+        one before, shape (N,). A pair is found if it is more similar than any two different places."""
         described = self.described_by(version, before)
         same = [(a, b) for a, b, _ in self.pairs() if a in described and b in described]
         apart = self._apart(described)

@@ -31,14 +31,14 @@ def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.floa
     the shift, so the network computes the same function. Before training, call ``with_batch_statistics``.
 
     Raises:
-        TrainingError: the file is no detector in float32, or has another encoder.
+        TrainingError: the file is not a detector in float32, or has another encoder.
     """
     import onnx
 
     try:
         graph = onnx.load(str(path)).graph
     except Exception as error:  # errors of protobuf, of the system and of onnx
-        raise TrainingError(f"{path}: is no ONNX file ({error})") from error
+        raise TrainingError(f"{path}: is not an ONNX file ({error})") from error
     weights = network_to_weights(KeypointNetwork(encoder))
     arrays = {array.name: np.array(onnx.numpy_helper.to_array(array)) for array in graph.initializer}
     for node in graph.node:

@@ -48,7 +48,7 @@ def sample_robots(names: Iterable[str], fraction: float, minimum: int, rng: np.r
     Args:
         names: of the connected robots.
         fraction: share of them to draw, in (0, 1].
-        minimum: number of robots to draw at least, as far as so many are connected.
+        minimum: number of robots to draw at least, if enough are connected.
         rng: source of randomness.
 
     Returns:

@@ -49,7 +49,7 @@ class Releases:
             folder.mkdir(parents=True, exist_ok=True)
             write_file(folder / "0.onnx", start)
         except (ValueError, KeyError, TypeError) as error:
-            raise TrainingError(f"{path}: is no list of releases ({error}); name another folder") from error
+            raise TrainingError(f"{path}: is not a list of releases ({error}); name another folder") from error
         except OSError as error:
             raise OutputError(f"{folder}: cannot be used ({error}); free disk space") from error
         releases = cls(folder, [version])

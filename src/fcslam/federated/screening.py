@@ -16,8 +16,8 @@ SMALLEST_MEDIAN: Final = 3
 WORST_CHANNEL: Final = 8.0
 """A channel may be as many times as far from the median as all channels together."""
 LONGER_THAN_BEFORE: Final = 2.0
-"""The limit of an update's length by those of the round before is so many times that by those of its own round: they
-grow at the start of training. It holds where most of a round's updates are poisoned."""
+"""Factor by which the previous round's length limit exceeds this round's: they grow at the start of training. It holds
+where most of a round's updates are poisoned."""
 BATCH_NORM_EPSILON: Final = 1e-5
 """Added to variances by batch normalisation."""
 

@@ -94,13 +94,13 @@ def client_context(ca: Path) -> ssl.SSLContext:
     """A context that trusts this authority and no other.
 
     Raises:
-        TrainingError: the file is no certificate.
+        TrainingError: the file is not a certificate.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         context.load_verify_locations(ca)
     except (ssl.SSLError, OSError) as error:
-        raise TrainingError(f"{ca}: is no certificate of an authority ({_reason(error)})") from error
+        raise TrainingError(f"{ca}: is not a certificate of an authority ({_reason(error)})") from error
     return context
 
 

@@ -1,7 +1,7 @@
 """Rigid alignment of matched points of the plane.
 
 Two matched places fix the frame of one map in another (FC-SLAM, section III.C, eqs. 5 and 6). The paper prints eq. (6)
-as ``x' = -D R D x``, with the translation D on both sides of R. This is no rigid map between two frames. Its
+as ``x' = -D R D x``, with the translation D on both sides of R. This is not a rigid map between two frames. Its
 homogeneous coordinate is -1, and with it divided out the translation counts twice. The corrected form is
 ``x' = D R x``.
 """

@@ -13,7 +13,7 @@ SAME_VIEW_BEAMS = 1.5
 """The same in increments, if that is more: interleaved scans, one beam more or less, rounded headers."""
 
 FINEST_RAD, COARSEST_RAD = radians(0.25), radians(0.5)
-"""Of beams closer together than the first, every k-th one is mapped, so that those are at most the second apart. The
+"""If beams are closer together than the first, every k-th one is mapped, at most the second apart. The
 normals of returns are fitted to few neighbours, which must be farther apart than the noise of a range."""
 ROUNDING = 0.01
 """Share by which headers round an increment."""
@@ -39,7 +39,7 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     turn are variations of one laser. Another field of view or another resolution is another laser.
 
     Args:
-        beams: those of the scan, from outside; NaN is no laser's.
+        beams: those of the scan, from outside; NaN belongs to no laser.
         declared: two or more beams with finite angles.
 
     Returns:

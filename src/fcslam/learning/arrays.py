@@ -30,7 +30,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file is no archive of arrays, or is broken.
+        ValueError: the file is not an archive of arrays, or is broken.
     """
     content = io.BytesIO(path.read_bytes())
     try:

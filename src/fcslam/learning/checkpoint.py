@@ -25,7 +25,7 @@ class Checkpoint:
     step: int
     """Steps done."""
     settings: dict[str, Any]
-    """Of the run; a run with other settings does not continue from this checkpoint."""
+    """Settings of the run; a run with other settings does not continue from this checkpoint."""
     tensors: dict[str, Tensor]
     """All tensors of network, averaged network and optimiser, by name."""
     examples: int = 0
@@ -63,7 +63,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        TrainingError: the file is no checkpoint, or has another format.
+        TrainingError: the file is not a checkpoint, or has another format.
     """
     try:
         arrays = read_arrays(path)
@@ -73,5 +73,5 @@ def read_checkpoint(path: Path) -> Checkpoint:
             return Checkpoint(header["stage"], header["step"], header["settings"], tensors, header.get("examples", 0))
         found = header["format"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise TrainingError(f"{path}: is no checkpoint of a training run ({error}); remove it") from error
+        raise TrainingError(f"{path}: is not a checkpoint of a training run ({error}); remove it") from error
     raise TrainingError(f"{path}: has format {found}, expected {FORMAT}; start again in another folder")

@@ -18,7 +18,7 @@ def read_curves(path: Path, stage: str) -> Curves:
     """Curves of a stage from its log; of a step that was repeated, the later values count.
 
     Raises:
-        TrainingError: the file is no log of a training run.
+        TrainingError: the file is not a log of a training run.
     """
     values: dict[str, dict[int, float]] = {}
     try:
@@ -27,7 +27,7 @@ def read_curves(path: Path, stage: str) -> Curves:
                 if row["stage"] == stage:
                     values.setdefault(row["name"], {})[int(row["step"])] = float(row["value"])
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise TrainingError(f"{path}: is no log of a training run ({error})") from error
+        raise TrainingError(f"{path}: is not a log of a training run ({error})") from error
     return {name: (sorted(points), [points[step] for step in sorted(points)]) for name, points in values.items()}
 
 

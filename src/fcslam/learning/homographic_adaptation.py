@@ -24,7 +24,7 @@ Response = NDArray[np.float32]
 HARRIS_BLOCK_PX: Final = 4
 HARRIS_K: Final = 0.04
 BORDER_PX: Final = 4
-"""Pixels closer to the border than this are no keypoints."""
+"""Pixels closer to the border than this are not keypoints."""
 
 
 def adapt(

@@ -37,12 +37,12 @@ def find_images(roots: Sequence[Path]) -> list[ImageFile]:
     """All image files in the folder trees, sorted by name.
 
     Raises:
-        TrainingError: a root is no folder or holds no image, or two roots have the same name and the same files.
+        TrainingError: a root is not a folder or holds no image, or two roots have the same name and the same files.
     """
     found: dict[str, ImageFile] = {}
     for root in roots:
         if not root.is_dir():
-            raise TrainingError(f"{root}: is no folder; give a folder of images")
+            raise TrainingError(f"{root}: is not a folder; give a folder of images")
         base = root.resolve()
         files = [file for file in base.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file()]
         if not files:
@@ -55,7 +55,7 @@ def find_images(roots: Sequence[Path]) -> list[ImageFile]:
 
 
 def read_image(path: Path) -> GreyImage | None:
-    """Read an image in grey levels, scaled down to ``LARGEST_SIDE_PX``; None if the file is no image."""
+    """Read an image in grey levels, scaled down to ``LARGEST_SIDE_PX``; None if the file is not an image."""
     try:
         image = read_grey(path)
     except FeatureError:

@@ -76,7 +76,7 @@ def read_teacher(path: Path) -> Teacher:
         arrays = read_arrays(path)
         keypoints, scores, descriptors = (arrays[name] for name in ("keypoints", "scores", "descriptors"))
     except (OSError, ValueError, KeyError) as error:
-        raise TrainingError(f"{path}: is no file of a teacher's points ({error})") from error
+        raise TrainingError(f"{path}: is not a file of a teacher's points ({error})") from error
     sides = (scores.ndim, keypoints.ndim, keypoints.shape[1:], descriptors.ndim) == (1, 2, (2,), 2)
     sound = sides and len(keypoints) == len(scores) == len(descriptors)
     if not sound or not all(is_finite(array) for array in (keypoints, scores, descriptors)):

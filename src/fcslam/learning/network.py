@@ -73,7 +73,7 @@ class KeypointNetwork(nn.Module):
         """Maps of a batch.
 
         Raises:
-            ValueError: height or width is no multiple of 8.
+            ValueError: height or width is not a multiple of 8.
         """
         if image.shape[-1] % CELL_PX or image.shape[-2] % CELL_PX:
             raise ValueError(f"sides must be multiples of {CELL_PX}, not {tuple(image.shape[-2:])}")

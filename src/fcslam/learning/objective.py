@@ -16,7 +16,7 @@ from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import Encoder, LossSettings
 
 MIN_NEGATIVE_DISTANCE_PX = 8.0
-"""Points closer to a match than this are no negatives, because their codes should be similar."""
+"""Points closer to a match than this are not negatives, because their codes should be similar."""
 TEACHER_SHARPNESS = 2.0
 """Logit of a bit per standard deviation of its projection: one standard deviation gives a probability of 88 %."""
 MIN_NEGATIVE_DISTANCE_M = 0.3

@@ -30,7 +30,7 @@ class RehearsalBatch:
     """The views of one step."""
 
     numbers: Tensor
-    """Of R views, shape (R,)."""
+    """Numbers of R views, shape (R,)."""
     points: Tensor
     """Shape (R, N, 2), pixels."""
 

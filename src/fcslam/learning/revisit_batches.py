@@ -40,7 +40,7 @@ class RevisitPair:
     points: tuple[Points, Points]
     """Shape (M, 2) each, pixels."""
     positions: FloatArray
-    """Of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
+    """Positions of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ class TaughtImage:
     codes: Codes
     """Shape (M, 32)."""
     positions: FloatArray
-    """Of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
+    """Positions of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -192,7 +192,7 @@ def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> MapRe
 def _offsets_of_alike(
     first: ImageFeatures, second: ImageFeatures, pixels: FloatArray, asked: NDArray[np.int64], others: FloatArray
 ) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Of the keypoints with a like code near their predicted pixel: how far that is off, (N, 2), and their numbers."""
+    """Offsets, (N, 2), and numbers of the keypoints with a like code near their predicted pixel."""
     distances = hamming_matrix(first.descriptors[asked], second.descriptors).astype(np.int64)
     gaps = others[None, :] - pixels[asked, None]
     distances[np.hypot(gaps[..., 0], gaps[..., 1]) > SEARCH_PX] = ALIKE_BITS + 1

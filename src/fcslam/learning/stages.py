@@ -52,7 +52,7 @@ class TrainingImages:
     held_out: list[TrainingExample]
     """For validation; if no image is held out, the first training image."""
     skipped: int
-    """Number of files that are no images, too small, or have too few corners."""
+    """Number of files that are not images, too small, or have too few corners."""
 
     @property
     def are_held_out(self) -> bool:
@@ -60,7 +60,7 @@ class TrainingImages:
         return self.held_out[0] is not self.train[0]
 
     def checksum(self) -> int:
-        """Of all that training reads, so that another run's checkpoint is not taken for one of these images."""
+        """Checksum of all that training reads, so that no checkpoint of other images is taken for one of these."""
         key = 0
         for example in (*self.train, *self.held_out):
             key = zlib.crc32(example.image.tobytes(), zlib.crc32(example.labels.keypoints.tobytes(), key))
@@ -209,8 +209,8 @@ def _check_usable(files: Sequence[ImageFile]) -> None:
 
 def _too_few(usable: int, files: int) -> TrainingError:
     return TrainingError(
-        f"only {usable} of {files} image files can be trained on: the others are no images, smaller than 96 px or have "
-        "too few corners; give more images"
+        f"only {usable} of {files} image files can be trained on: the others are not images, smaller than 96 px or "
+        "have too few corners; give more images"
     )
 
 

@@ -219,7 +219,7 @@ def trained_network(path: Path) -> KeypointNetwork:
     """The averaged network of a checkpoint, the result of its run, in evaluation mode.
 
     Raises:
-        TrainingError: the file is no checkpoint, or belongs to a network that this version does not have.
+        TrainingError: the file is not a checkpoint, or belongs to a network that this version does not have.
     """
     checkpoint = read_checkpoint(path)
     try:

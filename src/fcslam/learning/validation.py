@@ -19,7 +19,7 @@ from fcslam.records import Codes, FloatArray
 
 NMS_PX: Final = 4.0
 LEAST_SCORE: Final = 0.001
-"""Probability below which a pixel is no keypoint."""
+"""Probability below which a pixel is not a keypoint."""
 ROLLED_RIM_PX: Final = 12.0
 """Points closer to the border than this are affected by the pixels that were rolled in."""
 MOST_POINTS: Final = 300
@@ -65,7 +65,7 @@ def collapse_warnings(figures: dict[str, float]) -> list[str]:
     """Warnings of collapsing codes; empty if there is nothing to report."""
     found = []
     if figures["code_spread_bits"] < LEAST_SPREAD_BITS:
-        found.append(f"codes collapse: those of different points differ in {figures['code_spread_bits']:.0f} bits")
+        found.append(f"codes collapse: codes of different points differ in {figures['code_spread_bits']:.0f} bits")
     if figures["bit_bias"] > LARGEST_BIAS:
         found.append(f"bits are stuck: their means are {figures['bit_bias']:.2f} from a half")
     return found

@@ -53,7 +53,7 @@ def random_shift(rng: np.random.Generator) -> FloatArray:
 
 
 def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImage:
-    """The view of this size, as uint8; beyond its border the image is mirrored, so that the border is no edge."""
+    """The view of this size, as uint8; beyond its border the image is mirrored, so that the border is not an edge."""
     warped = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     return np.asarray(warped, np.uint8)
 

@@ -57,7 +57,7 @@ class LidarBackend:
         self._window: list[MappedKeyscan] = []
         """The newest keyscans, as far back as the next submaps need them."""
         self._T_local_base: list[FloatArray] = []
-        """Of every keyscan, as the tracker found it."""
+        """Pose of every keyscan, as the tracker found it."""
         self._next_anchor_m = 0.0
         self._unsolved = 0
 

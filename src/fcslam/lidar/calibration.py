@@ -26,7 +26,7 @@ FEWEST_TURNS: Final = 20
 FEWEST_MOTIONS: Final = 30
 """Fewer turns and motions say nothing."""
 LARGEST_RESIDUAL_M: Final = 0.015
-"""Motions of scans and odometry that differ by more, as a standard deviation, are no measure of each other."""
+"""Motions of scans and odometry that differ by more, as a standard deviation, are not a measure of each other."""
 LARGEST_DELAY_S: Final = 0.4
 DELAY_STEP_S: Final = 0.01
 """Range and step of the search for the delay, before it is refined."""

@@ -165,7 +165,7 @@ class _Trial:
         self._weights = np.array([1.0 / len(kind) for kind in kinds for _ in kind])
 
     def agreements(self, facing: Facing) -> FloatArray:
-        """Of each pair with a mounting; NaN if too few points are common."""
+        """Agreement of each pair with a mounting; NaN if too few points are common."""
         return np.array([_agreement(pair, facing) for pair in self.pairs])
 
     def mean(self, agreements: FloatArray) -> float:

@@ -44,7 +44,7 @@ class OdometryModel:
 
 
 WHEELS = OdometryModel()
-"""Of a robot with wheel odometry."""
+"""Model of a robot with wheel odometry."""
 
 
 class OdometryError(NamedTuple):

@@ -151,12 +151,12 @@ class PackedSubmap:
     rows: NDArray[np.int16]
     solitary: NDArray[np.bool_]
     origin: FloatArray
-    """Of the surface."""
+    """Origin of the surface."""
     free: bytes
     """The free cells as bits, compressed."""
     free_shape: tuple[int, int]
     corner: FloatArray
-    """Of the free cells."""
+    """Corner of the free cells."""
 
     @classmethod
     def of(cls, submap: Submap) -> Self:

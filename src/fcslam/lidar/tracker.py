@@ -33,7 +33,7 @@ and a log-likelihood higher by this."""
 USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 LARGEST_VELOCITY = 30.0
-"""Of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
+"""Largest velocity of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
 _NO_INFORMATION = np.zeros((3, 3))
 
 

@@ -26,7 +26,7 @@ CELL_M = 0.25
 WELL_INSIDE_M = 0.5
 """A point in free space farther than this from any surface contradicts it, in the exhaustive search."""
 VIOLATION_WEIGHT = 2.0
-"""A metre of surface in free space cancels so many metres of explained surface."""
+"""Metres of explained surface that a metre of surface in free space cancels."""
 ELSEWHERE_M, ELSEWHERE_RAD = 1.0, np.radians(15.0)
 """Transforms this far apart are two."""
 PEAKS = 3

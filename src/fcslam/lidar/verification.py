@@ -17,9 +17,9 @@ from fcslam.records import FloatArray, Reason, ReasonCode
 UNFIXED_INFORMATION = 1e-2
 """Information in a direction that no point fixes: a standard deviation of 10 m or 10 rad."""
 ALIGNED_POINTS = 400
-"""Points of a submap that are aligned, at least, if it has so many."""
+"""Least number of aligned points of a submap; smaller submaps align all their points."""
 NOISE_FACTOR = 2.0
-"""Noise raises the limit of a gate's violation by no more than this factor: people who walk about are no noise."""
+"""Noise raises the limit of a gate's violation by no more than this factor: people who walk about are not noise."""
 NO_PRIOR = np.zeros((3, 3))
 _VERIFIED = Reason(ReasonCode.VERIFIED)
 ALIGNMENT_SCALE_M = 0.4
@@ -69,8 +69,8 @@ class LooseGate(Gate):
 
 
 PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
-"""Of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a cluster,
-and never alone."""
+"""Gate of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a
+cluster, and never alone."""
 
 
 class VerificationConfig(Settings):
@@ -81,7 +81,7 @@ class VerificationConfig(Settings):
 
 
 VERIFICATION = VerificationConfig()
-"""Of closures of one robot."""
+"""Thresholds for closures of one robot."""
 
 
 @dataclass(frozen=True, slots=True)

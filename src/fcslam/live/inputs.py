@@ -15,7 +15,7 @@ from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.wire.checks import check_name
 
 JPEG_QUALITY = 95
-"""Of images that are given as arrays."""
+"""JPEG quality of images that are given as arrays."""
 
 Lasers = LaserModel | Mapping[str, LaserModel]
 
@@ -69,7 +69,7 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
         laser: the laser.
 
     Raises:
-        InputError: the ranges are no numbers, or not as many as the laser can have beams.
+        InputError: the ranges are not numbers, or not as many as the laser can have beams.
     """
     try:
         ranges = np.array(ranges_m, np.float32)
@@ -103,7 +103,7 @@ def checked_camera(camera: CameraModel | None) -> CameraModel | None:
     if not all(map(math.isfinite, numbers)) or min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
         raise InputError(f"camera: {camera} needs finite numbers, and a size and a focal length above 0 pixels")
     if not is_unit:
-        raise InputError(f"camera: the rotation {rotation} of T_base_camera is no unit quaternion (x, y, z, w)")
+        raise InputError(f"camera: the rotation {rotation} of T_base_camera is not a unit quaternion (x, y, z, w)")
     return camera
 
 
@@ -139,7 +139,7 @@ def checked_stamp(stamp: float, newest_s: float) -> float:
         InputError: it is not finite, or far before ``newest_s``.
     """
     if not math.isfinite(stamp):
-        raise InputError(f"stamp: {stamp} is no time; give seconds")
+        raise InputError(f"stamp: {stamp} is not a time; give seconds")
     if stamp < newest_s - MAX_STEP_BACK_S:
         raise InputError(
             f"stamp: {stamp:.6f} s is {newest_s - stamp:.3g} s before the newest scan; the clock went back. Stamps may "

@@ -110,7 +110,7 @@ class LocalizedRobot(LiveTracker):
             pose: (x, y, theta) of ``base`` in the map, metres and radians.
 
         Raises:
-            InputError: it is no pose, or outside of the map.
+            InputError: it is not a pose, or outside of the map.
         """
         T_map_base = self._checked("pose", pose)
         with self._lock:

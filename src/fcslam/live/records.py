@@ -18,7 +18,7 @@ class RobotPose:
     """Where a robot is at one scan, in its map."""
 
     stamp: float
-    """Of the scan, seconds."""
+    """Stamp of the scan, seconds."""
     T_map_base: FloatArray
     """Pose (x, y, theta) of ``base`` in the robot's map, shape (3,), metres and radians. It jumps when a correction
     arrives; ``T_map_odom`` holds the jump, so a controller that works in ``odom`` sees none. NaN in a finished map
@@ -177,6 +177,6 @@ class RobotEvent:
 
     kind: EventKind
     stamp: float
-    """Of the newest scan, seconds."""
+    """Stamp of the newest scan, seconds."""
     text: str
     """One line for people."""

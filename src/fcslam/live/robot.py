@@ -52,7 +52,7 @@ from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesT
 from fcslam.wire.messages import Hello, Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
-"""Corrections that move the robot by less are no event."""
+"""Corrections that move the robot by less are not events."""
 
 POLL_INTERVAL_S = 0.1
 """Interval at which ``finish`` looks whether the server has everything."""
@@ -65,7 +65,7 @@ class Playback(NamedTuple):
     """A recording that is played to a robot."""
 
     fingerprint: str
-    """Of the recording and the settings."""
+    """Fingerprint of the recording and the settings."""
     resume: bool
     """Whether the robot read it before and was interrupted; its packets come again."""
 
@@ -124,7 +124,7 @@ class Robot(LiveTracker):
             state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
                 With a server it holds the packets that the server has not confirmed. None: nothing is kept.
             token: the robot's bearer token.
-            ca: PEM file of the authority that signed the server's certificate. None: those of the system.
+            ca: PEM file of the authority that signed the server's certificate. None: the authorities of the system.
             certificate: PEM files of the robot's certificate and key, which replace the token.
             budget_kbps: limit of the uplink, kB per second by the stamps. None: everything is sent.
             outbox_mb: limit of the packets that wait for the server, MB; above three quarters, places are left out.
@@ -139,7 +139,7 @@ class Robot(LiveTracker):
             executor: runs the back end and the map, in its only worker. None: a process of its own, which ends with the
                 robot.
             clock: seconds of any origin, for the age of corrections and for retries.
-            sleep: sleeps for so many seconds while ``finish`` waits for the server.
+            sleep: sleeps for a number of seconds while ``finish`` waits for the server.
 
         Raises:
             InputError: the name, a laser, the configuration, the floor, the address, a file or the state folder cannot
@@ -224,7 +224,7 @@ class Robot(LiveTracker):
             floor: as for the robot itself.
 
         Raises:
-            InputError: it is no floor.
+            InputError: it is not a floor.
         """
         _checked_floor(floor)
         with self._lock:

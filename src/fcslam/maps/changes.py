@@ -31,7 +31,7 @@ class ChangedRegion:
     kind: str
     """``appeared`` or ``disappeared``."""
     area_m2: float
-    """Of its changed cells."""
+    """Area of its changed cells."""
     x: float
     """Mean of the changed cells in ``map``, metres."""
     y: float
@@ -122,7 +122,7 @@ def _regions(
 
 
 def _grown(mask: Mask, cells: int) -> Mask:
-    """The mask with all cells within so many rows and columns."""
+    """The mask, grown to all cells within this many rows and columns."""
     side = 2 * cells + 1
     grown: Cells = np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)), np.uint8)
     return np.asarray(grown > 0)

@@ -18,7 +18,7 @@ WORLD_M = 512.0
 TILE_PX = 512
 DEEPEST_ZOOM = 8
 KEPT_BYTES = 256_000_000
-"""Of maps in memory; the one that was asked for last stays, however large it is."""
+"""Size of maps kept in memory; the one that was asked for last stays, however large it is."""
 
 
 def finest_zoom(resolution_m: float) -> int:
@@ -65,7 +65,7 @@ class _Pyramid:
     levels: list[NDArray[np.uint8]]
     """Pixels (H, W) with row 0 at the lowest y. Each level has half as many per side as the one before, their means."""
     resolution_m: float
-    """Of the first level."""
+    """Resolution of the first level."""
     origin: NDArray[np.float64]
     """Lower left corner, (2,), metres."""
 

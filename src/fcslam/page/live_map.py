@@ -22,7 +22,7 @@ from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.worker import LIVE_EVERY_S, LIVE_LOOK_S
 
 SHARE = 0.5
-"""Of the time, for writing. Copies have a low priority, so they mostly use what the mapping leaves."""
+"""Share of the time for writing. Copies have a low priority, so they mostly use what the mapping leaves."""
 
 _log = logging.getLogger(__name__)
 

@@ -29,9 +29,9 @@ from fcslam.service.summaries import (
 from fcslam.service.viewed_mission import ViewedMission
 
 MOST_CLOSURES = 5000
-"""Of each status, as the page asks for."""
+"""Largest number of closures of each status that the page asks for."""
 MOST_TILES = 200
-"""Of all maps together: a tile has about 15 kB. Of a larger map, the file holds coarser tiles."""
+"""Most tiles of all maps together: a tile has about 15 kB. For a larger map, the file holds coarser tiles."""
 SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="stylesheet" href="page.css">'
 """Elements of the page that the file holds instead."""
 
@@ -96,7 +96,7 @@ def _json(content: Settings | Iterable[Settings]) -> str:
 
 
 def _zoom(occupancy: OccupancyMap, most: int) -> int:
-    """The deepest zoom down to which a map has at most so many tiles; -1: it is too large even for zoom 0."""
+    """The deepest zoom at which a map has at most this many tiles; -1: it is too large even for zoom 0."""
     finest = finest_zoom(occupancy.resolution_m)
     counts = itertools.accumulate(math.prod(map(len, _covered(occupancy, zoom))) for zoom in range(finest + 1))
     return sum(1 for count in counts if count <= most) - 1

@@ -17,7 +17,7 @@ covered lens."""
 def excluding_recent(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDArray[np.bool_]:
     """Mask of the places (columns) that a query (row) may retrieve: those at least ``gap`` before it, shape (N, N).
 
-    A place is always similar to those just before it, so retrieving them is no loop.
+    A place is always similar to those just before it, so retrieving them is not a loop.
 
     Args:
         stamps: shape (N,), ascending; times, or numbers of places.

@@ -25,7 +25,7 @@ from fcslam.storage.files import write_file
 
 MOST_WORDS: Final = 65536
 _MOST_BYTES: Final = 2 * (MOST_WORDS * CODE_BYTES + 4096)
-"""Of a file: all words of two channels, and their names."""
+"""Largest size of a file: all words of two channels, and their names."""
 _ITERATIONS: Final = 8
 _DIGITS: Final = 12
 
@@ -104,7 +104,7 @@ def _check_replaceable(path: Path) -> None:
     try:
         read_vocabularies(path)
     except InputError as error:
-        raise OutputError(f"{path}: exists and is no vocabulary, so it stays; choose another name") from error
+        raise OutputError(f"{path}: exists and is not a vocabulary, so it stays; choose another name") from error
 
 
 def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
@@ -155,5 +155,5 @@ def _read(archive: np.lib.npyio.NpzFile, channel: Channel) -> WordVocabulary:
         raise ValueError(f"the detector version is {version.shape} {version.dtype}")
     name = version.tobytes().decode("ascii")
     if not NAME.fullmatch(name):
-        raise ValueError(f"{name[:64]!r} is no detector version")
+        raise ValueError(f"{name[:64]!r} is not a detector version")
     return WordVocabulary(channel, name, frozen(centres, np.uint8))

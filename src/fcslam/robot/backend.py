@@ -193,7 +193,7 @@ class _Session:
         return bodies if submap is None else [*bodies, *self._submap_bodies(submap)]
 
     def keyscan_poses(self) -> FloatArray:
-        """Of every keyscan in the robot's own map, shape (N, 3), metres and radians."""
+        """Pose of every keyscan in the robot's own map, shape (N, 3), metres and radians."""
         return self._lidar.keyscan_poses()
 
     def describe(self, input: NewImage) -> bool:
@@ -216,7 +216,7 @@ class _Session:
             bodies.append(self._lidar_place(submap))
         complete = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
         self._views = self._views[len(complete) :]
-        # A view outside of every submap is no place: the robot may have jumped between two scans.
+        # A view outside of every submap is not a place: the robot may have jumped between two scans.
         shown = [view for view in complete if submap.first <= view.keyscan <= submap.last]
         self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
         return [*bodies, *(self._camera_place(view) for view in shown)]
@@ -253,7 +253,7 @@ class _Session:
 
     @property
     def detector_versions(self) -> dict[Channel, str]:
-        """Of the channels in use."""
+        """Detector versions of the channels in use."""
         versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
         return {channel: versions[channel] for channel in self._config.channels}
 

@@ -1,6 +1,6 @@
 """Localisation in a finished map beside the tracker of a live robot: no pose of a scan waits for a search of the map.
 
-The tracker gives the pose in ``odom`` at once. Where ``odom`` lies in the map is known as of the newest keyscan that
+The tracker gives the pose in ``odom`` at once. Where ``odom`` lies in the map is known at the newest keyscan that
 the worker has handled; the robot's own motion carries it on until the next one.
 """
 

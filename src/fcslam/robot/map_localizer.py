@@ -69,12 +69,12 @@ INITIAL_ERROR_RAD = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapEstimate:
-    """Where a robot is in the map, as of its newest keyscan."""
+    """Pose of a robot in the map at its newest keyscan."""
 
     T_map_odom: FloatArray
     """Pose of the session's ``odom`` frame in the map, shape (3,), metres and radians."""
     covariance: FloatArray
-    """Of the keyscan's pose in the map, over (x, y, theta), shape (3, 3)."""
+    """Covariance of the keyscan's pose in the map, over (x, y, theta), shape (3, 3)."""
     quality: float
     """Share of the walls that lie on walls of the map, where the map knows the area, in [0, 1]. It is the smaller of
     two shares: of the last metres and of the newest keyscan.
@@ -87,7 +87,7 @@ class _Vote:
 
     T_map_odom: FloatArray
     ratio: float
-    """Of its score to the best one elsewhere."""
+    """Ratio of its score to the best one elsewhere."""
 
 
 class MapLocalizer:

@@ -55,7 +55,7 @@ def _mapped_sweep(sweep: Sweep, beam_count: int, step: int) -> Sweep:
 def _returns(ranges_m: Ranges, max_range_m: float) -> Ranges:
     """The ranges below the maximum, inf for no return, and 0 for the others, shape (N,), metres.
 
-    The maximum is rounded as the ranges are: 5.6 m in single precision is below 5.6 m, and it is no return. It is
+    The maximum is rounded as the ranges are: 5.6 m in single precision is below 5.6 m, and it is not a return. It is
     compared before the ranges are rounded to the steps of the wire, which may take it below the maximum as well.
     """
     is_known = (ranges_m < np.float32(max_range_m)) | np.isposinf(ranges_m)

@@ -20,8 +20,8 @@ PREDICTED = OdometryModel(
     heading_rad=0.1,
     heading_per_turn=0.5,
 )
-"""Of a robot without odometry: every scan is matched, and the prediction is trusted little. Within a tenth of a second,
-a robot may brake or turn by so much."""
+"""Model of a robot without odometry: every scan is matched, and the prediction is trusted little. Within a tenth of a
+second, a robot may brake or turn by so much."""
 
 
 class MotionPrediction:

@@ -13,7 +13,7 @@ from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
 
 VOCABULARY = VocabularyConfig()
-"""Of the places of one robot."""
+"""Vocabulary of the places of one robot."""
 
 
 class OwnPlaces:

@@ -107,7 +107,7 @@ class Uplink:
 
     @property
     def is_full(self) -> bool:
-        """Whether so many packets wait that a recording should wait, too."""
+        """Whether enough packets wait that a recording should wait, too."""
         return self._sender is not None and self._outbox.is_full
 
     @property

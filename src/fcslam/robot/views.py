@@ -25,7 +25,7 @@ from fcslam.robot.keyframe_folder import KeyframeFolder
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
 FEWEST_KEYPOINTS = 20
-"""Least number of keypoints with a position; an image with fewer is no place."""
+"""Least number of keypoints with a position; an image with fewer is not a place."""
 
 
 class ViewsConfig(Settings):

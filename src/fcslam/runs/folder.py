@@ -131,7 +131,7 @@ def prepare_output(path: Path, force: bool = False) -> Path:
     if place == Path.cwd() or os.path.ismount(place):
         raise OutputError(f"{path}: cannot be replaced as a whole; name a new folder inside it")
     if occupied and not (place.is_dir() and is_run_folder(place)):
-        raise OutputError(f"{path}: exists and is no run folder; name a new folder")
+        raise OutputError(f"{path}: exists and is not a run folder; name a new folder")
     if occupied and not force:
         raise OutputError(
             f"{path}: already holds a run; name a new folder or give --force (in Python force=True) to replace it"
@@ -173,7 +173,7 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
         maps: read the maps and the mission file too, which may be large.
 
     Raises:
-        EvaluationError: ``folder`` is no run folder, or a file of it is missing or broken.
+        EvaluationError: ``folder`` is not a run folder, or a file of it is missing or broken.
     """
     path = Path(folder)
     if not is_run_folder(path):
@@ -237,7 +237,7 @@ def _tum_path(folder: Path, robot: str) -> Path:
 
 def _read_trajectory(folder: Path, robot: str, map_index: int, floor: str) -> RobotTrajectory:
     if not _SAFE_NAME.fullmatch(robot):
-        raise ValueError(f"{ROBOTS}: {robot!r} is no robot's name")
+        raise ValueError(f"{ROBOTS}: {robot!r} is not a robot's name")
     stamps, poses = read_tum(_tum_path(folder, robot))
     return RobotTrajectory(robot, map_index, stamps, poses, floor)
 

@@ -24,7 +24,7 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*([1-9]\d{0,6})\s+([1-9]
 
 
 HEADER_BYTES: Final = 4096
-"""Of an image: comments that are longer are not read."""
+"""Largest header of an image: longer comments are not read."""
 
 
 class Occupancy(IntEnum):
@@ -125,7 +125,7 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
         description: content of the YAML file; the image that it names is not opened.
 
     Raises:
-        EvaluationError: the image is no binary PGM of its stated size, or the description is incomplete, contains a
+        EvaluationError: the image is not a binary PGM of its stated size, or the description is incomplete, contains a
             number that is out of range, or rotates or negates the image.
     """
     image = parse_image(name, pgm, description)
@@ -172,7 +172,7 @@ def _described(description: str) -> tuple[float, tuple[float, float], float, flo
     """Resolution, origin, threshold of occupied cells, threshold of free cells."""
     content: Any = parse_yaml(description)
     if not isinstance(content, dict):
-        raise ValueError("the description is no YAML mapping")
+        raise ValueError("the description is not a YAML mapping")
     resolution_m, occupied, free = (number_in(content, key) for key in ("resolution", "occupied_thresh", "free_thresh"))
     origin = content.get("origin")
     if not isinstance(origin, list) or len(origin) != 3:
@@ -189,7 +189,7 @@ def number_in(description: Mapping[str, object], key: str) -> float:
     """A finite number of the description; YAML 1.1 reads ``5e-2`` as text.
 
     Raises:
-        ValueError: it is missing or no finite number.
+        ValueError: it is missing or not a finite number.
     """
     value = description.get(key)
     try:
@@ -197,5 +197,5 @@ def number_in(description: Mapping[str, object], key: str) -> float:
     except (ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"`{key}` in the description {'is missing' if value is None else 'is no finite number'}")
+        raise ValueError(f"`{key}` in the description {'is missing' if value is None else 'is not a finite number'}")
     return number

@@ -86,7 +86,7 @@ class ClosureRow:
 
     robot_i: str
     stamp_i: float
-    """Of the keyscan of ``robot_i``, seconds."""
+    """Stamp of the keyscan of ``robot_i``, seconds."""
     robot_j: str
     stamp_j: float
     channel: Channel

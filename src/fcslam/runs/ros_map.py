@@ -27,7 +27,7 @@ _MODES: Final = ("trinary", "scale", "raw")
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _PGM: Final = re.compile(rb"P([25])(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+([1-9]\d{0,4})\s")
 _MOST_PIXELS: Final = 1 << 28
-"""Of a PNG, which can be small and fill the memory; cells of 2.5 cm over 400 m."""
+"""Largest number of pixels of a PNG, which can be small and fill the memory; cells of 2.5 cm over 400 m."""
 _PERCENT: Final = 100
 _ROUNDING: Final = 1e-6
 """Share of a cell by which a map that is turned by a right angle may seem wider."""
@@ -54,7 +54,7 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
 def _map(image: bytes, description: str) -> OccupancyMap:
     content: Any = parse_yaml(description)
     if not isinstance(content, dict):
-        raise ValueError("the description is no YAML mapping")
+        raise ValueError("the description is not a YAML mapping")
     resolution_m, occupied, free = (number_in(content, key) for key in ("resolution", "occupied_thresh", "free_thresh"))
     mode, origin = content.get("mode", "trinary"), content.get("origin")
     if mode not in _MODES:
@@ -112,7 +112,7 @@ def _white(image: bytes, dtype: np.dtype[Any]) -> int:
 
 
 def _occupancy(mode: str, negate: bool) -> NDArray[np.float64]:
-    """Of a cell by grey value, shape (256,); NaN is unknown."""
+    """Occupancy of a cell by grey value, shape (256,); NaN is unknown."""
     grey = np.arange(256.0)
     if mode == "raw":
         return np.where(grey <= _PERCENT, grey / _PERCENT, np.nan)

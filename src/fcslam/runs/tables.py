@@ -43,7 +43,7 @@ def read_robots(path: Path) -> dict[str, tuple[int, str]]:
 
 def _floor(text: str) -> str:
     if text and not FLOOR.fullmatch(text):
-        raise ValueError(f"{text[:64]!r} is no floor")
+        raise ValueError(f"{text[:64]!r} is not a floor")
     return text
 
 
@@ -72,7 +72,7 @@ def read_localized(path: Path) -> LocalizedPoses:
     """Every line of localization/<robot>.csv.
 
     Raises:
-        ValueError: a column is missing or a value is no number.
+        ValueError: a column is missing or a value is not a number.
     """
     rows = [
         [float(row[column] or "nan") for column in _LOCALIZED_COLUMNS] for row in _read_csv(path, _LOCALIZED_COLUMNS)
@@ -87,7 +87,7 @@ def read_vetoes(path: Path) -> tuple[Veto, ...]:
     A line without stamps speaks of every closure between the two robots.
 
     Raises:
-        ConfigError: the file cannot be read, a column is missing, or a stamp is no number.
+        ConfigError: the file cannot be read, a column is missing, or a stamp is not a number.
     """
     try:
         return tuple(_read_veto(number, row) for number, row in enumerate(_read_csv(path, _CLOSURE_ENDS), start=2))
@@ -136,7 +136,7 @@ def read_metrics(path: Path) -> dict[str, Metric]:
 def _number(value: object) -> float:
     """As it stands: a count stays an integer."""
     if not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is no number")
+        raise TypeError(f"{value!r} is not a number")
     return value
 
 

@@ -15,7 +15,7 @@ from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode
 
 KEYSCANS = 31
-"""Of a picture, for each end: about 4 m of path before it and after it."""
+"""Number of keyscans in a picture, for each end: about 4 m of path before it and after it."""
 SAME_S = 1e-3
 """Stamps of a keyscan in packets, trajectories and closures differ by less."""
 

@@ -36,7 +36,7 @@ class CrashLog:
             self._suspect, self._crashes = str(suspect), crashes
 
     def is_fatal(self, task: str) -> bool:
-        """Whether so many workers in a row died at this task that it is left out."""
+        """Whether the task is left out, after killing too many workers in a row."""
         return task == self._suspect and self._crashes >= MOST_CRASHES
 
     def begin(self, task: str) -> None:

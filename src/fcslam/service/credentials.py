@@ -73,7 +73,7 @@ def _authority(folder: Path, now: datetime.datetime) -> Authority:
     if (folder / "ca.key").exists():
         found = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
         if not isinstance(found, ec.EllipticCurvePrivateKey):
-            raise ValueError("ca.key is no key of ours")
+            raise ValueError("ca.key is not a key of ours")
         return x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes()), found
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fcslam development authority")])

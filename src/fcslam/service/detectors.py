@@ -45,7 +45,7 @@ class DetectorStore:
         """Add a network and announce it to the robots.
 
         Raises:
-            FeatureError: it is no network that this fcslam runs.
+            FeatureError: it is not a network that this fcslam runs.
         """
         self._root.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self._root, prefix=STAGING) as folder:

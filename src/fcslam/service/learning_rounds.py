@@ -28,7 +28,7 @@ def read_rounds(folder: Path) -> list[LearningRound]:
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise EvaluationError(f"{path}: is no table of rounds ({error})") from error
+        raise EvaluationError(f"{path}: is not a table of rounds ({error})") from error
 
 
 def _round(row: dict[str, str]) -> LearningRound:

@@ -27,7 +27,7 @@ class MissionFolder:
 
     @property
     def name(self) -> str:
-        """Of the mission."""
+        """Name of the mission."""
         return self.path.name
 
     @property

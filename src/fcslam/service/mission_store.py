@@ -104,7 +104,7 @@ class StoredPacket:
     kind: PacketKind | None
     """None: it could not be read, and was refused."""
     channel: Channel | None
-    """Of a place."""
+    """Channel of a place."""
     data: bytes
     refusal: str | None = None
     """Why it has no effect; its number is used up."""
@@ -149,7 +149,7 @@ class MissionStore:
         """Open a mission: that of a file, which is created if there is none, or that of a server.
 
         Raises:
-            StoreError: the file is no mission of this version, or cannot be used.
+            StoreError: the file is not a mission of this version, or cannot be used.
         """
         self._database: RowStore = Database(place, SCHEMA, VERSION) if isinstance(place, Path) else place
 

@@ -50,7 +50,7 @@ class OpenMission:
 
     @property
     def name(self) -> str:
-        """Of the mission."""
+        """Name of the mission."""
         return self.folder.name
 
     @property
@@ -195,7 +195,7 @@ class Missions:
         """Files of a mission, there or not.
 
         Raises:
-            PacketError: it is no name.
+            PacketError: it is not a name.
         """
         check_name(name, "mission")
         return MissionFolder(self.root / "missions" / name)
@@ -228,7 +228,7 @@ class Missions:
         """The run folder of a result of a mission; None if there is none.
 
         Raises:
-            PacketError: it is no name.
+            PacketError: it is not a name.
         """
         return existing_result(self.folder(name), str(number))
 

@@ -28,7 +28,7 @@ class ViewedMission(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the mission or of the run folder."""
+        """Name of the mission or of the run folder."""
 
     @property
     def run_folder(self) -> Path | None:

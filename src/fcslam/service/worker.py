@@ -66,7 +66,7 @@ AT_ONCE_S = 0.25
 """Packets, and about the time, between two looks at what else there is to do. Corrections leave in between, so a robot
 does not wait for its own while there is a queue."""
 LIVE_SHARE = 0.1
-"""Of the time, for writing the live run folder beside the worker."""
+"""Share of the time for writing the live run folder beside the worker."""
 LIVE_LOOK_S = 0.05
 """Between two looks whether the live run folder is written."""
 REPORT_EVERY_S = 0.1
@@ -74,7 +74,7 @@ REPORT_EVERY_S = 0.1
 PAUSE_S = 30.0
 """After something could not be written."""
 SNAPSHOT_SHARE = 0.05
-"""Of the worker's time, for its snapshots: the next worker repeats no more than this part's inverse."""
+"""Share of the worker's time for snapshots; bounds the replay of the next worker to 1 / share."""
 SNAPSHOT_EVERY_S = 5.0
 """The snapshot is not written more often than this."""
 SHARED_LOOK_S = 0.25
@@ -112,7 +112,7 @@ class Worker:
         self._edits: list[Edit] = []
         """The edits that were read."""
         self._read_hash = b""
-        """Of all packets that were read, in their order."""
+        """Hash of all packets that were read, in their order."""
         self._resumed_at = store.applied()
         """How many packets took effect before a restart: their results are stored already."""
         self._times: dict[tuple[str, int], float] = {}

@@ -31,7 +31,7 @@ _GROUND: Final = -2
 _GROUND_RETURNS: Final = 0.75
 """Share of beams that return from near ground. The others graze it and are lost."""
 _GROUND_REFLECTIVITY: Final = 0.1
-"""Of ground that beams graze."""
+"""Reflectivity of ground that beams graze."""
 _GROUND_ROUGHNESS: Final = 0.04
 """Relative error of a range to the ground."""
 _GLASS_PASSES: Final = 0.5

@@ -113,11 +113,11 @@ def changed_share(before_m: Ranges, after_m: Ranges, max_range_m: float = inf) -
 
     Args:
         before_m, after_m: ranges of the same beams, metres; beams that only one of them has are left out.
-        max_range_m: a range at or above it is no return.
+        max_range_m: a range at or above it is not a return.
     """
     count = min(len(before_m), len(after_m))
     a, b = before_m[:count], after_m[:count]
-    with np.errstate(invalid="ignore"):  # NaN is no return
+    with np.errstate(invalid="ignore"):  # NaN is not a return
         both = (a > 0.0) & (a < max_range_m) & (b > 0.0) & (b < max_range_m)
         changed = np.abs(a - b) > np.maximum(CHANGE_M, CHANGE * np.minimum(a, b))
     returns = np.count_nonzero(both)

@@ -26,7 +26,7 @@ class Fault(StrEnum):
     TIME_REVERSAL = "steps back in time kept"
     NO_STAMP = "scans without a stamp taken as 1 s apart"
     REPEATED_STAMP = "scans with the stamp of the scan before kept"
-    NON_FINITE_RANGE = "ranges that are no finite number made invalid"
+    NON_FINITE_RANGE = "ranges that are not finite made invalid"
     NEGATIVE_RANGE = "negative ranges made invalid"
 
 

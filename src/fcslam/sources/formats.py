@@ -160,7 +160,9 @@ def format_of(path: Path) -> Format:
     if len(parts) > 1 and not os.path.isdir(path):
         for part in parts:
             if (kind := format_of(part)).name != _BAG:
-                raise SourceError(f"{part}: a {kind.name} is no part of several; give one recording, or parts of a bag")
+                raise SourceError(
+                    f"{part}: a {kind.name} is not a part of several; give one recording, or parts of a bag"
+                )
         return kind
     content = b"" if is_folder(path) else head(path)
     with translate_errors(path):

@@ -74,7 +74,7 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
     """Read a recording once or twice and say what is in it.
 
     Raises:
-        SourceError: it is no recording of a known format, or cannot be read at all.
+        SourceError: it is not a recording of a known format, or cannot be read at all.
     """
     source = open_source(path, options)
     name = format_of(robot_in(path)[0]).name

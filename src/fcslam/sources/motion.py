@@ -29,11 +29,11 @@ LEAST_STEP_M, LEAST_STEP_RAD = 0.005, 0.005
 
 
 JUMP_M, JUMP_RAD = 0.3, 0.5
-"""A step that is not longer is no jump: stamps may be wrong, and scan matching corrects it."""
+"""A step that is not longer is not a jump: stamps may be wrong, and scan matching corrects it."""
 LEAST_SPEED_M_S, LEAST_TURN_RAD_S = 5.0, 6.0
 """Speeds that any robot may seem to reach between two readings, as their stamps may be wrong."""
 FASTER: Final = 2.0
-"""A robot may be so many times as fast as it was lately."""
+"""Largest ratio of the speed of a robot to its recent speed."""
 FORGOTTEN: Final = 0.98
 """Share of a speed that counts at the next reading."""
 
@@ -103,7 +103,7 @@ class OdometryBridge:
         self._changed_s = 0.0
         """Stamp of the newest reading that differs from the one before."""
         self._speed_m_s, self._turn_rad_s = 0.0, 0.0
-        """Of the robot lately."""
+        """Recent speed and turn rate of the robot."""
         self._T_first_odom: Pose | None = None
         """The present frame in the first one; None before the first jump."""
 

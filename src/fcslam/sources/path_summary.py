@@ -67,7 +67,7 @@ class PathSummary:
 
     @property
     def fault(self) -> str | None:
-        """Why these poses are no odometry, as the end of a sentence; None if they can be."""
+        """Why these poses are not odometry, as the end of a sentence; None if they can be."""
         if self.count < FEWEST_POSES or self.says_something:
             return None
         if not self._leaves and not self._turns:

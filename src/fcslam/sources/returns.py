@@ -72,7 +72,7 @@ class RangeSample:
             self._samples, self._step = self._samples[::2], 2 * self._step
 
     def placeholders(self) -> tuple[float, ...]:
-        """The values that are no ranges."""
+        """The values that are not ranges."""
         places = [sample for sample in self._samples if sample.is_elsewhere]
         beams = sum(len(sample.values) for sample in places)
         if len(places) < FEWEST_SCANS:
@@ -128,7 +128,7 @@ def without(values: Ranges, placeholders: Sequence[float]) -> Ranges:
 def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> list[str]:
     """The notice about placeholders; empty without any."""
     shown = ", ".join(f"{value:g}" for value in placeholders)
-    return [f"{path}: {shown} m repeats exactly in many beams{which} everywhere, so it is no range"] * bool(shown)
+    return [f"{path}: {shown} m repeats exactly in many beams{which} everywhere, so it is not a range"] * bool(shown)
 
 
 def is_apart(a: Pose, b: Pose) -> bool:

@@ -28,7 +28,7 @@ RETRY_S: Final = 5.0
 ANSWER_S: Final = 10.0
 """A statement that takes longer fails: the server, or the way to it, is gone."""
 MOST_CONNECTIONS: Final = 8
-"""Of one process to the server."""
+"""Most connections of one process to the server."""
 _CONNECT_S: Final = 3
 _LOOK_EVERY_S: Final = 0.5
 _SCHEMES: Final = ("postgresql", "postgres")

@@ -14,7 +14,7 @@ AGENT_HEADER = "Fcslam-Agent"
 """128 random bits in hexadecimal that distinguish two agents of the same name."""
 
 REMOVED_HEADER = "Fcslam-Removed"
-"""Of a response: 1 if an administrator removed the robot's session, so that its packets have no effect, else 0."""
+"""Header of a response: 1 if an administrator removed the robot's session, and its packets have no effect; else 0."""
 REFUSED_HEADER = "Fcslam-Refused"
 """In a reply: number of the robot's packets that were refused."""
 

@@ -73,7 +73,7 @@ def check_name(name: str, what: str) -> None:
     Raises:
         PacketError: the name is not valid; the message begins with ``what``.
     """
-    _require(NAME.fullmatch(name) is not None, f"{what}: {name[:64]!r} is no name (1-64 of A-Z a-z 0-9 . _ + -)")
+    _require(NAME.fullmatch(name) is not None, f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
 
 
 def _robot_of(body: Body) -> str:

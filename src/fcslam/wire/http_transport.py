@@ -109,7 +109,7 @@ class HttpClient:
         Args:
             url: address of the cloud.
             token: bearer token, if the cloud asks for one.
-            ca: PEM file of certificate authorities; None: those of the system.
+            ca: PEM file of certificate authorities; None: the authorities of the system.
             own: PEM files of the own certificate and its key, in place of a token.
             headers: of every request.
 

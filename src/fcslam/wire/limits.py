@@ -4,13 +4,13 @@ from fcslam.records import Channel
 
 PROTOCOL_VERSION = 2
 FLOOR_VERSION = 3
-"""Of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
+"""Version of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
 WORDS_VERSION = 4
-"""Of what only a robot sends that sends words in place of descriptors."""
+"""Version of packets that only a robot with words in place of descriptors sends."""
 TAUGHT_VERSION = 5
-"""Of codes that the cloud gives to a robot that learns."""
+"""Version of packets with codes that the cloud gives to a robot that learns."""
 SWEEP_VERSION = 6
-"""Of a keyscan whose beams were measured at different times."""
+"""Version of a keyscan whose beams were measured at different times."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -29,7 +29,7 @@ BYTES_PER_RANGE = 2
 SWEEP_NUMBERS = 8
 MAXIMUM_BEAM_TIME_S = 2.0
 MAXIMUM_SPEED = 50.0
-"""Of a robot during a scan, m/s and rad/s."""
+"""Largest speed of a robot during a scan, m/s and rad/s."""
 MAXIMUM_ACCELERATION = 500.0
 """The same, m/s^2 and rad/s^2."""
 
@@ -42,7 +42,7 @@ MAXIMUM_WORDS = 65536
 """Words of a vocabulary that robots and cloud share."""
 BYTES_PER_WORD = 2
 BYTES_PER_ROW = 2
-"""Of the number of a keypoint in its place."""
+"""Size of the number of a keypoint in its place."""
 
 TILE_CELLS = 256
 """Cells along each side of a map tile."""

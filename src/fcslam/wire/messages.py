@@ -91,7 +91,7 @@ class TaughtPlace:
     number: int
     """The keyscan of the place, in the epoch of the packet."""
     detector_version: str
-    """Of the codes, and of the place as the robot sent it."""
+    """Detector version of the codes, and of the place as the robot sent it."""
     count: int
     """Keypoints of the place, as the robot sent it."""
     rows: NDArray[np.uint16]

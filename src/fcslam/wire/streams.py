@@ -43,7 +43,7 @@ _LEARNT_BITS: Final = 4
 more.
 """
 _STATES: Final = 3
-"""Of a cell: unknown, free, occupied."""
+"""Number of states of a cell: unknown, free, occupied."""
 _NEIGHBOURS: Final = _STATES**5
 """States of the five cells before a cell that are nearest to it."""
 
@@ -64,7 +64,7 @@ def unpack_ranges(data: bytes, count: int) -> RangeCodes:
     codes = np.zeros(count, np.int64)
     _unpack(data, BYTES_PER_RANGE * count, "keyscan: ranges", _code_ranges, codes)
     if codes.min(initial=0) < 0 or codes.max(initial=0) > np.iinfo(np.uint16).max:
-        raise PacketError("keyscan: a range is no 16-bit number")
+        raise PacketError("keyscan: a range is not a 16-bit number")
     return codes.astype(np.uint16)
 
 
@@ -85,7 +85,7 @@ def unpack_keypoints(data: bytes, count: int, axes: int) -> KeypointCodes:
         codes = np.zeros((count, axes), np.int64)
         _unpack(data, BYTES_PER_AXIS * count * axes, "place: keypoints", _code_keypoints, codes)
     if np.abs(codes).max(initial=0) > np.iinfo(np.int16).max:
-        raise PacketError("place: a keypoint is no 16-bit number of steps")
+        raise PacketError("place: a keypoint is not a 16-bit number of steps")
     if not np.array_equal(ascending(codes), np.arange(count)):
         raise PacketError("place: keypoints are not in ascending order")
     keypoints: KeypointCodes = codes.astype(np.int16)
@@ -136,7 +136,7 @@ def unpack_words(data: bytes, count: int) -> Words:
     codes = np.zeros(count, np.int64)
     _unpack(data, BYTES_PER_WORD * count, "place: words", _code_words, codes)
     if codes.max(initial=0) > np.iinfo(np.uint16).max:
-        raise PacketError("place: a word is no 16-bit number")
+        raise PacketError("place: a word is not a 16-bit number")
     words: Words = codes.astype(np.uint16)
     if pack_words(words) != data:
         raise PacketError("place: words have more bits than the largest")

@@ -103,7 +103,7 @@ def _relative(report: "FleetReport") -> "Table":
 
 
 def _closures(report: "FleetReport", within: "ClosureScope") -> "Table":
-    """Of the channels that closed something; of both together where both did."""
+    """Table of the channels that closed something, and of both together if both did."""
     from rich.table import Table
 
     from fcslam.evaluation.fleet.closure_stages import BOTH

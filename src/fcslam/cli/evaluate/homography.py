@@ -91,7 +91,7 @@ def _show(console: "Console", report: "HomographyReport", truth: HomographyGroun
         "Repeatability at 320 x 240, NMS 4, of the 300 strongest keypoints in common view; correct to 3 px.",
         "Homography at 640 x 480 by mutual nearest neighbours among the 1000 strongest in common view, RANSAC at 3 px: "
         "share of pairs whose corners are right to e px on average.",
-        "MMA: share of the matches right to so many px, mean over pairs; matching score: share of the keypoints in "
+        "MMA: share of the matches within a limit in px, mean over pairs; matching score: share of the keypoints in "
         "common view whose nearest neighbour is right to 3 px; both of the 1000 strongest of each image.",
         "NMS 0: keypoints as the detector gives them. ...-logits: the network's own, compared by the cosine of their "
         "logits instead of by bits.",

@@ -44,7 +44,7 @@ def join(
     from fcslam.federated.messages import MAX_NAME_LENGTH
 
     if not images.is_dir():
-        raise TrainingError(f"{images}: is no folder; give the folder of the robot's images")
+        raise TrainingError(f"{images}: is not a folder; give the folder of the robot's images")
     check_robot_security(ca, robot_key, insecure)
     default_name = images.resolve().name if robot_key is None else robot_key.stem
     robot_name = default_name if name is None else name

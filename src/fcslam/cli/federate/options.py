@@ -90,7 +90,7 @@ class Security:
         """The certificates; None with ``--insecure``.
 
         Raises:
-            TrainingError: something is missing, or is no file.
+            TrainingError: something is missing, or is not a file.
         """
         from fcslam.errors import TrainingError
         from fcslam.federated.tls import Certificates
@@ -98,7 +98,7 @@ class Security:
         files = [file for file in (self.ca, self.certificate, self.key, *self.robot_keys) if file is not None]
         for file in files:
             if not file.is_file():
-                raise TrainingError(f"{file}: is no file; {_NEEDED}")
+                raise TrainingError(f"{file}: is not a file; {_NEEDED}")
         if self.insecure:
             if files:
                 raise TrainingError(_TOO_MUCH)
@@ -112,14 +112,14 @@ def check_robot_security(ca: Path | None, robot_key: Path | None, insecure: bool
     """Check that a robot has an authority and a private key, or that the user wants neither.
 
     Raises:
-        TrainingError: something is missing, is no file, or is too much.
+        TrainingError: something is missing, is not a file, or is too much.
     """
     from fcslam.errors import TrainingError
 
     files = [file for file in (ca, robot_key) if file is not None]
     for file in files:
         if not file.is_file():
-            raise TrainingError(f"{file}: is no file; {_ROBOT_NEEDS}")
+            raise TrainingError(f"{file}: is not a file; {_ROBOT_NEEDS}")
     if insecure and files:
         raise TrainingError(_TOO_MUCH)
     if not insecure and len(files) < 2:
@@ -137,5 +137,5 @@ def parse_address(text: str) -> "Address":
 
     host, colon, port = text.removeprefix("https://").removeprefix("http://").rpartition(":")
     if not (colon and host.strip("[]") and port.isdecimal() and 0 < int(port) < 65536):
-        raise TrainingError(f"{text}: is no HOST:PORT")
+        raise TrainingError(f"{text}: is not a HOST:PORT")
     return Address(host.strip("[]"), int(port))

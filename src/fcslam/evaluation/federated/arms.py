@@ -52,7 +52,7 @@ class Arm(Settings):
         """The settings of this arm.
 
         Raises:
-            ConfigError: ``settings`` names something that is no setting.
+            ConfigError: ``settings`` names something that is not a setting.
         """
         content = common.model_dump() | self.settings
         content["training"] = dict(content["training"]) | {"seed": seed}

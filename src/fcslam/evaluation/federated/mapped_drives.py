@@ -36,13 +36,13 @@ class MappedDrive:
     robot: str
     keyframes: tuple[Keyframe, ...]
     stamps: FloatArray
-    """Of the keyframes' keyscans, shape (N,), seconds."""
+    """Stamps of the keyframes' keyscans, shape (N,), seconds."""
     T_own_base: FloatArray
     """Estimated poses at the keyframes in the robot's own map, shape (N, 3), metres and radians."""
     T_map_base: FloatArray
     """The same in the fleet's map, shape (N, 3)."""
     map_index: int
-    """Of the fleet's map that the robot is in."""
+    """Index of the fleet's map that the robot is in."""
 
 
 @dataclass(frozen=True, slots=True)

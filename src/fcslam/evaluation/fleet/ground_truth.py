@@ -81,7 +81,7 @@ def read_grid(path: Path) -> LabelledGrid:
         meta = parse_yaml(path.read_text(encoding="utf-8"))
         pixels = cv2.imdecode(np.fromfile(path.parent / meta["image"], dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
         if pixels is None:
-            raise ValueError(f"{meta['image']} is no image")
+            raise ValueError(f"{meta['image']} is not an image")
         resolution_m, origin = float(meta["resolution"]), np.array(meta["origin"], dtype=np.float64)
         occupied_over, free_under = float(meta["occupied_thresh"]), float(meta["free_thresh"])
         if not (resolution_m > 0.0 and origin.shape == (3,) and np.isfinite(origin).all()):

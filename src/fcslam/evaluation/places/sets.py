@@ -110,7 +110,7 @@ def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
     frames = [_FRAME.fullmatch(str(Path(row["image"]).with_suffix(""))) for row in rows]
     wrong = [row["image"] for row, frame in zip(rows, frames, strict=True) if frame is None]
     if wrong:
-        raise EvaluationError(f"{folder}: {wrong[0]} is no <clip>_frame_<number>")
+        raise EvaluationError(f"{folder}: {wrong[0]} is not a <clip>_frame_<number>")
     clips = np.array([frame[1] for frame in frames if frame])
     numbers = np.array([int(frame[2]) for frame in frames if frame])
     floors, areas = (np.array([row[key] for row in rows]) for key in ("label", "area"))

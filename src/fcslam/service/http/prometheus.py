@@ -19,7 +19,7 @@ from fcslam.wire.packets import read_label
 _AT_ONCE = 10_000
 """Packets counted in one query of the store."""
 _MOST_NOTED = 100_000
-"""Arrivals whose times are kept; while so many wait, later ones are not noted."""
+"""Most arrivals whose times are kept; later ones are not noted while these wait."""
 
 
 class ServiceMetrics:
@@ -67,7 +67,7 @@ class ServiceMetrics:
         self._packets.set(ready)
         applied = mission.store.applied()
         self._queue.set(ready - applied)
-        self.arrived(mission)  # packets of before this start, if nobody noted them
+        self.arrived(mission)  # packets from before this start, if nobody noted them
         self._age.set(self._arrivals.age_s(applied, self._clock()))
         self._stages.follow(mission)
         self._waiting.set(mission.intake.waiting_count())

@@ -151,6 +151,6 @@ def _unpacked_size(body: bytes) -> int:
     """Size of a batch for the rate limit: the unpacked size, because unpacking takes time.
 
     Raises:
-        PacketError: it is no batch.
+        PacketError: it is not a batch.
     """
     return sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(body))

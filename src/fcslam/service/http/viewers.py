@@ -48,7 +48,7 @@ Index = Annotated[int, PathParameter(ge=0, le=MOST)]
 Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
 Stamp = Annotated[float, PathParameter(allow_inf_nan=False, description="of a keyscan, seconds")]
 KEPT = {"Cache-Control": "private, max-age=60"}
-"""Of what is computed for a request and hardly changes."""
+"""Headers of answers that are computed for a request and hardly change."""
 TEXT, JSON = "text/plain", "application/json"
 MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
 

@@ -18,7 +18,7 @@ class SharedDetectors(DetectorStore):
         """Add a network and announce it to the robots of all instances.
 
         Raises:
-            FeatureError: it is no network that this fcslam runs.
+            FeatureError: it is not a network that this fcslam runs.
             StoreError: it cannot be stored.
         """
         file = super().announce(content)

@@ -116,10 +116,10 @@ class SharedMissions:
             root: folder of this instance's own files, which can be made again from the store.
             config: of new missions.
             server: the store.
-            instance, process, on_taken: as of ``Instance`` and ``Registry``.
+            instance, process, on_taken: see ``Instance`` and ``Registry``.
             admission: how much the instance takes.
             clock, wall_clock: seconds; since 1970.
-            launch, listen: as of ``Instance``.
+            launch, listen: see ``Instance``.
 
         Raises:
             ServiceError: the folder cannot be used, or another instance has the name.
@@ -173,7 +173,7 @@ class SharedMissions:
         """Local files of a mission, there or not.
 
         Raises:
-            PacketError: it is no name.
+            PacketError: it is not a name.
         """
         check_name(name, "mission")
         return MissionFolder(self.root / "missions" / name)

@@ -108,7 +108,7 @@ class Registry:
             connection.execute("COMMIT")
 
     def claim(self, most: int) -> list[Lease]:
-        """Take at most so many missions that need a worker and have none, with a new fencing number each."""
+        """Take up to ``most`` missions that need a worker and have none, each with a new fencing number."""
         claimed = self._server.rows(
             "UPDATE missions SET holder = ?, fence = fence + 1, is_ready = false,"
             f" expires = {_EXPIRY} WHERE number IN (SELECT number FROM missions"

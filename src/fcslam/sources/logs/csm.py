@@ -3,7 +3,7 @@
     {"nrays": n, "min_theta": a, "max_theta": b, "readings": [r1..rn], "valid": [..], "theta": [..],
      "odometry": [x, y, theta], "timestamp": [seconds, microseconds], ...}
 
-A reading that is null, or not valid, is no return. The angles are the first and the last of ``theta`` where it is
+A reading that is null, or not valid, is not a return. The angles are the first and the last of ``theta`` where it is
 given. A scan without odometry has the pose 0, so a log of such scans is refused as one without odometry. Without
 timestamps, scans are 1 s apart.
 """
@@ -51,7 +51,7 @@ class _CsmParser:
         increment_rad = (last_rad - first_rad) / (count - 1) if count > 1 else 0.0
         if not is_field_of_view(Beams(count, first_rad, increment_rad)):
             raise ValueError("no sane field of view")
-        text = b" ".join(b"%r" % (value if value > 0.0 else 0.0) for value in values)  # NaN is no return
+        text = b" ".join(b"%r" % (value if value > 0.0 else 0.0) for value in values)  # NaN is not a return
         check_beams(text, count)
         pose = _pose(content.get("odometry"))
         stamp = self._stamp(content.get("timestamp"))

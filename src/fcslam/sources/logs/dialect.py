@@ -101,4 +101,4 @@ def check_beams(range_text: bytes, beam_count: int) -> None:
     if beam_count < 2 or not (single_spaced or len(range_text.split()) == beam_count):
         raise ValueError("not as many ranges as stated")
     if range_text.translate(None, _NUMBER_LETTERS):
-        raise ValueError("a range is no number")
+        raise ValueError("a range is not a number")

@@ -4,7 +4,7 @@
     Laser n r1..rn
 
 A scan takes the pose of the odometry before it. Its 181 beams are a SICK's over 180 degrees, from right to left; 8.19 m
-(8191 mm, all bits set) is no return.
+(8191 mm, all bits set) is not a return.
 """
 
 import re

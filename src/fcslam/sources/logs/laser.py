@@ -11,7 +11,7 @@ A geometry stated in a scan line (ROBOTLASER1) is used. Otherwise the beam count
 In all of them beam ``n // 2`` looks straight ahead. If the count alternates between two neighbours, as 181, 180, 180,
 180, the scanner interleaves its scans: those with one beam less lie between the beams of the others.
 
-A range of 50 m or more is no return. SICK scanners send 81.8 to 81.9 m, about 51.2 m or 50 m for it, depending on
+A range of 50 m or more is not a return. SICK scanners send 81.8 to 81.9 m, about 51.2 m or 50 m for it, depending on
 their resolution, and logs do not say which; beyond 50 m indoors nothing is lost. The parameter
 ``robot_front_laser_max`` does not help: it belongs to obstacle avoidance, and a log with 10 m has good returns at 12 m.
 """
@@ -36,7 +36,7 @@ _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 
 class Interleaving(NamedTuple):
-    """A scanner whose scans lie between one another, as of a SICK: the first of a cycle has one more beam."""
+    """A scanner with interleaved scans, for example a SICK: the first of a cycle has one more beam."""
 
     full_count: int
     """Beams of the first scan of a cycle; the others have one less."""

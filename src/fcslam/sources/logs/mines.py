@@ -34,7 +34,7 @@ _INCREMENT_RAD = 2.0 * pi / 1024.0
 _LASER = StatedLaser((_HIDDEN_BEAMS - _MIDDLE_BEAM) * _INCREMENT_RAD, _INCREMENT_RAD, _MAX_RANGE_M)
 
 _MAX_COUNT = 1e15
-"""Of ticks or microseconds; a larger one is damage."""
+"""Largest count of ticks or microseconds; a larger one is damage."""
 _POSES_KEPT = 8
 """Enough to look back over ``_SCAN_AGE_S`` at 10 to 50 lines a second."""
 _MAX_STEP_M = 10.0

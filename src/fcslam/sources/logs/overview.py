@@ -30,7 +30,7 @@ class LogReading(NamedTuple):
     has_odometry: bool
     """Whether the poses are those of wheels."""
     placeholders: tuple[float, ...] = ()
-    """Values that are no ranges."""
+    """Values that are not ranges."""
 
 
 class MountingEstimate:

@@ -20,7 +20,7 @@ _LONGEST_RANGE_M = 1e6
 _BATCH_LINES, _BATCH_BYTES = 256, 1 << 18
 """Lines that are parsed together; fewer if the text of their ranges is longer."""
 _MAX_LETTERS = 16
-"""Of a number that float64 holds exactly without its point."""
+"""Most characters of a number that float64 holds exactly without its point."""
 _POINT, _SPACE, _ZERO = b". 0"
 _POWERS = 10 ** np.arange(_MAX_LETTERS)
 

@@ -4,7 +4,7 @@ Besides the rules of ``gate``:
 
 - Scans of a dialect without stamps get stamps 1 s apart, and are counted.
 - If only the poses of odometry messages change, a scan takes the pose of the message before it.
-- Poses that say nothing (``PathSummary.fault``) are no odometry.
+- Poses that say nothing (``PathSummary.fault``) are not odometry.
 """
 
 from collections import Counter
