@@ -50,7 +50,7 @@ def test_how_a_laser_faces_is_found(laser, turned_deg, upside_down):
         assert found is None
         return
     assert math.remainder(found.facing.turned_deg - turned_deg, 360.0) == pytest.approx(0.0, abs=3.0)
-    assert found.facing[1:] == (upside_down, 1.0)
+    assert found.facing[1:] == (upside_down, 1.0, 1.0)
     assert found.agreement > found.stated_agreement + 0.15
 
 
@@ -60,6 +60,19 @@ def test_the_scale_of_the_odometry_is_found(distance):
     scans = worlds.recording(poses, poses, worlds.room(), NARROW)
     found = contradicted_facing(stated(scans, distance=distance))
     assert found.facing == Facing(distance=pytest.approx(distance, rel=0.08))
+
+
+@pytest.mark.parametrize("turn", [0.5, 0.75])
+def test_angles_of_beams_that_are_wrong_are_found(turn):
+    beams = WIDE.beams
+    stated_beams = beams._replace(
+        angle_min_rad=turn * beams.angle_min_rad, angle_increment_rad=turn * beams.angle_increment_rad
+    )
+    scans = [replace(scan, laser=scan.laser.with_beams(stated_beams)) for scan in drive(WIDE)]
+    found = contradicted_facing(scans)
+    assert found.facing == Facing(turn=pytest.approx(turn, rel=0.05))
+    span_deg = float(str(found).split("which then span ")[1].split()[0])
+    assert span_deg == pytest.approx(360.0, rel=0.05)
 
 
 def test_a_bare_corridor_does_not_tell():

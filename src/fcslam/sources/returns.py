@@ -103,10 +103,14 @@ class RangeSample:
         large = beyond if len(beyond) > _TOO_FAR * beams and _is_varied(beyond) else returns
         middle = float(np.median(large)) if len(large) else 0.0
         if large is beyond or (middle > LONGEST_USUAL_M and _is_varied(returns)):
-            unit, divisor = ("millimetres", 1000) if middle > _MILLIMETRES else ("centimetres", 100)
+            unit = (
+                "millimetres: divide them by 1000"
+                if middle > _MILLIMETRES
+                else "centimetres: divide them by 100 (inches: by 39.37)"
+            )
             raise SourceError(
                 f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
-                f"be {unit}: divide them by {divisor} and give the recording again"
+                f"be {unit} and give the recording again"
             )
         share = len(returns) / max(beams, 1)
         if share < FEWEST_RETURNS:
