@@ -13,6 +13,7 @@ from fcslam.lidar.frontend import LidarConfig
 from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.sources import BagOptions, open_source, write_bag
+from fcslam.sources.logs.carmen_writer import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 
@@ -110,6 +111,14 @@ def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg
     kept = calibrated(open_source(path, given), LidarConfig())
     assert "--laser-pose is kept" in " ".join(kept.survey().notes)
     assert kept.survey().lasers[0].T_base_laser == given.laser_poses[0]
+
+
+def test_a_log_says_that_its_laser_faces_another_way(tmp_path):
+    path = tmp_path / "wrong.clf"
+    write_carmen(path, stated(drive(NARROW), turned_deg=180))
+    source = calibrated(open_source(path), LidarConfig())
+    assert "the laser is turned by about 180 deg" in source.survey().notes[-1]
+    assert len(list(source.records())) == source.survey().scan_count
 
 
 def test_a_laser_may_be_given_upside_down(tmp_path):

@@ -70,13 +70,13 @@ def info(
 def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":
     from fcslam.cli.warm_up import compiled
     from fcslam.lidar.frontend import LidarConfig
-    from fcslam.robot.calibrating import calibrate_bag
+    from fcslam.robot.calibrating import calibrate_bag, contradictions_of
     from fcslam.sources import open_source
     from fcslam.sources.bags.rosbag import RosBag
 
     source = open_source(recording, options)
     if not isinstance(source, RosBag):
-        yield "calibration: of ROS bags only"
+        yield from contradictions_of(source) or ("calibration: of ROS bags only; the scans agree with the odometry",)
         return
     with compiled(notices(quiet=False)):
         found = calibrate_bag(source, LidarConfig())

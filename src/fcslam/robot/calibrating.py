@@ -12,14 +12,14 @@ from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
 from fcslam.lidar.facing import WHEELS, Contradiction, contradicted_facing, distance_remedy, turn_remedy
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
-from fcslam.sources.source import Source
+from fcslam.sources.source import Noted, Source
 
 MOST_SCANS: Final = 1200
 """Scans that are tracked at most."""
@@ -66,7 +66,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     Raises:
         SourceError: the bag cannot be mapped.
     """
-    contradictions = [_contradiction_of(bag, laser) for laser in bag.survey().lasers]
+    contradictions = _contradictions(bag)
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
         lines = (f"{laser.name}: {found}; not corrected" for laser, found in named if found)
@@ -91,9 +91,25 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     return Calibrated(fine.calibration, correction, (f"{found}; {done}", *fine.lines))
 
 
-def _contradiction_of(bag: RosBag, laser: LaserModel) -> Contradiction | None:
-    scans = (record for record in bag.records() if isinstance(record, LaserScan))
-    return contradicted_facing(scan for scan in scans if is_same_laser(scan.laser, laser))
+def contradictions_of(source: Source) -> tuple[str, ...]:
+    """Lines about the lasers of a recording of any format that contradict its odometry.
+
+    Raises:
+        SourceError: the recording cannot be mapped.
+    """
+    return tuple(f"{source.name}: {found}; not corrected" for found in _contradictions(source) if found)
+
+
+def _contradictions(source: Source) -> list[Contradiction | None]:
+    """Of each laser."""
+    return [
+        contradicted_facing(
+            record
+            for record in source.records()
+            if isinstance(record, LaserScan) and is_same_laser(record.laser, laser)
+        )
+        for laser in source.survey().lasers
+    ]
 
 
 def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
@@ -158,13 +174,14 @@ def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
 
 
 def calibrated(source: Source, config: LidarConfig) -> Source:
-    """A bag with what its motion says against its messages; another recording as it is.
+    """A recording with what its motion says against it; only a bag is corrected.
 
     Raises:
-        SourceError: the bag cannot be mapped.
+        SourceError: the recording cannot be mapped.
     """
     if not isinstance(source, RosBag):
-        return source
+        said = contradictions_of(source)
+        return Noted(source, said) if said else source
     found = calibrate_bag(source, config)
     lines = tuple(f"{source.stream.path}: {line}" for line in found.lines)
     return source.corrected(found.correction, lines) if lines else source
