@@ -97,7 +97,7 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     Raises:
         SourceError: the recording cannot be mapped.
     """
-    return tuple(f"{source.name}: {found}; not corrected" for found in _contradictions(source) if found)
+    return tuple(f"{source.name}: {found}" for found in _contradictions(source) if found)
 
 
 def _contradictions(source: Source) -> list[Contradiction | None]:
@@ -181,7 +181,7 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
     """
     if not isinstance(source, RosBag):
         said = contradictions_of(source)
-        return Noted(source, said) if said else source
+        return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
     found = calibrate_bag(source, config)
     lines = tuple(f"{source.stream.path}: {line}" for line in found.lines)
     return source.corrected(found.correction, lines) if lines else source
