@@ -47,6 +47,8 @@ ENOUGH_AGREEMENT: Final = 0.75
 """Agreement with which a mounting is right."""
 LEAST_AGREEMENT: Final = 0.6
 """Least agreement with the right mounting; below, the scans do not fit the odometry in any way."""
+LEAST_TURNED: Final = 0.45
+"""The same with the right scale of turns."""
 LEAST_GAIN: Final = 0.1
 """Least gain in agreement over the stated mounting."""
 LEAST_LEAD: Final = 0.05
@@ -58,6 +60,8 @@ WHEELS: Final = 1.5
 """Distances that differ by a larger factor may be due to the unit of the ranges."""
 BENT: Final = 1.15
 """Turns that differ by a larger factor may be due to the angles of the beams."""
+LARGEST_SPAN_DEG: Final = 400.0
+"""No beams span more than a turn, with the error of an estimate."""
 UNITS_M: Final = {"feet": 0.3048, "inches": 0.0254}
 SAME_UNIT: Final = 0.1
 """Largest relative difference of a distance from that of a unit."""
@@ -128,6 +132,8 @@ def turn_remedy(turn: float, beams: Beams) -> str:
     if 1.0 / BENT < turn < BENT:
         return wheels
     span_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
+    if span_deg / turn > LARGEST_SPAN_DEG:
+        return wheels
     return f"{wheels}, or the angles of the beams, which then span {span_deg / turn:.0f} deg and not {span_deg:.0f}"
 
 
@@ -175,8 +181,8 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     is_certain = trial.leads(found, as_stated, LEAST_GAIN) and all(
         trial.leads(found, scores[each], LEAST_LEAD) for each in far
     )
-    is_bent = best.turn != 1.0  # so that moves never agree
-    if not is_certain or (trial.mean(found) < LEAST_AGREEMENT and not is_bent):
+    least = LEAST_AGREEMENT if best.turn == 1.0 else LEAST_TURNED  # where angles are wrong, moves never agree
+    if not is_certain or trial.mean(found) < least:
         return None
     turned_deg = math.remainder(best.turned_deg, 360)
     beams = trial.pairs[0][0].laser.beams

@@ -127,7 +127,9 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
         calibration = calibrate(motions, odometry)
     scale = calibration.turn_scale
     if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
-        return Calibrated(calibration, BagCorrection(), _contradiction(scale, survey.lasers[0].beams))
+        is_sure = calibration.delay is not None or _is_wrong(scale)  # a long drive, or a clear one
+        lines = _contradiction(scale, survey.lasers[0].beams) if is_sure else ()
+        return Calibrated(calibration, BagCorrection(), lines)
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
     if _is_wrong(distance := calibration.distance_scale) and not 1.0 / WHEELS < distance.value < WHEELS:

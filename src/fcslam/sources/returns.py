@@ -87,8 +87,13 @@ class RangeSample:
                 found.append(float(value))
         return tuple(found)
 
-    def check(self, path: Path, which: str) -> None:
-        """Refuse a recording that cannot be mapped; ``which`` names the laser, empty or with a blank before it.
+    def check(self, path: Path, which: str, remedy: str = "its range_min and range_max") -> None:
+        """Refuse a recording that cannot be mapped.
+
+        Args:
+            path: of the recording.
+            which: the laser, empty or with a blank before it.
+            remedy: what to check where nearly no beam has a return.
 
         Raises:
             SourceError: the laser measures nothing or in another unit.
@@ -116,7 +121,7 @@ class RangeSample:
         if share < FEWEST_RETURNS:
             raise SourceError(
                 f"{path}: only {share:.1%} of the beams{which} measure a range {limits} in {len(self._samples)} "
-                "sampled scans; check that the laser is not covered, its range_min and range_max, and record again"
+                f"sampled scans; check that the laser is not covered, {remedy}, and record again"
             )
 
 
