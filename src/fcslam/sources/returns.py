@@ -87,7 +87,7 @@ class RangeSample:
                 found.append(float(value))
         return tuple(found)
 
-    def check(self, path: Path, which: str, remedy: str = "its range_min and range_max") -> None:
+    def check(self, path: Path, which: str, remedy: str) -> None:
         """Refuse a recording that cannot be mapped.
 
         Args:
