@@ -30,7 +30,7 @@ def test_the_text_says_what_is_in_it_and_that_it_can_be_mapped(bag, capsys):
 
 def test_what_cannot_be_mapped_ends_with_the_reason(tmp_path, capsys):
     said = [message for message in drive(40) if message.topic != "/scan"]
-    assert main(["info", str(save(tmp_path / "run1.bag", said))]) == 0
+    assert main(["info", str(save(tmp_path / "run1.bag", said))]) == 1
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("cannot be mapped: ")
     assert "no laser scans" in last

@@ -13,6 +13,7 @@ from fcslam.lidar.frontend import LidarConfig
 from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.sources import BagOptions, open_source, write_bag
+from fcslam.sources.logs.carmen_writer import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 
@@ -50,7 +51,7 @@ def test_how_a_laser_faces_is_found(laser, turned_deg, upside_down):
         assert found is None
         return
     assert math.remainder(found.facing.turned_deg - turned_deg, 360.0) == pytest.approx(0.0, abs=3.0)
-    assert found.facing[1:] == (upside_down, 1.0)
+    assert found.facing[1:] == (upside_down, 1.0, 1.0)
     assert found.agreement > found.stated_agreement + 0.15
 
 
@@ -60,6 +61,19 @@ def test_the_scale_of_the_odometry_is_found(distance):
     scans = worlds.recording(poses, poses, worlds.room(), NARROW)
     found = contradicted_facing(stated(scans, distance=distance))
     assert found.facing == Facing(distance=pytest.approx(distance, rel=0.08))
+
+
+@pytest.mark.parametrize("turn", [0.5, 0.75])
+def test_angles_of_beams_that_are_wrong_are_found(turn):
+    beams = WIDE.beams
+    stated_beams = beams._replace(
+        angle_min_rad=turn * beams.angle_min_rad, angle_increment_rad=turn * beams.angle_increment_rad
+    )
+    scans = [replace(scan, laser=scan.laser.with_beams(stated_beams)) for scan in drive(WIDE)]
+    found = contradicted_facing(scans)
+    assert found.facing == Facing(turn=pytest.approx(turn, rel=0.05))
+    span_deg = float(str(found).split("which then span ")[1].split()[0])
+    assert span_deg == pytest.approx(360.0, rel=0.05)
 
 
 def test_a_bare_corridor_does_not_tell():
@@ -97,6 +111,14 @@ def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg
     kept = calibrated(open_source(path, given), LidarConfig())
     assert "--laser-pose is kept" in " ".join(kept.survey().notes)
     assert kept.survey().lasers[0].T_base_laser == given.laser_poses[0]
+
+
+def test_a_log_says_that_its_laser_faces_another_way(tmp_path):
+    path = tmp_path / "wrong.clf"
+    write_carmen(path, stated(drive(NARROW), turned_deg=180))
+    source = calibrated(open_source(path), LidarConfig())
+    assert "the laser is turned by about 180 deg" in source.survey().notes[-1]
+    assert len(list(source.records())) == source.survey().scan_count
 
 
 def test_a_laser_may_be_given_upside_down(tmp_path):

@@ -146,6 +146,16 @@ def test_invalid_clouds_are_refused_by_their_field(tmp_path):
         open_source(save(tmp_path / "broken.mcap", messages)).survey()
 
 
+@pytest.mark.parametrize("unit", [1000.0, 100.0, 1.0 / 0.3048])
+def test_a_cloud_in_another_unit_is_refused_with_what_to_check(tmp_path, unit):
+    def scaled(name, kind, offset, value):
+        return name, kind, offset, (lambda measured: unit * value(measured)) if name in "xyz" else value
+
+    layout = VELODYNE[0], [scaled(*field) for field in VELODYNE[1]]
+    with pytest.raises(SourceError, match="points are in metres"):
+        open_source(save(tmp_path / "run.mcap", drive(layout=layout))).survey()
+
+
 def test_a_body_that_is_wider_than_usual_is_left_out_with_a_note(tmp_path):
     angles = np.linspace(-2.5, 2.5, 400)
     deck = np.stack((0.7 * np.cos(angles), 0.7 * np.sin(angles), np.full(400, -0.1)), axis=1)

@@ -72,6 +72,12 @@ def test_a_refused_packet_is_told_by_its_place(cloud, transport):
     assert transport.send(PACKETS, -1) == HttpResponse(refusal=Refusal(1, f"{cloud.url}: bad (400)"))
 
 
+def test_a_token_that_is_not_known_names_the_option(cloud, transport):
+    cloud.canned.append(error(401))
+    with pytest.raises(CloudError, match=r"by --token-file$"):
+        transport.state()
+
+
 @pytest.mark.parametrize(
     ("status", "more", "wait_s"),
     [
@@ -183,7 +189,18 @@ def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_pa
             with pytest.raises(CloudError, match="its certificate is not trusted"):
                 wary.send(PACKETS, -1)
             wary.close()
+        plain = HttpTransport(cloud.url.replace("https", "http"), "r", "ab" * 16)
+        with pytest.raises(UnavailableError, match="its address begins with https://"):
+            plain.send(PACKETS, -1)
+        plain.close()
     assert len(cloud.requests) == 1, "no token went to a stranger"
+
+
+def test_a_cloud_without_tls_is_named(cloud):
+    secure = HttpTransport(cloud.url.replace("http", "https"), "r", "ab" * 16)
+    with pytest.raises(UnavailableError, match="its address begins with http://"):
+        secure.send(PACKETS, -1)
+    secure.close()
 
 
 @pytest.mark.parametrize("content", [None, b"noise"])

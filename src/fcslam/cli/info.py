@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,20 +51,33 @@ def info(
     laser_pose: LaserPose = None,
     cloud_band: CloudHeights = None,
 ) -> None:
-    """Say what is in a recording, and whether it can be mapped; if not, why."""
+    """Say what is in a recording, and whether it can be mapped; if not, why, and the exit code is 1."""
     from fcslam.sources.inspection import inspect
 
     options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
-    found = inspect(recording, options)
+    found = _with_contradictions(inspect(recording, options), options)
     console = answers()
     if as_json:
         print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
-        return
-    for line in _lines(found):
-        print_line(console, printable(line))
-    for each in found.robots or [found]:
-        for line in _calibration(each.path, options) if calibrate and each.problem is None else ():
+    else:
+        for line in _lines(found):
             print_line(console, printable(line))
+        for each in found.robots or [found]:
+            for line in _calibration(each.path, options) if calibrate and each.problem is None else ():
+                print_line(console, printable(line))
+    if any(each.problem is not None for each in (found, *found.robots)):
+        raise typer.Exit(1)
+
+
+def _with_contradictions(found: "Inspection", options: "BagOptions | None") -> "Inspection":
+    from fcslam.robot.calibrating import contradictions_of
+    from fcslam.sources import open_source
+
+    if found.robots:
+        return replace(found, robots=tuple(_with_contradictions(robot, options) for robot in found.robots))
+    if found.problem is not None:
+        return found
+    return replace(found, notes=(*found.notes, *contradictions_of(open_source(found.path, options))))
 
 
 def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":

@@ -8,7 +8,7 @@ The scans are tracked without odometry. Their motion is then compared with that 
 - sweep: ``share * (turn by odometry in the assumed sweep) = turn in the sweep, as the scans were matched``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,7 +24,9 @@ LONGEST_S: Final = 2.0
 """Scans farther apart in time are not compared: odometry drifts."""
 FEWEST_TURNS: Final = 20
 FEWEST_MOTIONS: Final = 30
-"""Fewer turns and motions say nothing."""
+"""Fewer turns and motions say nothing about times and the mounting."""
+FEWEST_PAIRS: Final = 4
+"""Fewer turns or motions say nothing about the scales: two numbers are estimated from them."""
 LARGEST_RESIDUAL_M: Final = 0.015
 """Motions of scans and odometry that differ by more, as a standard deviation, are not a measure of each other."""
 LARGEST_DELAY_S: Final = 0.4
@@ -100,20 +102,23 @@ class MotionCalibration:
 
 
 def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibration:
-    """Compare the motion of the scans with that of the odometry."""
+    """Compare the motion of the scans with that of the odometry.
+
+    A short drive has the scales alone: their standard deviations say whether they mean anything.
+    """
     pairs = _pairs(motions)
-    turned = np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD
-    if np.count_nonzero(turned) < FEWEST_TURNS:
-        return MotionCalibration()
-    delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
-    share = _sweep_share(motions, odometry, delay.value)
-    calibration = MotionCalibration(delay, turn_scale, sweep_share=share)
-    if len(pairs) < FEWEST_MOTIONS:
-        return calibration
-    fit = _mounting(motions, odometry, pairs, delay.value, turn_scale.value)
-    if fit is None:
-        return MotionCalibration(turn_scale=turn_scale)
-    return MotionCalibration(delay, turn_scale, *fit, share)
+    turns = np.count_nonzero(np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD)
+    delay, turn_scale = Estimate(0.0, 0.0), None
+    if turns >= FEWEST_PAIRS:
+        delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
+    fit = None
+    if len(pairs) >= FEWEST_PAIRS:
+        fit = _mounting(motions, odometry, pairs, delay.value, 1.0 if turn_scale is None else turn_scale.value)
+    scales = MotionCalibration(turn_scale=turn_scale, distance_scale=fit[0] if fit else None)
+    if turns < FEWEST_TURNS or (fit is None and len(pairs) >= FEWEST_MOTIONS):
+        return scales
+    timed = replace(scales, delay=delay, sweep_share=_sweep_share(motions, odometry, delay.value))
+    return timed if fit is None or len(pairs) < FEWEST_MOTIONS else replace(timed, mounting=fit[1])
 
 
 def _pairs(motions: ScanMotions) -> Pairs:

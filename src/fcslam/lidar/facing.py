@@ -15,7 +15,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
-from fcslam.records import FloatArray, LaserScan
+from fcslam.records import Beams, FloatArray, LaserScan
 
 LEAST_MOVE_M: Final = 0.3
 LEAST_TURN_RAD: Final = 0.3
@@ -39,19 +39,32 @@ LARGEST_STEP_M: Final = 0.3
 STEPS_DEG: Final = (30, 3)
 """Between the mountings that are tried, first and around the best."""
 DISTANCES: Final = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
-"""Scales of the distance that are tried; then those between."""
+TURNS: Final = (0.5, 0.75, 1.33, 2.0)
+"""Scales of the distance and of turns that are tried; then those between."""
 SQUARE_DEG: Final = 3
 """A laser that is turned by nearly a multiple of a right angle is turned by it."""
 ENOUGH_AGREEMENT: Final = 0.75
 """Agreement with which a mounting is right."""
 LEAST_AGREEMENT: Final = 0.6
 """Least agreement with the right mounting; below, the scans do not fit the odometry in any way."""
+LEAST_TURNED: Final = 0.45
+"""The same with the right scale of turns."""
 LEAST_GAIN: Final = 0.1
 """Least gain in agreement over the stated mounting."""
 LEAST_LEAD: Final = 0.05
 """Least gain in agreement over any other mounting."""
 SIGMAS: Final = 5.0
 """Least ratio of the gain to its standard deviation."""
+
+WHEELS: Final = 1.5
+"""Distances that differ by a larger factor may be due to the unit of the ranges."""
+BENT: Final = 1.15
+"""Turns that differ by a larger factor may be due to the angles of the beams."""
+LARGEST_SPAN_DEG: Final = 400.0
+"""No beams span more than a turn, with the error of an estimate."""
+UNITS_M: Final = {"feet": 0.3048, "inches": 0.0254}
+SAME_UNIT: Final = 0.1
+"""Largest relative difference of a distance from that of a unit."""
 
 
 class Facing(NamedTuple):
@@ -63,6 +76,8 @@ class Facing(NamedTuple):
     """Whether it is upside down where it is said to be upright, or the other way round."""
     distance: float = 1.0
     """Distance of the robot per distance by odometry."""
+    turn: float = 1.0
+    """Turn of the robot per turn by odometry."""
 
 
 class Contradiction(NamedTuple):
@@ -73,10 +88,16 @@ class Contradiction(NamedTuple):
     """Mean agreement of the points with the odometry, 0 to 1, as the laser faces."""
     stated_agreement: float
     """The same with the stated mounting."""
+    beams: Beams
+    """Of the laser, as stated."""
 
     def __str__(self) -> str:
         """Why the mounting or the odometry cannot be right, and what to do."""
-        (turned_deg, upside_down, distance), claims = self.facing, []
+        (turned_deg, upside_down, distance, turn), claims = self.facing, []
+        remedy = (
+            "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the "
+            "odometry"
+        )
         if upside_down:
             claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")
         if turned_deg:
@@ -84,16 +105,36 @@ class Contradiction(NamedTuple):
             claims.append(f"the laser is turned by about {abs(turned_deg):.0f} deg to the {side} of what is stated")
         if distance != 1.0:
             claims.append(f"the robot's distance is {distance:.2f} of what odometry says")
-        remedy = (
-            "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the "
-            "odometry"
-            if distance == 1.0
-            else "correct the radius of the wheels in its driver"
-        )
+            remedy = distance_remedy(distance)
+        elif turn != 1.0:
+            claims.append(f"the robot's turn is {turn:.2f} of what odometry says")
+            remedy = turn_remedy(turn, self.beams)
         return (
             f"the scans contradict the odometry: {', and '.join(claims)} (then {100 * self.agreement:.0f} % of the "
             f"points agree, and {100 * self.stated_agreement:.0f} % as stated); {remedy}"
         )
+
+
+def distance_remedy(distance: float) -> str:
+    """What to do about a robot whose distance by scans is ``distance`` of that by odometry."""
+    wheels = "correct the radius of the wheels in its driver"
+    if 1.0 / WHEELS < distance < WHEELS:
+        return wheels
+    seem = (
+        f", which seem to be {unit}" for unit, metres in UNITS_M.items() if abs(distance * metres - 1.0) < SAME_UNIT
+    )
+    return f"{wheels}, or the unit of the ranges{next(seem, '')}"
+
+
+def turn_remedy(turn: float, beams: Beams) -> str:
+    """What to do about a robot whose turn by scans is ``turn`` of that by odometry."""
+    wheels = "correct the distance of the wheels in its driver"
+    if 1.0 / BENT < turn < BENT:
+        return wheels
+    span_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
+    if span_deg / turn > LARGEST_SPAN_DEG:
+        return wheels
+    return f"{wheels}, or the angles of the beams, which then span {span_deg / turn:.0f} deg and not {span_deg:.0f}"
 
 
 Pair = tuple[LaserScan, LaserScan]
@@ -115,12 +156,15 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
         for facing in (
             *(Facing(turned, flipped) for flipped in (False, True) for turned in range(0, 360, coarse)),
             *(Facing(distance=distance) for distance in DISTANCES),
+            *(Facing(turn=turn) for turn in TURNS),
         )
     }
     best = max(scores, key=lambda facing: trial.mean(scores[facing]))
     near = [best._replace(turned_deg=best.turned_deg + step) for step in range(-coarse // 2, coarse // 2 + 1, fine)]
     if best.distance != 1.0:
         near = [best._replace(distance=best.distance * 1.04**step) for step in range(-5, 6)]
+    elif best.turn != 1.0:
+        near = [best._replace(turn=best.turn * 1.04**step) for step in range(-4, 5)]
     best = max(near, key=lambda facing: trial.mean(trial.agreements(facing)))
     square_deg = 90 * round(best.turned_deg / 90)
     if abs(best.turned_deg - square_deg) <= SQUARE_DEG:
@@ -132,13 +176,17 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     far = [each for each in scores if abs(math.remainder(each.turned_deg - best.turned_deg, 360)) > coarse]
     if best.distance == 1.0:
         far += [each for each in scores if each.distance != 1.0]
+    if best.turn == 1.0:
+        far += [each for each in scores if each.turn != 1.0]
     is_certain = trial.leads(found, as_stated, LEAST_GAIN) and all(
         trial.leads(found, scores[each], LEAST_LEAD) for each in far
     )
-    if not is_certain or trial.mean(found) < LEAST_AGREEMENT:
+    least = LEAST_AGREEMENT if best.turn == 1.0 else LEAST_TURNED  # where angles are wrong, moves never agree
+    if not is_certain or trial.mean(found) < least:
         return None
     turned_deg = math.remainder(best.turned_deg, 360)
-    return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated))
+    beams = trial.pairs[0][0].laser.beams
+    return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated), beams)
 
 
 class FacingWatch:
@@ -215,7 +263,7 @@ def _agreement(pair: Pair, facing: Facing) -> float:
     """Mean agreement, 0 to 1, of the points of the later scan with the earlier one; NaN if too few are in its view."""
     before, after = pair
     T_base_laser = se2.compose(before.laser.T_base_laser, (0.0, 0.0, math.radians(facing.turned_deg)))
-    moved = se2.between(before.T_odom_base, after.T_odom_base) * (facing.distance, facing.distance, 1.0)
+    moved = se2.between(before.T_odom_base, after.T_odom_base) * (facing.distance, facing.distance, facing.turn)
     T_before_after = se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
     sign = -1.0 if facing.upside_down else 1.0
     in_laser = point_scan(after.ranges_m, replace(after.laser, T_base_laser=(0.0, 0.0, 0.0))).points

@@ -3,23 +3,23 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeGuard
 
 import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
-from fcslam.lidar.facing import Contradiction, contradicted_facing
+from fcslam.lidar.facing import WHEELS, Contradiction, contradicted_facing, distance_remedy, turn_remedy
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.records import FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
-from fcslam.sources.source import Source
+from fcslam.sources.source import Noted, Source
 
 MOST_SCANS: Final = 1200
 """Scans that are tracked at most."""
@@ -36,6 +36,8 @@ LARGEST_OFFSET_M: Final = 1.0
 """A laser is not farther from where tf says. A drive along one circle fixes neither mounting nor times; then nothing is
 corrected."""
 LEAST_SCALE: Final = 0.01
+GROSS_SCALE: Final = 0.25
+"""Scales that differ by more are no matter of precision."""
 LEAST_SHARE: Final = 0.1
 """Smaller differences from what the bag says are not corrected."""
 SHORT_SHARE: Final = 0.2
@@ -64,7 +66,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     Raises:
         SourceError: the bag cannot be mapped.
     """
-    contradictions = [_contradiction_of(bag, laser) for laser in bag.survey().lasers]
+    contradictions = _contradictions(bag)
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
         lines = (f"{laser.name}: {found}; not corrected" for laser, found in named if found)
@@ -72,10 +74,11 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     found = contradictions[0]
     if found is None:
         return _calibrate_finely(bag, config)
-    turned_deg, upside_down, distance = found.facing
-    if distance != 1.0:
+    turned_deg, upside_down, distance, turn = found.facing
+    if (distance, turn) != (1.0, 1.0):
         fine = _calibrate_finely(bag, config)
-        lines_before = () if fine.calibration.distance_scale else (str(found),)
+        scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
+        lines_before = () if _is_wrong(scale) else (f"{found}; not corrected",)
         return replace(fine, lines=(*lines_before, *fine.lines))
     T_base_laser = np.array(bag.survey().lasers[0].T_base_laser)
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
@@ -88,9 +91,25 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     return Calibrated(fine.calibration, correction, (f"{found}; {done}", *fine.lines))
 
 
-def _contradiction_of(bag: RosBag, laser: LaserModel) -> Contradiction | None:
-    scans = (record for record in bag.records() if isinstance(record, LaserScan))
-    return contradicted_facing(scan for scan in scans if is_same_laser(scan.laser, laser))
+def contradictions_of(source: Source) -> tuple[str, ...]:
+    """Lines about the lasers of a recording of any format that contradict its odometry.
+
+    Raises:
+        SourceError: the recording cannot be mapped.
+    """
+    return tuple(f"{source.name}: {found}" for found in _contradictions(source) if found)
+
+
+def _contradictions(source: Source) -> list[Contradiction | None]:
+    """Of each laser."""
+    return [
+        contradicted_facing(
+            record
+            for record in source.records()
+            if isinstance(record, LaserScan) and is_same_laser(record.laser, laser)
+        )
+        for laser in source.survey().lasers
+    ]
 
 
 def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
@@ -108,18 +127,41 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
         calibration = calibrate(motions, odometry)
     scale = calibration.turn_scale
     if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
-        return Calibrated(calibration, BagCorrection(), _contradiction(scale))
+        is_sure = calibration.delay is not None or _is_wrong(scale)  # a long drive, or a clear one
+        lines = _contradiction(scale, survey.lasers[0].beams) if is_sure else ()
+        return Calibrated(calibration, BagCorrection(), lines)
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
+    if _is_wrong(distance := calibration.distance_scale) and not 1.0 / WHEELS < distance.value < WHEELS:
+        calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
     found = _corrected(calibration, assumed, _stated_share(bag.stream.stated_sweep, assumed_s))
     sweep = found.correction.sweep
     if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
         found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
-    return found
+    return replace(found, lines=(*found.lines, *_scale_lines(calibration, survey.lasers[0].beams)))
 
 
-def _contradiction(scale: Estimate) -> tuple[str, ...]:
+def _is_wrong(scale: Estimate | None) -> TypeGuard[Estimate]:
+    """Whether the odometry has certainly another scale than the scans."""
+    return scale is not None and (scale.differs(1.0, 5.0 * LEAST_SCALE) or scale.differs(1.0, GROSS_SCALE, sigmas=3.0))
+
+
+def _scale_lines(calibration: MotionCalibration, beams: Beams) -> Iterator[str]:
+    distance, turn = calibration.distance_scale, calibration.turn_scale
+    if _is_wrong(distance):
+        yield _scale_line("distance", distance, distance_remedy(distance.value))
+    if _is_wrong(turn):
+        yield _scale_line("turn", turn, turn_remedy(turn.value, beams))
+
+
+def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
+    return (
+        f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); not corrected: {remedy}"
+    )
+
+
+def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
     """Lines that say what is wrong if the turns of the scans are not at all those of odometry."""
     if abs(scale.value + 1.0) < 0.3:
         return (
@@ -128,18 +170,20 @@ def _contradiction(scale: Estimate) -> tuple[str, ...]:
         )
     return (
         f"the turns of the scans are {scale.value:.2f} (+- {scale.sigma:.2f}) of what odometry says: they are not of "
-        "one robot, or one of both is broken; not corrected: choose the topics by --scan-topic and --odom-topic",
+        "one robot, or one of both is broken; not corrected: choose the topics by --scan-topic and --odom-topic, or "
+        f"{turn_remedy(scale.value, beams)}",
     )
 
 
 def calibrated(source: Source, config: LidarConfig) -> Source:
-    """A bag with what its motion says against its messages; another recording as it is.
+    """A recording with what its motion says against it; only a bag is corrected.
 
     Raises:
-        SourceError: the bag cannot be mapped.
+        SourceError: the recording cannot be mapped.
     """
     if not isinstance(source, RosBag):
-        return source
+        said = contradictions_of(source)
+        return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
     found = calibrate_bag(source, config)
     lines = tuple(f"{source.stream.path}: {line}" for line in found.lines)
     return source.corrected(found.correction, lines) if lines else source
@@ -276,15 +320,6 @@ def _stamped(first_s: float, last_s: float) -> str | None:
 
 
 def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: list[str]) -> Calibrated:
-    for name, scale, what in (
-        ("distance", calibration.distance_scale, "radius"),
-        ("turn", calibration.turn_scale, "distance"),
-    ):
-        if scale is not None and scale.differs(1.0, 5.0 * LEAST_SCALE):
-            lines.append(
-                f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); correct the "
-                f"{what} of the wheels in its driver"
-            )
     if calibration.mounting is None:
         return Calibrated(calibration, correction, tuple(lines))
     x, y, yaw = calibration.mounting

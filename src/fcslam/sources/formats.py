@@ -1,10 +1,13 @@
 """The known formats of recordings, and opening a recording by its content."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+
+import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan
@@ -24,6 +27,8 @@ from fcslam.sources.source import Source
 
 _BAG = "ROS bag"
 _SCANS_COMPARED = 10
+_SCANS_SHARED = 20
+"""Scans that two recordings share at least if they overlap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +95,10 @@ def _is_same(a: Path, b: Path) -> bool:
 
 
 def check_copies(sources: Sequence[Source]) -> None:
-    """Refuse a recording that is there twice, whatever the names and formats of its files are.
+    """Refuse a recording that is there twice, whole or cut, whatever the names and formats of its files are.
 
     Raises:
-        SourceError: two recordings have the same scans.
+        SourceError: two recordings share scans.
     """
     known: dict[tuple[int, float, float], Source] = {}
     for source in sources:
@@ -101,6 +106,25 @@ def check_copies(sources: Sequence[Source]) -> None:
         other = known.setdefault((survey.scan_count, survey.duration_s, survey.path_length_m), source)
         if other is not source and _first_scans(other) == _first_scans(source):
             raise SourceError(f"{source.name} and {other.name} are copies of one recording; give each recording once")
+    if len(sources) < 2:
+        return
+    owners: dict[int, Source] = {}
+    for source in sources:
+        own = set(_distinct_scans(source))
+        for name, shared in Counter(owners[scan].name for scan in own & owners.keys()).items():
+            if shared >= _SCANS_SHARED:
+                raise SourceError(
+                    f"{source.name} and {name} share {shared} scans, so they are parts of one recording that overlap; "
+                    "give each scan once"
+                )
+        owners.update(dict.fromkeys(own, source))
+
+
+def _distinct_scans(source: Source) -> Iterator[int]:
+    """Hashes of the scans with returns: stamp to a millisecond, as formats round it, and ranges."""
+    for record in source.records():
+        if isinstance(record, LaserScan) and ((record.ranges_m > 0.0) & (record.ranges_m < np.inf)).any():
+            yield hash((round(record.stamp, 3), record.ranges_m.tobytes()))
 
 
 def _first_scans(source: Source) -> list[tuple[float, bytes]]:

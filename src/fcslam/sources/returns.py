@@ -87,8 +87,13 @@ class RangeSample:
                 found.append(float(value))
         return tuple(found)
 
-    def check(self, path: Path, which: str) -> None:
-        """Refuse a recording that cannot be mapped; ``which`` names the laser, empty or with a blank before it.
+    def check(self, path: Path, which: str, remedy: str) -> None:
+        """Refuse a recording that cannot be mapped.
+
+        Args:
+            path: of the recording.
+            which: the laser, empty or with a blank before it.
+            remedy: what to check where nearly no beam has a return.
 
         Raises:
             SourceError: the laser measures nothing or in another unit.
@@ -103,16 +108,20 @@ class RangeSample:
         large = beyond if len(beyond) > _TOO_FAR * beams and _is_varied(beyond) else returns
         middle = float(np.median(large)) if len(large) else 0.0
         if large is beyond or (middle > LONGEST_USUAL_M and _is_varied(returns)):
-            unit, divisor = ("millimetres", 1000) if middle > _MILLIMETRES else ("centimetres", 100)
+            unit = (
+                "millimetres: divide them by 1000"
+                if middle > _MILLIMETRES
+                else "centimetres: divide them by 100 (inches: by 39.37)"
+            )
             raise SourceError(
                 f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
-                f"be {unit}: divide them by {divisor} and give the recording again"
+                f"be {unit} and give the recording again"
             )
         share = len(returns) / max(beams, 1)
         if share < FEWEST_RETURNS:
             raise SourceError(
                 f"{path}: only {share:.1%} of the beams{which} measure a range {limits} in {len(self._samples)} "
-                "sampled scans; check that the laser is not covered, its range_min and range_max, and record again"
+                f"sampled scans; check that the laser is not covered, {remedy}, and record again"
             )
 
 

@@ -1,7 +1,8 @@
 """The interface of recordings of all formats."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 from fcslam.records import CameraModel, LaserModel, SensorRecord
@@ -66,3 +67,29 @@ class Source(Protocol):
         Raises:
             SourceError: as in ``survey``.
         """
+
+
+class Noted:
+    """A recording with further notes in its survey."""
+
+    def __init__(self, source: Source, notes: tuple[str, ...]) -> None:
+        self.name = source.name
+        self._source = copy(source)
+        self._notes = notes
+
+    def __copy__(self) -> "Noted":
+        return Noted(self._source, self._notes)
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._source.faults
+
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source."""
+        survey = self._source.survey(scans)
+        return replace(survey, notes=(*survey.notes, *self._notes))
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source."""
+        return self._source.records(scans)

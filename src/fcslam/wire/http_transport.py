@@ -144,13 +144,20 @@ class HttpClient:
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
                 raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
-            # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
-            hint = (
-                "; if that stays, it does not trust this robot's certificate"
-                if self._has_own and isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError)
-                else ""
-            )
-            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{hint}") from error
+            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{self._hint(error)}") from error
+
+    def _hint(self, error: "httpx.RequestError") -> str:
+        """What may be wrong if a connection that was opened fails."""
+        import httpx
+
+        if "WRONG_VERSION_NUMBER" in str(error):
+            return "; the cloud does not use TLS: its address begins with http://"
+        if not isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError):
+            return ""
+        if self._url.startswith("http:") and not isinstance(error, httpx.ConnectError):
+            return "; if that stays, the cloud may use TLS: then its address begins with https://"
+        # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
+        return "; if that stays, it does not trust this robot's certificate" if self._has_own else ""
 
     def _require(self, response: "httpx.Response", status: int) -> None:
         """Raise an error for any other status."""
@@ -166,7 +173,8 @@ class HttpClient:
 
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase
-        return f"{self._url}: {said} ({response.status_code})"
+        remedy = "; give a valid token by --token-file" if response.status_code == 401 else ""
+        return f"{self._url}: {said} ({response.status_code}){remedy}"
 
 
 class HttpTransport(HttpClient):

@@ -43,6 +43,9 @@ from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _EACH_LASER = "give one for each laser, in the same order"
 
+_OF_SCANS = "its range_min and range_max"
+_OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --cloud-band"
+
 
 class _Reading(NamedTuple):
     """Summary of a bag, and how to read it."""
@@ -136,8 +139,9 @@ class RosBag:
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
         which = [f" of {laser.name}" for laser in self.stream.lasers]
-        for sample, its in zip(samples, which, strict=True):
-            sample.check(self.stream.path, its)
+        for sample, its, recorded in zip(samples, which, self.stream.lasers, strict=True):
+            is_scan = recorded.topic.type in LASER_SCANS
+            sample.check(self.stream.path, its, _OF_SCANS if is_scan else _OF_CLOUDS)
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]

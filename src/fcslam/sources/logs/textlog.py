@@ -115,7 +115,7 @@ class TextLog:
                 self._sample(sample, turns, line, declared)
             overview.add(line)
         reading = overview.conclude(self._path, audit.faults(), interleaving)
-        sample.check(self._path, "")
+        sample.check(self._path, "", "the unit of the ranges")
         placeholders = sample.placeholders()
         found = (*placeholder_note(self._path, placeholders, ""), *turns.note(self._path, declared))
         notes = (*reading.survey.notes, *found)
