@@ -9,7 +9,7 @@ import typer
 from fcslam.cli.learning_options import LearnConfig
 from fcslam.cli.listening import check_tls, is_loopback, listen
 from fcslam.cli.mission_options import ConfigFile, mission_config
-from fcslam.cli.options import Quiet, WorkerCa, WorkerCertificate, WorkerKey, WorkersOption
+from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 
@@ -96,9 +96,6 @@ def serve(
         typer.Option(min=1, help="Robots that may send to this instance of --store.", rich_help_panel=_INSTANCES),
     ] = 200,
     workers: WorkersOption = "1",
-    workers_ca: WorkerCa = None,
-    workers_certificate: WorkerCertificate = None,
-    workers_key: WorkerKey = None,
 ) -> None:
     """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
     import gc
@@ -119,7 +116,7 @@ def serve(
     if is_open and not is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     check_tls(tls_certificate, tls_key, client_ca)
-    chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
+    chosen = Workers(workers)
     chosen.check()
     if chosen.is_cluster:
         with verifying(chosen):  # refused here, not by the worker of each mission
