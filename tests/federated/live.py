@@ -86,9 +86,7 @@ class LiveFleet:
             assert time.monotonic() < ended, reason
             time.sleep(0.1)
 
-        hooks = CoordinatorHooks(
-            version, lambda _: {"repeatability": 0.5, "mma_3px": 0.5}, lambda report, _: reports.append(report), wait
-        )
+        hooks = CoordinatorHooks(version, lambda _: {"repeatability": 0.5, "mma_3px": 0.5}, reports.append, wait=wait)
         return Coordinator(grid, settings, WEIGHTS, folder, hooks).run(), reports
 
     def _end(self, notice):

@@ -275,7 +275,7 @@ def test_a_stranger_starts_no_app_and_registers_no_key(fleet, undisturbed, tmp_p
 
 
 def test_a_stranger_finds_no_operation(fleet):
-    """All of Flower's, and what a web server may offer beside; nothing is answered without a signature."""
+    """All of Flower's, and what a web server may offer beside; nothing is answered without a token."""
     from flwr.supercore.protobuf.translation import PROTOBUF_REQUEST_TYPES
 
     paths = [path for _, path in PROTOBUF_REQUEST_TYPES] + ["/", "/docs", "/openapi.json", "/health", "/v1/health"]
@@ -285,11 +285,10 @@ def test_a_stranger_finds_no_operation(fleet):
         httpx.Client(base_url=f"https://{fleet.address}", verify=ssl.create_default_context(cafile=fleet.ca)) as client,
     ):
         unknown = {client.request(method, path).status_code for path in paths for method in ("GET", "POST")}
-        unsigned = {
-            client.post(f"/api/v1/robots/one/learning/{name}").status_code for name in ("next", "alive", "reply/1")
-        }
-        client.headers["x-fcslam-robot"] = "one"
-        named = {client.post(f"/fleet/{name}", content=b"x").status_code for name in ("next", "alive", "reply/1")}
+        operations = [f"/api/v1/robots/one/learning/{name}" for name in ("next", "alive", "reply/1", "taught")]
+        unsigned = {client.post(path).status_code for path in operations}
+        client.headers["Authorization"] = "Bearer guessed"
+        named = {client.post(path, content=b"x").status_code for path in operations}
     assert (unknown, unsigned, named) == ({404}, {401}, {401})
 
 
