@@ -108,7 +108,7 @@ def deploy(folder: Path, options: Sequence[object]) -> Path:
         wait_for(lambda: "waiting: 0 robots" in log.read_text(), "the server's start", log)
         robots = {}
         for robot in ROBOTS:
-            words = ["join", where, folder / robot, "-o", folder / f"home-{robot}", "--insecure"]
+            words = ["join", f"http://{where}", folder / robot, "-o", folder / f"home-{robot}"]
             robots[robot] = running.enter_context(federate(*words, log=folder / f"{robot}.log"))
         # It labels its images when the first order to train has come.
         labels = folder / f"home-{KILLED}" / "labels"

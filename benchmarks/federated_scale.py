@@ -9,7 +9,7 @@ after it. The weights have the size of the bundled detector. A robot's update is
 training itself is the robots' own work and is measured elsewhere (`federated_deployed.py`).
 
 The same fleet runs in one process too, where the missing robots fail at once. Both runs must make the same version in
-every round. CPU is that of the server's process: requests, signatures, screening, merging and checkpoints.
+every round. CPU is that of the server's process: requests, tokens, screening, merging and checkpoints.
 """
 
 import argparse
@@ -28,7 +28,6 @@ from typing import Any
 
 import common
 import numpy as np
-from cryptography.hazmat.primitives.asymmetric import ec
 
 from fcslam.errors import TrainingError
 from fcslam.federated.client import ClientUpdate
@@ -39,11 +38,10 @@ from fcslam.federated.fleet_robot import RobotLink, robot_context, serve_request
 from fcslam.federated.fleet_server import FleetApp, listening
 from fcslam.federated.flower import InProcessGrid, RobotGrid
 from fcslam.federated.history import RoundReport
-from fcslam.federated.identity import RobotAuthenticator, RobotIdentity
 from fcslam.federated.initial_weights import read_detector_weights
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.tls import Address
 from fcslam.federated.weights import Weights
+from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 
 DETECTOR = common.REPOSITORY / "src/fcslam/features/networks/detector.onnx"
 PROCESSES = 4
@@ -138,12 +136,11 @@ def over_a_network(
     names: list[str], missing: float, settings: FederatedSettings
 ) -> tuple[list[tuple[RoundReport, float]], float]:
     """Rounds with their CPU seconds, and the server's largest resident set in MB."""
-    keys = {name: ec.derive_private_key(number + 1, ec.SECP384R1()) for number, name in enumerate(names)}
-    grid = FleetGrid(names)
-    app = FleetApp(grid, RobotAuthenticator({name: key.public_key() for name, key in keys.items()}), print)
+    grid = FleetGrid()
+    app = FleetApp(grid, Authenticator(tuple(map(token_entry, names))), print)
     with (
         socket.create_server(("127.0.0.1", 0)) as listener,
-        listening(app, listener, None),
+        listening(app, listener),
         robots(names, missing, listener.getsockname()[1]),
     ):
         end = time.monotonic() + CONNECTING_S
@@ -152,6 +149,11 @@ def over_a_network(
                 sys.exit(f"only {len(grid.get_node_ids())} of {len(names)} robots connected")
             time.sleep(0.2)
         return train(grid, settings), peak()
+
+
+def token_entry(name: str) -> TokenEntry:
+    """The token of a robot here is its name."""
+    return TokenEntry(name=name, role=Role.ROBOT, sha256=hashlib.sha256(name.encode()).hexdigest())
 
 
 def train(grid: RobotGrid, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
@@ -175,9 +177,8 @@ def train(grid: RobotGrid, settings: FederatedSettings) -> list[tuple[RoundRepor
 def robots(names: list[str], missing: float, port: int) -> Iterator[None]:
     """The robots, in processes of their own."""
     context = multiprocessing.get_context("spawn")
-    numbered = list(enumerate(names))
     processes = [
-        context.Process(target=drive, args=(numbered[share::PROCESSES], missing, port), daemon=True)
+        context.Process(target=drive, args=(names[share::PROCESSES], missing, port), daemon=True)
         for share in range(PROCESSES)
     ]
     for process in processes:
@@ -189,9 +190,9 @@ def robots(names: list[str], missing: float, port: int) -> Iterator[None]:
             process.kill()
 
 
-def drive(numbered: list[tuple[int, str]], missing: float, port: int) -> None:
+def drive(names: list[str], missing: float, port: int) -> None:
     """Some robots in threads of this process, until it is killed."""
-    threads = [threading.Thread(target=answer, args=(*robot, missing, port)) for robot in numbered]
+    threads = [threading.Thread(target=answer, args=(name, missing, port)) for name in names]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -202,7 +203,7 @@ class PowerLossError(BaseException):
     """A robot is gone; nothing of fcslam catches it."""
 
 
-def answer(number: int, name: str, missing: float, port: int) -> None:
+def answer(name: str, missing: float, port: int) -> None:
     """One robot. It comes back some seconds after the deadline: a silent one starts again, a late one replies."""
 
     def stay_away(_robot: DrawnRobot, is_silent: bool) -> None:
@@ -212,10 +213,9 @@ def answer(number: int, name: str, missing: float, port: int) -> None:
 
     client = DrawnRobot(name, missing, stay_away)
     app = build_client_app(lambda _: client)
-    identity = RobotIdentity(name, ec.derive_private_key(number + 1, ec.SECP384R1()))
     while True:
         try:
-            with RobotLink(Address("127.0.0.1", port), identity, None) as link:
+            with RobotLink(f"http://127.0.0.1:{port}", name, name) as link:
                 serve_requests(link, app, robot_context(), lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)

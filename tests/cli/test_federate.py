@@ -21,8 +21,8 @@ TINY = {
     "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
 }
 pytestmark = pytest.mark.usefixtures("brief_validation")
-JOIN_FILES = ("--ca", "{fleet}/tiny.yaml", "--robot-key", "{fleet}/tiny.yaml")
-SERVE_FILES = (*JOIN_FILES, "--certificate", "{fleet}/tiny.yaml", "--key", "{fleet}/tiny.yaml")
+SERVE_FILES = ("--tls-certificate", "{fleet}/tiny.yaml", "--tls-key", "{fleet}/tiny.yaml")
+TOKENS = ("--tokens", "{fleet}/tiny.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -111,16 +111,15 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
         (["federate", "local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
         (["federate", "local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is not a checkpoint"),
         (["federate", "serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is not a HOST:PORT"),
-        (["federate", "serve", "a:1", "-o", "{out}"], "give --ca"),
-        (["federate", "serve", "a:1", "-o", "{out}", "--ca", "{fleet}/no.crt"], "no.crt: is not a file"),
-        (["federate", "serve", "a:1", "-o", "{out}", "--insecure", "--ca", "{fleet}/tiny.yaml"], "leave out one"),
-        (["federate", "join", "a:1", "{fleet}/nobody", "-o", "{out}", "--insecure"], "nobody: is not a folder"),
-        (["federate", "join", "a", "{fleet}/one", "-o", "{out}", "--insecure"], "a: is not a HOST:PORT"),
-        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give --ca"),
-        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", *JOIN_FILES], "tiny.yaml: is not a private key"),
-        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", *JOIN_FILES, "--insecure"], "leave out one"),
-        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", "--insecure", "--name", ""], "give --name"),
-        (["federate", "serve", "a:1", "-o", "{out}", *SERVE_FILES], "tiny.yaml: is not a public key"),
+        (["federate", "serve", "a:1", "-o", "{out}"], "give --tokens"),
+        (["federate", "serve", "a:1", "-o", "{out}", *SERVE_FILES], "give --tokens"),
+        (["federate", "serve", "a:1", "-o", "{out}", "--insecure", *TOKENS, *SERVE_FILES], "or --insecure"),
+        (["federate", "serve", "a:1", "-o", "{out}", *TOKENS, *SERVE_FILES], "no certificate with its key"),
+        (["federate", "join", "http://a:1", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
+        (["federate", "join", "a", "{fleet}/one", "-o", "{out}"], "is not the address of a cloud"),
+        (["federate", "join", "https://a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give a PEM"),
+        (["federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--name", ""], "give another --name"),
+        (["federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--token-file", "{fleet}/no"], "no token"),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
@@ -142,7 +141,7 @@ def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
         ["join", "a:1"],
         ["join", "a:1", "{fleet}/one", "{fleet}/two", "-o", "{out}"],
         ["join", "a:1", "{fleet}/one", "-o", "{out}", "--rounds", "3"],
-        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--certificate", "own.crt"],
+        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--tokens", "tokens.yaml"],
         ["--local", "{fleet}/one"],
     ],
 )

@@ -173,13 +173,25 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypat
         assert len(warnings_of()) == 1
 
 
+def configured(files):
+    """Dask's configuration with the certificates of a client."""
+    import dask
+
+    keys = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert", "distributed.comm.tls.client.key")
+    return dask.config.set(dict(zip(keys, map(str, files), strict=True)))
+
+
 def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, expected):
     ours, others = (credentials(tmp_path / name) for name in ("ours", "others"))
     options = ("--tls-ca-file", ours[0], "--tls-cert", ours[1], "--tls-key", ours[2])
     with Cluster(tmp_path, "tls", tuple(map(str, options))) as cluster:
         assert cluster.address.startswith("tls://")
         cluster.start_worker("one")
-        with pytest.raises(InputError, match="no Dask scheduler answers"), verifying(Workers(cluster.address, *others)):
+        with (
+            configured(others),
+            pytest.raises(InputError, match="no Dask scheduler answers"),
+            verifying(Workers(cluster.address)),
+        ):
             pass
         with (
             pytest.raises(InputError, match=r"the certificates cannot be used|no Dask scheduler answers"),
@@ -188,7 +200,7 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
             pass
         wait_for(lambda: "Starting established" in (tmp_path / "scheduler-0.log").read_text())
         time.sleep(1.0)
-        with verifying(Workers(cluster.address, *ours)) as verify:
+        with configured(ours), verifying(Workers(cluster.address)) as verify:
             assert len(verify._processes()) == 1
             assert written(verify(pairs, CONFIG)) == expected
 

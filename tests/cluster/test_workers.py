@@ -35,28 +35,9 @@ def test_a_choice_that_is_none_is_refused(where):
         Workers(where).check()
 
 
-def test_certificates_belong_together_and_to_tls(tmp_path):
-    files = [tmp_path / name for name in ("ca.pem", "own.pem", "own.key")]
-    for file in files[:2]:
-        file.touch()
-    with pytest.raises(InputError, match="belong together"):
-        Workers("tls://h:1", files[0]).check()
-    with pytest.raises(InputError, match="needs a cluster with TLS"):
-        Workers("tcp://h:1", *files).check()
-    with pytest.raises(InputError, match=r"own\.key: there is no such file"):
-        Workers("tls://h:1", *files).check()
-
-
-def test_options_make_the_same_choice(tmp_path):
-    files = [tmp_path / name for name in ("ca.pem", "own.pem", "own.key")]
+def test_options_make_the_same_choice():
     assert Workers().options() == []
     assert Workers("3").options() == ["--workers", "3"]
-    named = [
-        text
-        for pair in zip(("--workers-ca", "--workers-certificate", "--workers-key"), files, strict=True)
-        for text in pair
-    ]
-    assert Workers("tls://h:1", *files).options() == ["--workers", "tls://h:1", *map(str, named)]
 
 
 def test_by_default_this_process_verifies():

@@ -4,6 +4,7 @@ import contextlib
 import socket
 import threading
 import time
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -12,9 +13,8 @@ from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.fleet_grid import FleetGrid
 from fcslam.federated.fleet_robot import RobotLink, robot_context, serve_requests
 from fcslam.federated.fleet_server import FleetApp, listening
-from fcslam.federated.identity import RobotAuthenticator, RobotIdentity, read_private_key, read_robot_keys
-from fcslam.federated.tls import Address, Certificates
-from tests.federated.authority import certificates, keys
+from fcslam.service.credentials import make_credentials
+from fcslam.service.http.authentication import Authenticator, Role, read_tokens
 from tests.federated.fakes import version
 
 LIMIT_S = 120.0
@@ -45,32 +45,29 @@ def honest_update(seed):
 
 
 class LiveFleet:
-    """The keys of a fleet, and a server for it."""
+    """The certificates and tokens of a fleet, and a server for it."""
 
     def __init__(self, folder, robots):
-        self._keys = certificates(folder / "keys")
-        keys(self._keys, *robots)
-        self.robots, self.notices = tuple(robots), []
-        self.ca = self._keys / "ca.crt"
+        self._keys, self.robots, self.notices = folder / "keys", tuple(robots), []
+        make_credentials(self._keys, ["127.0.0.1"], dict.fromkeys(robots, Role.ROBOT), datetime.now(UTC))
+        self.ca = self._keys / "ca.pem"
+
+    def token(self, robot):
+        return (self._keys / "tokens" / robot).read_text().strip()
 
     @contextlib.contextmanager
     def server(self):
         """A grid that listens."""
-        public = read_robot_keys([self._keys / f"{robot}.pub" for robot in self.robots])
-        grid = FleetGrid(self.robots)
-        app = FleetApp(grid, RobotAuthenticator(public), self.notices.append)
-        own = Certificates(self.ca, self._keys / "own.crt", self._keys / "own.key")
+        grid = FleetGrid()
+        app = FleetApp(grid, Authenticator(read_tokens(self._keys / "tokens.yaml")), self.notices.append)
         with socket.create_server(("127.0.0.1", 0)) as listener:
-            self.address = Address("127.0.0.1", listener.getsockname()[1])
-            with listening(app, listener, own):
+            self.address = f"127.0.0.1:{listener.getsockname()[1]}"
+            with listening(app, listener, (self._keys / "cloud.pem", self._keys / "cloud.key")):
                 yield grid
 
-    def identity(self, robot, key=None):
-        """The name that a robot claims, and the key with which it signs."""
-        return RobotIdentity(robot, read_private_key(self._keys / (key or robot)))
-
-    def link(self, robot, key=None):
-        return RobotLink(self.address, self.identity(robot, key), self.ca)
+    def link(self, robot, owner=None):
+        """The link of a robot that shows the token of ``owner``."""
+        return RobotLink(f"https://{self.address}", robot, self.token(owner or robot), self.ca)
 
     def start(self, client, app=None):
         """Let a robot answer requests until the server ends."""
@@ -89,9 +86,7 @@ class LiveFleet:
             assert time.monotonic() < ended, reason
             time.sleep(0.1)
 
-        hooks = CoordinatorHooks(
-            version, lambda _: {"repeatability": 0.5, "mma_3px": 0.5}, lambda report, _: reports.append(report), wait
-        )
+        hooks = CoordinatorHooks(version, lambda _: {"repeatability": 0.5, "mma_3px": 0.5}, reports.append, wait=wait)
         return Coordinator(grid, settings, WEIGHTS, folder, hooks).run(), reports
 
     def _end(self, notice):

@@ -1,4 +1,4 @@
-"""Attacks on a fleet: a stranger who reaches the port, and a robot whose key is valid. None succeeds.
+"""Attacks on a fleet: a stranger who reaches the port, and a robot whose token is valid. None succeeds.
 
 All servers listen on loopback.
 """
@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -24,7 +25,6 @@ from fcslam.errors import TrainingError
 from fcslam.federated.client import ClientUpdate
 from fcslam.federated.flower import QUIET
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.tls import client_context
 from tests.federated.authority import free_port
 from tests.federated.fakes import Fake
 from tests.federated.live import LiveFleet, honest_update
@@ -85,7 +85,7 @@ def start_honest(fleet):
         fleet.start(Fake(robot, answer=honest_update(seed)))
 
 
-# ---- a robot with a valid key ----
+# ---- a robot with a valid token ----
 
 
 class HostileClient:
@@ -187,7 +187,7 @@ def test_a_robot_that_sends_noise_is_left_out(fleet, undisturbed, tmp_path):
 
 
 def test_a_robot_cannot_answer_in_the_name_of_another(fleet):
-    with fleet.server(), fleet.link("one", key=HOSTILE) as link, pytest.raises(TrainingError, match="not signed with"):
+    with fleet.server(), fleet.link("one", owner=HOSTILE) as link, pytest.raises(TrainingError, match="no token of"):
         link.fetch()
 
 
@@ -195,15 +195,14 @@ def test_a_robot_cannot_answer_in_the_name_of_another(fleet):
     "operation", ["control/start-run", "control/register-node", "runtime/acquire-task", "fleet/push-messages"]
 )
 def test_a_robot_cannot_start_a_run_or_send_to_robots(operation, fleet):
-    """Its signature opens the three operations of a robot and nothing else."""
+    """Its token opens the operations of a robot and nothing else."""
     path = f"/v1/{operation}"
     with fleet.server():
-        headers = fleet.identity(HOSTILE).headers("POST", path, b"")
-        answer = httpx.post(f"https://{fleet.address}{path}", headers=headers, verify=client_context(fleet.ca))
+        headers = {"Authorization": f"Bearer {fleet.token(HOSTILE)}"}
+        trusted = ssl.create_default_context(cafile=fleet.ca)
+        answer = httpx.post(f"https://{fleet.address}{path}", headers=headers, verify=trusted)
     assert answer.status_code == 404
-    assert any(
-        line.startswith(f"refused: POST {path} from 127.0.0.1: this port starts no run") for line in fleet.notices
-    )
+    assert any(line.startswith(f"refused: POST {path} from 127.0.0.1: nobody starts a run") for line in fleet.notices)
 
 
 def test_a_robot_cannot_hold_many_requests_open(fleet):
@@ -276,16 +275,20 @@ def test_a_stranger_starts_no_app_and_registers_no_key(fleet, undisturbed, tmp_p
 
 
 def test_a_stranger_finds_no_operation(fleet):
-    """All of Flower's, and what a web server may offer beside; nothing is answered without a signature."""
+    """All of Flower's, and what a web server may offer beside; nothing is answered without a token."""
     from flwr.supercore.protobuf.translation import PROTOBUF_REQUEST_TYPES
 
     paths = [path for _, path in PROTOBUF_REQUEST_TYPES] + ["/", "/docs", "/openapi.json", "/health", "/v1/health"]
     assert len(paths) > 50
-    with fleet.server(), httpx.Client(base_url=f"https://{fleet.address}", verify=client_context(fleet.ca)) as client:
+    with (
+        fleet.server(),
+        httpx.Client(base_url=f"https://{fleet.address}", verify=ssl.create_default_context(cafile=fleet.ca)) as client,
+    ):
         unknown = {client.request(method, path).status_code for path in paths for method in ("GET", "POST")}
-        unsigned = {client.post(f"/fleet/{name}").status_code for name in ("next", "alive", "reply/1")}
-        client.headers["x-fcslam-robot"] = "one"
-        named = {client.post(f"/fleet/{name}", content=b"x").status_code for name in ("next", "alive", "reply/1")}
+        operations = [f"/api/v1/robots/one/learning/{name}" for name in ("next", "alive", "reply/1", "taught")]
+        unsigned = {client.post(path).status_code for path in operations}
+        client.headers["Authorization"] = "Bearer guessed"
+        named = {client.post(path, content=b"x").status_code for path in operations}
     assert (unknown, unsigned, named) == ({404}, {401}, {401})
 
 

@@ -1,4 +1,4 @@
-"""The same fleet in processes of its own, over TLS and with keys: the result is that of one process."""
+"""The same fleet in processes of its own, over TLS and with tokens: the result is that of one process."""
 
 import csv
 import os
@@ -6,18 +6,20 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 
 import cv2
 import pytest
 import yaml
 
-from tests.federated.authority import certificates, free_port, keys
+from fcslam.service.credentials import make_credentials
+from fcslam.service.http.authentication import Role
+from tests.federated.authority import free_port
 from tests.learning.textures import textured
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.cli import main
 
 PATH = os.pathsep.join(path for path in sys.path if path)
 LIMIT_S = 600.0
@@ -47,22 +49,6 @@ def versions(folder):
         return [(row["version"], row["robots"], row["released"]) for row in csv.DictReader(file)]
 
 
-def line_of(capsys):
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
-@pytest.mark.slow
-def test_certificates_that_do_not_fit_end_in_one_line(tmp_path, capsys):
-    ours, theirs = certificates(tmp_path / "ours"), certificates(tmp_path / "theirs")
-    keys(ours, "robot")
-    files = ["--ca", str(ours / "ca.crt"), "--certificate", str(theirs / "own.crt"), "--key", str(theirs / "own.key")]
-    words = ["127.0.0.1:8000", "-o", str(tmp_path / "out"), *files, "--robot-key", str(ours / "robot.pub")]
-    assert main(["federate", "serve", *words]) == 2
-    assert f"{theirs / 'own.crt'}: does not fit {ours / 'ca.crt'}" in line_of(capsys)
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.fixture(scope="module")
 def embedded(tmp_path_factory):
     """Two robots' images, and what the robots make of them in one process."""
@@ -82,28 +68,26 @@ def embedded(tmp_path_factory):
 
 
 class Deployment:
-    """The fleet's processes, each a command of a user, over TLS and with keys."""
+    """The fleet's processes, each a command of a user, over TLS and with tokens."""
 
     def __init__(self, folder, embedded):
         self.folder, self.where = folder, f"127.0.0.1:{free_port()}"
         self._images, self._processes = embedded, []
-        self.keys = certificates(folder / "keys")
-        keys(self.keys, "one", "two")
-        (folder / "others").mkdir()
-        keys(folder / "others", "one", "stranger")
+        self.keys, robots = folder / "keys", dict.fromkeys(("one", "two"), Role.ROBOT)
+        for place in (self.keys, folder / "others"):
+            make_credentials(place, ["127.0.0.1"], robots, datetime.now(UTC))
 
     def server(self):
-        files = {"--ca": "ca.crt", "--certificate": "own.crt", "--key": "own.key"}
+        files = {"--tokens": "tokens.yaml", "--tls-certificate": "cloud.pem", "--tls-key": "cloud.key"}
         words = ["serve", self.where, "-o", str(self.folder / "deployed"), "--device", "cpu"]
         words += [word for option, file in files.items() for word in (option, str(self.keys / file))]
-        for robot in ("one", "two"):
-            words += ["--robot-key", str(self.keys / f"{robot}.pub")]
         return self._started(*words, "--config", str(self._images / "tiny.yaml"), log="server")
 
-    def robot(self, name, key=None, log=None):
-        log = log or name
-        words = ["join", self.where, str(self._images / name), "-o", str(self.folder / f"home-{name}")]
-        words += ["--device", "cpu", "--ca", str(self.keys / "ca.crt"), "--robot-key", str(key or self.keys / name)]
+    def robot(self, name, owner=None, keys=None, log=None):
+        log, keys = log or name, keys or self.keys
+        words = ["join", f"https://{self.where}", str(self._images / name), "-o", str(self.folder / f"home-{name}")]
+        words += ["--device", "cpu", "--ca", str(self.keys / "ca.pem")]
+        words += ["--token-file", str(keys / "tokens" / (owner or name))]
         return self._started(*words, log=log)
 
     def said(self, who):
@@ -145,10 +129,12 @@ def assert_same(deployed, embedded):
 def test_a_deployed_fleet_ends_as_one_in_a_process(deployment, embedded):
     server = deployment.server()
     deployment.until("server", "waiting: 0 robots are there, 2 needed")
-    for key, reason in (("stranger", "the server has no key stranger.pub"), ("one", "it is not signed with")):
-        refused = deployment.robot("one", deployment.folder / "others" / key, log=f"refused-{key}")
+    for owner, keys in (("two", deployment.keys), ("one", deployment.folder / "others")):
+        refused = deployment.robot("one", owner, keys, log=f"refused-{owner}")
         assert refused.wait(LIMIT_S) == 2
-        assert f"the server does not accept this robot: {reason}" in deployment.said(f"refused-{key}")
+        assert "the server does not accept this robot: it has no token of robot one" in deployment.said(
+            f"refused-{owner}"
+        )
     for robot in ("one", "two"):
         deployment.robot(robot)
     assert server.wait(LIMIT_S) == 0, deployment.said("server")

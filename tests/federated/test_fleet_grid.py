@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.federated.fleet_grid import MAX_OPEN_ROBOTS, ONLINE_S, FleetGrid
+from fcslam.federated.fleet_grid import MAX_ROBOTS, ONLINE_S, FleetGrid
 from fcslam.federated.flower import Message, MessageType, RecordDict, message_to_bytes, request_from_bytes
 
 
@@ -25,7 +25,9 @@ def clock():
 
 @pytest.fixture
 def grid(clock):
-    return FleetGrid(["one", "two"], clock)
+    grid = FleetGrid(clock)
+    assert all(map(grid.admits, ("one", "two")))
+    return grid
 
 
 def ask(grid, *nodes):
@@ -110,13 +112,8 @@ def test_who_waits_gets_the_replies(grid):
     assert sorted(reply.metadata.src_node_id for reply in got) == [2, 3]
 
 
-def test_a_fleet_with_keys_has_no_other_robots(grid):
-    assert not grid.admits("stranger")
-    assert grid.robot_names() == {2: "one", 3: "two"}
-
-
-def test_a_fleet_without_keys_has_room_for_so_many():
-    grid = FleetGrid(None)
-    assert all(grid.admits(str(number)) for number in range(MAX_OPEN_ROBOTS))
+def test_a_fleet_has_room_for_so_many():
+    grid = FleetGrid()
+    assert all(grid.admits(str(number)) for number in range(MAX_ROBOTS))
     assert not grid.admits("one more")
     assert grid.admits("0")

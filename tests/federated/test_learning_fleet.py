@@ -103,15 +103,15 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
         record_robot(robot, tmp_path / "sim" / robot.name, resume=False)
     weak = weak_detector(tmp_path)
     (tmp_path / "fleet.yaml").write_text(yaml.safe_dump(SETTINGS))
-    port, learn = free_port(), f"127.0.0.1:{free_port()}"
+    port = free_port()
     logs = [tmp_path / f"{name}.log" for name in ("service", *robots)]
     service = started(
-        logs[0], "serve", "--data", tmp_path / "data", "--port", port, "--learn", "--learn-server", learn,
+        logs[0], "serve", "--data", tmp_path / "data", "--port", port, "--learn",
         "--learn-config", tmp_path / "fleet.yaml",
     )  # fmt: skip
     fleet = [
         started(log, "robot", tmp_path / "sim" / robot, "--server", f"http://127.0.0.1:{port}", "--state",
-                tmp_path / f"state-{robot}", "--learn", "--learn-server", learn)
+                tmp_path / f"state-{robot}", "--learn")
         for robot, log in zip(robots, logs[1:], strict=True)
     ]  # fmt: skip
     everyone = [service, *fleet]

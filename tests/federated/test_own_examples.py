@@ -1,6 +1,7 @@
 """Examples of a robot that learns: keyframes on disk, split once and for all, and taught codes at the right pixels."""
 
 import asyncio
+import hashlib
 import json
 import time
 
@@ -15,7 +16,6 @@ from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
 from fcslam.federated.fleet_grid import FleetGrid  # noqa: E402
 from fcslam.federated.fleet_server import FleetApp  # noqa: E402
 from fcslam.federated.held_out import judge  # noqa: E402
-from fcslam.federated.identity import ROBOT_HEADER, RobotAuthenticator  # noqa: E402
 from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
 from fcslam.federated.networks import weights_to_network  # noqa: E402
@@ -26,6 +26,7 @@ from fcslam.robot.backend import RobotBackend  # noqa: E402
 from fcslam.robot.beside import Inline  # noqa: E402
 from fcslam.robot.frontend import RobotConfig, RobotFrontend  # noqa: E402
 from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes  # noqa: E402
+from fcslam.service.http.authentication import Authenticator, Role, TokenEntry  # noqa: E402
 from fcslam.wire.batches import write_batch  # noqa: E402
 from fcslam.wire.messages import Packet, TaughtPlace  # noqa: E402
 from fcslam.wire.packets import decode, encode  # noqa: E402
@@ -155,11 +156,12 @@ def test_what_the_server_teaches_is_checked():
             checked_lessons(robot, batch)
 
 
-def asked_for_codes(keys, path="/fleet/taught", **headers):
-    """The answer of a port that teaches each robot its name."""
+def asked_for_codes(entries, robot, **headers):
+    """The answer of a server that teaches each robot its name."""
+    path = f"/api/v1/robots/{robot}/learning/taught"
 
     async def ask():
-        app = FleetApp(FleetGrid(keys), RobotAuthenticator(keys), lambda _line: None, str.encode)
+        app = FleetApp(FleetGrid(), Authenticator(entries), lambda _line: None, str.encode)
         transport = httpx.ASGITransport(app.asgi())
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
             return await client.post(path, headers=headers)
@@ -168,12 +170,14 @@ def asked_for_codes(keys, path="/fleet/taught", **headers):
 
 
 def test_a_robot_is_taught_its_own_places_only():
-    """The port gives what was asked in the robot's own name, which its signature proves."""
-    alice = {ROBOT_HEADER: "alice"}
-    assert asked_for_codes(None, **alice).content == b"alice"
-    assert asked_for_codes(None).status_code == 401
-    assert asked_for_codes(None, "/fleet/taught/bob", **alice).status_code == 404
-    assert asked_for_codes({}, **alice).status_code == 401
+    """The server gives what a robot asks in its own name, which its token proves."""
+    alice = {"Authorization": "Bearer secret"}
+    known = [TokenEntry(name="alice", role=Role.ROBOT, sha256=hashlib.sha256(b"secret").hexdigest())]
+    assert asked_for_codes(None, "alice").content == b"alice"
+    assert asked_for_codes(known, "alice", **alice).content == b"alice"
+    assert asked_for_codes(known, "bob", **alice).status_code == 401
+    assert asked_for_codes(known, "alice").status_code == 401
+    assert asked_for_codes(None, "alice/bob").status_code == 404
 
 
 class Client:

@@ -1,6 +1,7 @@
-"""Ports on which commands listen."""
+"""Ports on which commands listen, and their certificates."""
 
 import ipaddress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -30,3 +31,33 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None = None) -> None:
+    """Check the certificate of a service and its key, and the authority of its clients' certificates.
+
+    Raises:
+        ServiceError: they do not fit, or a file cannot be read.
+    """
+    import ssl
+
+    from fcslam.errors import ServiceError
+    from fcslam.wire.keys import no_passphrase
+
+    if (certificate is None) != (key is None):
+        raise ServiceError("--tls-certificate and --tls-key belong together; give both or neither")
+    if certificate is None or key is None:
+        if client_ca is not None:
+            raise ServiceError("--client-ca needs TLS; give --tls-certificate and --tls-key")
+        return
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    try:
+        context.load_cert_chain(certificate, key, no_passphrase)
+    except (OSError, ssl.SSLError) as error:
+        raise ServiceError(f"{certificate}, {key}: no certificate with its key ({error})") from error
+    if client_ca is None:
+        return
+    try:
+        context.load_verify_locations(client_ca)
+    except (OSError, ssl.SSLError) as error:
+        raise ServiceError(f"{client_ca}: no certificate authority can be read ({error})") from error

@@ -24,9 +24,6 @@ from fcslam.cli.mission_options import (
 from fcslam.cli.options import (
     Force,
     Quiet,
-    WorkerCa,
-    WorkerCertificate,
-    WorkerKey,
     WorkersOption,
     output_option,
 )
@@ -117,9 +114,6 @@ def map_recordings(
     force: Force = False,
     quiet: Quiet = False,
     workers: WorkersOption = "1",
-    workers_ca: WorkerCa = None,
-    workers_certificate: WorkerCertificate = None,
-    workers_key: WorkerKey = None,
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
@@ -146,7 +140,7 @@ def map_recordings(
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
-    chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
+    chosen = Workers(workers)
     with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:
         map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors, verify)
 

@@ -29,27 +29,9 @@ WorkersOption = Annotated[
         "--workers",
         metavar="N|ADDRESS",
         help="Processes that verify closures, this one included, or the Dask scheduler of a cluster: "
-        "tls://HOST:PORT or tcp://HOST:PORT. The result is the same.",
+        "tls://HOST:PORT or tcp://HOST:PORT, with the certificates of Dask's configuration. The result is the same.",
         rich_help_panel=_WORKERS,
     ),
-]
-WorkerCa = Annotated[
-    Path | None,
-    typer.Option(
-        "--workers-ca",
-        help="Certificate of the authority of the cluster (PEM). Everybody with a certificate of it can run programs "
-        "on the cluster and here.",
-        show_default="as Dask is configured",
-        rich_help_panel=_WORKERS,
-    ),
-]
-WorkerCertificate = Annotated[
-    Path | None,
-    typer.Option("--workers-certificate", help="Own certificate for the cluster (PEM).", rich_help_panel=_WORKERS),
-]
-WorkerKey = Annotated[
-    Path | None,
-    typer.Option("--workers-key", help="Private key of --workers-certificate (PEM).", rich_help_panel=_WORKERS),
 ]
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.learning_options import LearnCa, LearnConfig, LearnServer, RobotLearning
+from fcslam.cli.learning_options import LearnConfig, RobotLearning
 from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices, print_line
@@ -182,15 +182,7 @@ def robot(
             "robot stands still. No image leaves.",
         ),
     ] = False,
-    learn_server: LearnServer = None,
     learn_config: LearnConfig = None,
-    learn_ca: LearnCa = None,
-    learn_key: Annotated[
-        Path | None,
-        typer.Option(
-            help="The robot's private key for learning; the service has the public one.", rich_help_panel=_LEARNING
-        ),
-    ] = None,
     quiet: Quiet = False,
     _explain: ExplainTraffic = False,
 ) -> None:
@@ -198,7 +190,7 @@ def robot(
 
     With --localize, find a live robot in a finished map instead.
     """
-    from fcslam.bridges.addresses import is_address, parse_address
+    from fcslam.bridges.addresses import is_address
     from fcslam.cli.live import map_live
     from fcslam.errors import InputError
     from fcslam.live.localized_robot import LocalizedRobot
@@ -206,13 +198,15 @@ def robot(
     from fcslam.sources import BagOptions
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
+    from fcslam.wire.keys import read_token
 
     keep_private()
     settings = mission_config(config)
-    token, own = _token(token_file), _own_certificate(certificate, key)
+    token = None if token_file is None else read_token(token_file)
+    own = _own_certificate(certificate, key)
     if localize is None and initial_pose is not None:
         raise InputError("an initial pose is one in a finished map; give --localize, too")
-    learning = RobotLearning(learn, learn_server, learn_config, learn_ca, learn_key).checked(localize is not None)
+    learning = RobotLearning(learn, learn_config, token_file, ca, own).checked(localize is not None)
     if is_address(source):
         start: Callable[..., Robot | LocalizedRobot] = partial(
             Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
@@ -230,7 +224,7 @@ def robot(
             or BagOptions()
         )
         parameters = node_parameters(ros_parameters, use_sim_time)
-        plan = learning.plan(name or parse_address(source).robot, settings.robot, server, state)
+        plan = learning.plan(settings.robot, server, state)
         map_live(source, name, start, options, domain, parameters, output, notices(quiet), plan)
         return
     if localize is not None:
@@ -245,7 +239,7 @@ def robot(
     survey = recording.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
-    plan = learning.plan(recording.name, settings.robot, server, state)
+    plan = learning.plan(settings.robot, server, state)
     fingerprint = _fingerprint(recording.name, survey, settings.robot, budget_kbps, floor)
     live = Robot(
         recording.name, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
@@ -354,22 +348,6 @@ def _check_name(name: str) -> None:
     stem, plus, number = name.rpartition("+")
     if plus and number.isdigit():
         raise SourceError(f"robot: {name!r} is how a later start of {stem!r} is called; give another --name")
-
-
-def _token(path: Path | None) -> str | None:
-    from fcslam.errors import InputError
-
-    if path is None:
-        return None
-    try:
-        token = path.read_text(encoding="ascii").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: no token can be read ({error}); give the file that `fcslam certificates` wrote"
-        ) from error
-    if not token or not token.isprintable() or " " in token:
-        raise InputError(f"{path}: holds no token; it should be one word")
-    return token
 
 
 def _own_certificate(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.learning_options import LearnCa, LearnConfig, LearnServer
-from fcslam.cli.listening import is_loopback, listen
+from fcslam.cli.learning_options import LearnConfig
+from fcslam.cli.listening import check_tls, is_loopback, listen
 from fcslam.cli.mission_options import ConfigFile, mission_config
-from fcslam.cli.options import Quiet, WorkerCa, WorkerCertificate, WorkerKey, WorkersOption
+from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 
@@ -70,16 +70,7 @@ def serve(
             help="Let the robots train the detector together while they map, on what they see again.",
         ),
     ] = False,
-    learn_server: LearnServer = None,
     learn_config: LearnConfig = None,
-    learn_ca: LearnCa = None,
-    robot_key: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Public key of a robot that may learn: robot1.pub is that of robot1. Can be repeated.",
-            rich_help_panel=_LEARNING,
-        ),
-    ] = None,
     docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
     store: Annotated[
@@ -105,15 +96,12 @@ def serve(
         typer.Option(min=1, help="Robots that may send to this instance of --store.", rich_help_panel=_INSTANCES),
     ] = 200,
     workers: WorkersOption = "1",
-    workers_ca: WorkerCa = None,
-    workers_certificate: WorkerCertificate = None,
-    workers_key: WorkerKey = None,
 ) -> None:
     """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
     import gc
     import logging
 
-    from fcslam.cli.serve_learning import FleetLearning, learning_beside
+    from fcslam.cli.serve_learning import learning_beside, learning_plan
     from fcslam.cli.shared_service import Shared, shared_state
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
@@ -127,14 +115,13 @@ def serve(
     is_open = tokens is None and client_ca is None and not insecure
     if is_open and not is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
-    _check_tls(tls_certificate, tls_key, client_ca)
-    chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
+    check_tls(tls_certificate, tls_key, client_ca)
+    chosen = Workers(workers)
     chosen.check()
     if chosen.is_cluster:
         with verifying(chosen):  # refused here, not by the worker of each mission
             pass
-    asked = FleetLearning(learn, learn_server, learn_config, learn_ca, tuple(robot_key or ()))
-    plan = asked.plan(learning or data / "learning", host, (tls_certificate, tls_key), insecure, store)
+    plan = learning_plan(learn, learn_config, learning or data / "learning", store)
     learning = learning if plan is None else plan.output
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
@@ -145,13 +132,16 @@ def serve(
         else:
             shared = Shared(store, instance, max_missions, max_robots)
             state = shared_state(shared, data, authenticator, given, learning, chosen)
-        stack.enter_context(learning_beside(plan, state))
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
-        pages = (page_router(), documentation_router()) if docs else (page_router(),)
-        app = create_app(state, pages, local_names=is_open, named=None if store is None else NAMED)
+        routers = [page_router(), *([documentation_router()] if docs else [])]
+        if plan is not None:
+            from fcslam.federated.relay import learning_router
+
+            routers.append(learning_router(state, stack.enter_context(learning_beside(plan, state))))
+        app = create_app(state, routers, local_names=is_open, named=None if store is None else NAMED)
         server = _server(app, tls_certificate, tls_key, client_ca, state.close)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
@@ -248,28 +238,3 @@ def _cloud_config(file: Path | None) -> "CloudConfig":
 
     config = mission_config(file)
     return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)
-
-
-def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> None:
-    import ssl
-
-    from fcslam.errors import ServiceError
-    from fcslam.wire.keys import no_passphrase
-
-    if (certificate is None) != (key is None):
-        raise ServiceError("--tls-certificate and --tls-key belong together; give both or neither")
-    if certificate is None or key is None:
-        if client_ca is not None:
-            raise ServiceError("--client-ca needs TLS; give --tls-certificate and --tls-key")
-        return
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    try:
-        context.load_cert_chain(certificate, key, no_passphrase)
-    except (OSError, ssl.SSLError) as error:
-        raise ServiceError(f"{certificate}, {key}: no certificate with its key ({error})") from error
-    if client_ca is None:
-        return
-    try:
-        context.load_verify_locations(client_ca)
-    except (OSError, ssl.SSLError) as error:
-        raise ServiceError(f"{client_ca}: no certificate authority can be read ({error})") from error

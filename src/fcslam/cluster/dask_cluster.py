@@ -161,19 +161,11 @@ class DaskCluster:
         await client
 
     def _security(self) -> Any:
-        """TLS by the files, else as Dask is configured."""
+        """TLS as Dask is configured (``distributed.comm.tls``)."""
         from distributed.security import Security
 
-        with_tls = self._workers.where.startswith("tls://")
-        files = {
-            "tls_ca_file": self._workers.ca,
-            "tls_client_cert": self._workers.certificate,
-            "tls_client_key": self._workers.key,
-        }
         try:
-            return Security(
-                require_encryption=with_tls, **{name: str(file) for name, file in files.items() if file is not None}
-            )
+            return Security(require_encryption=self._workers.where.startswith("tls://"))
         except (OSError, ssl.SSLError, ValueError) as error:
             raise InputError(f"{self._workers.where}: the certificates cannot be used ({_text(error)})") from error
 

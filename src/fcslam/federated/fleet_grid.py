@@ -21,8 +21,8 @@ ONLINE_S: Final = 60.0
 """A robot that has been silent for longer is gone."""
 REPLY_OVERHEAD_BYTES: Final = 64 * 1024
 """Room in a reply beside the weights: names, metrics, shapes."""
-MAX_OPEN_ROBOTS: Final = 1000
-"""Robots that a fleet without authentication accepts."""
+MAX_ROBOTS: Final = 1000
+"""Robots of a fleet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +42,15 @@ class FleetGrid(RobotGrid):
     again gets it again, and only the first reply counts.
 
     Args:
-        robots: names of the robots that may join; None to accept every name.
         clock: gives seconds since any fixed moment.
     """
 
-    def __init__(self, robots: Sequence[str] | None, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
-        self._is_open, self._clock = robots is None, clock
-        self._nodes = {robot: FIRST_NODE + index for index, robot in enumerate(robots or ())}
+        self._clock = clock
+        self._nodes: dict[str, int] = {}
         self._seen: dict[int, float] = {}
-        self._requests: dict[int, deque[Request]] = {node: deque() for node in self._nodes.values()}
+        self._requests: dict[int, deque[Request]] = {}
         self._replies: dict[int, Message] = {}
         self._issued = 0
         self._changed = threading.Condition()
@@ -148,7 +147,7 @@ class FleetGrid(RobotGrid):
         return any(request.number in numbers for node in online for request in self._requests[node])
 
     def _node(self, robot: str) -> int | None:
-        if self._is_open and robot not in self._nodes and len(self._nodes) < MAX_OPEN_ROBOTS:
+        if robot not in self._nodes and len(self._nodes) < MAX_ROBOTS:
             self._nodes[robot] = FIRST_NODE + len(self._nodes)
             self._requests[self._nodes[robot]] = deque()
         return self._nodes.get(robot)

@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -26,7 +27,6 @@ from fcslam.features.detector_file import describe_detector_file
 from fcslam.federated.artifacts import DETECTOR
 from fcslam.federated.gate import is_worse
 from fcslam.federated.history import RoundReport
-from fcslam.federated.identity import RobotAuthenticator, read_robot_keys
 from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.federated.launch import open_port, waiting
@@ -35,9 +35,9 @@ from fcslam.federated.live_settings import RELEASE, RELEASES, FleetLearningSetti
 from fcslam.federated.mission_places import MissionPlaces
 from fcslam.federated.networks import weights_version
 from fcslam.federated.releases import Releases
-from fcslam.federated.tls import Address, Certificates
 from fcslam.federated.weights import Weights
 from fcslam.learning.trainer import ExecutionOptions
+from fcslam.service.http.authentication import Authenticator
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import READY
 
@@ -107,14 +107,11 @@ class MissionTeacher:
                 _log.error("nothing is taught now: %s", error)
 
 
-def run(
-    data: Path, output: Path, settings: FleetLearningSettings, address: Address, certificates: Certificates | None,
-    robot_keys: Sequence[Path], tell: Tell,
-) -> None:  # fmt: skip
+def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket, tell: Tell) -> None:
     """Learn until all rounds are done, and teach as long as the process lives.
 
     Raises:
-        TrainingError: the port cannot be opened, or the output folder belongs to other rounds.
+        TrainingError: the output folder belongs to other rounds.
         OutputError: the output folder cannot be written.
     """
     start = _announced(data)
@@ -139,7 +136,6 @@ def run(
         output, settings.federated, releases.detector(0), gate=settings.gate,
         fallback=partial(releases.fallback, initial=initial),
     )  # fmt: skip
-    authenticator = RobotAuthenticator(None if certificates is None else read_robot_keys(robot_keys))
     told: set[str] = set()
 
     def say_once(line: str) -> None:
@@ -147,7 +143,8 @@ def run(
             told.add(line)
             _log.info("%s", line)
 
-    with open_port(address, certificates, authenticator, say_once, teacher.teach) as grid:
+    everybody = Authenticator(None)  # the service has asked for the token
+    with open_port(listener, None, everybody, say_once, teacher.teach) as grid:
         stop = threading.Event()
         thread = threading.Thread(target=teacher.run, args=(stop,), name="teacher", daemon=True)
         thread.start()
@@ -179,12 +176,9 @@ def _end_with_stdin() -> None:
 def main(arguments: Sequence[str]) -> int:
     """Run until stdin ends."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--address", nargs=2, required=True)
+    parser.add_argument("--listener", type=Path, required=True)
     parser.add_argument("--settings", type=FleetLearningSettings.model_validate_json, required=True)
     parser.add_argument("--output", type=Path, required=True)
-    for file in ("ca", "certificate", "key"):
-        parser.add_argument(f"--{file}", type=Path)
-    parser.add_argument("--robot-key", type=Path, action="append", default=[])
     parser.add_argument("data", type=Path)
     given = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -192,10 +186,12 @@ def main(arguments: Sequence[str]) -> int:
     torch.set_num_threads(1)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     threading.Thread(target=_end_with_stdin, daemon=True).start()
-    certificates = None if given.ca is None else Certificates(given.ca, given.certificate, given.key)
-    host, port = given.address
+    given.listener.unlink(missing_ok=True)  # of a process before that was killed
     try:
-        run(given.data, given.output, given.settings, Address(host, int(port)), certificates, given.robot_key, _tell)
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(given.listener))
+            listener.listen()
+            run(given.data, given.output, given.settings, listener, _tell)
     except FcslamError as error:
         _log.error("%s", error)
         return 2

@@ -10,18 +10,12 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
+from urllib.parse import quote
 
 import httpx
 
-from fcslam.errors import TrainingError
-from fcslam.federated.fleet_server import (
-    ALIVE_PATH,
-    LONG_POLL_S,
-    NEXT_PATH,
-    NUMBER_HEADER,
-    REPLY_PATH,
-    TAUGHT_PATH,
-)
+from fcslam.errors import TrainingError, UnavailableError
+from fcslam.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER
 from fcslam.federated.flower import (
     FIRST_NODE,
     RUN_ID,
@@ -35,9 +29,8 @@ from fcslam.federated.flower import (
     request_from_bytes,
     use_own_identity,
 )
-from fcslam.federated.identity import RobotIdentity
 from fcslam.federated.replies import printable_line
-from fcslam.federated.tls import Address, client_context
+from fcslam.wire.http_transport import HttpClient
 
 ALIVE_S: Final = 15.0
 """Time between two signs of life; a quarter of that after which a robot counts as gone."""
@@ -50,29 +43,27 @@ MAX_REQUEST_BYTES: Final = 256 * 2**20
 _T = TypeVar("_T")
 
 
-class RobotLink:
-    """The connection of a robot with its server.
+class RobotLink(HttpClient):
+    """The connection of a robot with the service that it learns at.
 
     Args:
-        address: of the server.
-        identity: of the robot.
-        ca: certificate of the authority that signed the server's; None for no encryption.
+        url, token, ca, own: as in ``HttpClient``.
+        robot: name of the robot.
     """
 
-    def __init__(self, address: Address, identity: RobotIdentity, ca: Path | None) -> None:
-        self._identity = identity
-        self._client = httpx.Client(
-            base_url=f"{'http' if ca is None else 'https'}://{address}",
-            verify=True if ca is None else client_context(ca),
-            timeout=httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S),
-            trust_env=False,
-        )
+    def __init__(
+        self, url: str, robot: str, token: str | None = None, ca: Path | None = None,
+        own: tuple[Path, Path] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(url, token, ca, own)
+        self._path = f"robots/{quote(robot, safe='')}/learning/"
+        self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 
     def __enter__(self) -> "RobotLink":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._client.close()
+        self.close()
 
     def fetch(self) -> tuple[int, bytes] | None:
         """A request with its number; None if there is none now.
@@ -81,7 +72,7 @@ class RobotLink:
             TrainingError: the server does not accept the robot.
             ConnectionError: the server cannot be reached, or is not a server of a fleet.
         """
-        status, headers, body = self._post(NEXT_PATH, b"")
+        status, headers, body = self._post("next")
         if status == httpx.codes.NO_CONTENT:
             return None
         number = headers.get(NUMBER_HEADER, "")
@@ -95,7 +86,7 @@ class RobotLink:
         Raises:
             TrainingError, ConnectionError: as in ``fetch``.
         """
-        status, _, answer = self._post(f"{REPLY_PATH}{number}", body)
+        status, _, answer = self._post(f"reply/{number}", body)
         return None if status == httpx.codes.NO_CONTENT else answer.decode(errors="replace") or f"status {status}"
 
     def taught(self) -> bytes:
@@ -104,7 +95,7 @@ class RobotLink:
         Raises:
             TrainingError, ConnectionError: as in ``fetch``.
         """
-        status, _, body = self._post(TAUGHT_PATH, b"")
+        status, _, body = self._post("taught")
         if status not in (httpx.codes.OK, httpx.codes.NO_CONTENT):
             raise ConnectionError(f"the server answers with status {status}")
         return body
@@ -115,21 +106,19 @@ class RobotLink:
         Raises:
             TrainingError, ConnectionError: as in ``fetch``.
         """
-        self._post(ALIVE_PATH, b"")
+        self._post("alive")
 
-    def _post(self, path: str, body: bytes) -> tuple[int, httpx.Headers, bytes]:
+    def _post(self, operation: str, body: bytes = b"") -> tuple[int, httpx.Headers, bytes]:
+        content = bytearray()
         try:
-            with self._client.stream(
-                "POST", path, content=body, headers=self._identity.headers("POST", path, body)
-            ) as response:
-                content = bytearray()
+            with self._explained(), self._client.stream("POST", self._path + operation, content=body) as response:
                 for part in response.iter_bytes():
                     content += part
                     if len(content) > MAX_REQUEST_BYTES:
                         raise ConnectionError(f"the server sends more than {MAX_REQUEST_BYTES} bytes")
-        except httpx.HTTPError as error:
-            raise ConnectionError(str(error) or type(error).__name__) from error
-        if response.status_code == httpx.codes.UNAUTHORIZED:
+        except UnavailableError as error:
+            raise ConnectionError(str(error)) from error
+        if response.status_code in (httpx.codes.UNAUTHORIZED, httpx.codes.FORBIDDEN):
             raise TrainingError(f"the server does not accept this robot: {content.decode(errors='replace')}")
         return response.status_code, response.headers, bytes(content)
 

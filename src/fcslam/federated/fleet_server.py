@@ -1,12 +1,12 @@
-"""The server's port: robots fetch requests and bring replies, and nothing else can be asked there.
+"""The operations of learning: robots fetch requests and bring replies, and nothing else can be asked.
 
-    POST /fleet/next             204, or a request with its number in a header; waits some seconds for one
-    POST /fleet/alive            204; a robot at work shows that it is still there
-    POST /fleet/reply/NUMBER     204; the reply to a request
-    POST /fleet/taught           204, or codes that others gave to places of this robot, as a batch of packets
+    POST /api/v1/robots/ROBOT/learning/next            204, or a request with its number in a header; waits for one
+    POST /api/v1/robots/ROBOT/learning/alive           204; a robot at work shows that it is still there
+    POST /api/v1/robots/ROBOT/learning/reply/NUMBER    204; the reply to a request
+    POST /api/v1/robots/ROBOT/learning/taught          204, or codes that others gave to places of this robot
 
-Whoever does not sign as a robot of the fleet gets 401 before the body is read. There is no operation that starts a
-run, adds a key or names a program: the operator does this on the server's command line.
+A robot shows its token or its certificate, as for its packets; anybody else gets 401 before the body is read. No
+operation starts a run, adds a token or names a program: the operator does this on the server's command line.
 """
 
 import asyncio
@@ -16,6 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
 from typing import Final
 
 import uvicorn
@@ -26,15 +27,11 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from fcslam.federated.fleet_grid import FleetGrid
-from fcslam.federated.identity import RefusedRequestError, RobotAuthenticator
 from fcslam.federated.replies import printable_line
-from fcslam.federated.tls import Certificates
+from fcslam.service.http.authentication import Authenticator, Identity, Role
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 
-NEXT_PATH: Final = "/fleet/next"
-ALIVE_PATH: Final = "/fleet/alive"
-REPLY_PATH: Final = "/fleet/reply/"
-TAUGHT_PATH: Final = "/fleet/taught"
+PATH: Final = "/api/v1/robots/{robot}/learning"
 NUMBER_HEADER: Final = "x-fcslam-request"
 """Number of the request in the body."""
 LONG_POLL_S: Final = 10.0
@@ -65,13 +62,13 @@ class FleetApp:
 
     Args:
         grid: holds requests and replies.
-        authenticator: decides which robot a request is by.
+        authenticator: knows the tokens of robots; an open one believes the name in the path.
         on_notice: called with one line for each kind of refused request; from the thread of the server.
         teach: called with the name of a robot that asks what it is taught.
     """
 
     def __init__(
-        self, grid: FleetGrid, authenticator: RobotAuthenticator, on_notice: OnNotice, teach: Teach = teach_nothing
+        self, grid: FleetGrid, authenticator: Authenticator, on_notice: OnNotice, teach: Teach = teach_nothing
     ) -> None:
         self._grid, self._authenticator, self._on_notice, self._teach = grid, authenticator, on_notice, teach
         self._open: Counter[str] = Counter()
@@ -85,12 +82,15 @@ class FleetApp:
     def asgi(self) -> Starlette:
         """The application for an ASGI server."""
         operations = {
-            NEXT_PATH: self._next,
-            ALIVE_PATH: self._alive,
-            f"{REPLY_PATH}{{number:int}}": self._reply,
-            TAUGHT_PATH: self._taught,
+            "next": self._next,
+            "alive": self._alive,
+            "reply/{number:int}": self._reply,
+            "taught": self._taught,
         }
-        routes = [Route(path, self._guarded(handler), methods=["POST"]) for path, handler in operations.items()]
+        routes = [
+            Route(f"{PATH}/{operation}", self._guarded(handler), methods=["POST"])
+            for operation, handler in operations.items()
+        ]
         app = Starlette(routes=routes, exception_handlers={404: self._unknown, 405: self._unknown})
         app.router.redirect_slashes = False  # a redirect repeats whatever Host the request names
         return app
@@ -101,21 +101,16 @@ class FleetApp:
         """The handler, for robots of the fleet only, and not too many times at once."""
 
         async def handle(request: Request) -> Response:
-            try:
-                robot = await run_in_threadpool(
-                    self._authenticator.robot, request.method, request.url.path, request.headers
-                )
-                if not self._grid.admits(robot):
-                    raise RefusedRequestError("the fleet is full")
-            except RefusedRequestError as error:
-                return self._refusal(request, 401, str(error))
+            robot = request.path_params["robot"]
+            if not self._authenticator.is_open and self._who(request) != Identity(robot, Role.ROBOT):
+                return self._refusal(request, 401, f"it has no token of robot {robot}")
+            if not self._grid.admits(robot):
+                return self._refusal(request, 401, f"the fleet has no room for robot {robot}")
             if self._open[robot] >= MAX_OPEN_REQUESTS:
                 return self._refusal(request, 429, f"{robot} has too many requests open")
             self._open[robot] += 1
             try:
                 return await handler(request, robot)
-            except RefusedRequestError as error:
-                return self._refusal(request, 401, str(error))
             except ClientDisconnect:
                 return Response(status_code=400)
             finally:
@@ -123,8 +118,11 @@ class FleetApp:
 
         return handle
 
-    async def _next(self, request: Request, robot: str) -> Response:
-        await self._body(request, 0)
+    def _who(self, request: Request) -> Identity | None:
+        tls = request.scope.get("extensions", {}).get("tls", {})
+        return self._authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
+
+    async def _next(self, _request: Request, robot: str) -> Response:
         end = time.monotonic() + LONG_POLL_S
         while time.monotonic() < end and not self._is_closing:
             found = self._grid.next_request(robot)
@@ -133,8 +131,7 @@ class FleetApp:
             await asyncio.sleep(POLL_S)
         return Response(status_code=204)
 
-    async def _alive(self, request: Request, robot: str) -> Response:
-        await self._body(request, 0)
+    async def _alive(self, _request: Request, robot: str) -> Response:
         self._grid.mark_online(robot)
         return Response(status_code=204)
 
@@ -153,23 +150,17 @@ class FleetApp:
         is_taken = await run_in_threadpool(self._grid.store_reply, robot, number, body)
         return Response(status_code=204) if is_taken else PlainTextResponse(_UNWANTED, 409)
 
-    async def _taught(self, request: Request, robot: str) -> Response:
-        await self._body(request, 0)
+    async def _taught(self, _request: Request, robot: str) -> Response:
         batch = self._teach(robot)
         return Response(batch) if batch else Response(status_code=204)
 
     async def _body(self, request: Request, limit: int) -> bytes | None:
-        """The body, read no further than ``limit`` bytes; None if it is longer.
-
-        Raises:
-            RefusedRequestError: the body is not the one that was signed.
-        """
+        """The body, read no further than ``limit`` bytes; None if it is longer."""
         body = bytearray()
         async for part in request.stream():
             body += part
             if len(body) > limit:
                 return None
-        await run_in_threadpool(self._authenticator.check_body, request.headers, bytes(body))
         return bytes(body)
 
     async def _drain(self, request: Request) -> None:
@@ -181,7 +172,7 @@ class FleetApp:
                 return
 
     async def _unknown(self, request: Request, _error: Exception) -> Response:
-        return self._refusal(request, 404, "this port starts no run and runs no app; robots fetch requests here")
+        return self._refusal(request, 404, "nobody starts a run or runs an app here; robots fetch requests")
 
     def _refusal(self, request: Request, status: int, reason: str) -> Response:
         host = "?" if request.client is None else request.client.host
@@ -193,21 +184,21 @@ class FleetApp:
 
 
 @contextlib.contextmanager
-def listening(app: FleetApp, listener: socket.socket, certificates: Certificates | None) -> Iterator[None]:
-    """Serve the port in a thread while the block runs.
+def listening(app: FleetApp, listener: socket.socket, tls: tuple[Path, Path] | None = None) -> Iterator[None]:
+    """Serve the operations in a thread while the block runs.
 
     Args:
         app: the operations to serve.
         listener: bound socket.
-        certificates: of this machine; None for no encryption.
+        tls: PEM files of this machine's certificate and its key; None for no encryption.
     """
     server = GuardedServer(
         uvicorn.Config(
             app.asgi(),
             loop="asyncio",
             http=GuardedProtocol,
-            ssl_certfile=None if certificates is None else certificates.certificate,
-            ssl_keyfile=None if certificates is None else certificates.key,
+            ssl_certfile=None if tls is None else tls[0],
+            ssl_keyfile=None if tls is None else tls[1],
             log_level="critical",
             lifespan="off",
             ws="none",

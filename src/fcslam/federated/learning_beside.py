@@ -20,16 +20,16 @@ STOP_S: Final = 5.0
 class RobotLearningPlan:
     """Where and how a robot learns."""
 
-    host: str
-    """Host of the server's port of learning."""
-    port: int
+    server: str
+    """Address of the service."""
     settings: RobotLearningSettings
     state: Path
     """The robot's state folder, with its keyframes."""
+    token_file: Path | None = None
     ca: Path | None = None
-    """Certificate of the authority that signed the server's; None for no encryption."""
-    robot_key: Path | None = None
-    """The robot's private key; None in a fleet without authentication."""
+    """PEM file of certificate authorities; None: the authorities of the system."""
+    own: tuple[Path, Path] | None = None
+    """PEM files of the robot's certificate and its key, in place of a token."""
 
 
 class LearningBeside:
@@ -37,10 +37,11 @@ class LearningBeside:
 
     def __init__(self, plan: RobotLearningPlan, robot: str, on_notice: Callable[[str], None]) -> None:
         """Start it. ``on_notice`` is called with lines for the user, in a thread of its own."""
-        files = {"--ca": plan.ca, "--robot-key": plan.robot_key}
+        certificate, key = plan.own or (None, None)
+        files = {"--token-file": plan.token_file, "--ca": plan.ca, "--certificate": certificate, "--key": key}
         options = [word for name, file in files.items() if file is not None for word in (name, str(file))]
         keyframes, cache = plan.state / KEYFRAMES, plan.state / "learning"
-        words = [str(keyframes), str(cache), plan.host, str(plan.port), robot, plan.settings.model_dump_json()]
+        words = [str(keyframes), str(cache), plan.server, robot, plan.settings.model_dump_json()]
         command = [sys.executable, "-m", "fcslam.federated.robot_learning", *words, *options]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._on_notice = on_notice

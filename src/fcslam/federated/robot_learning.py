@@ -13,8 +13,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -24,12 +25,11 @@ from fcslam.errors import FcslamError, PacketError, TrainingError
 from fcslam.federated.client import RobotClient, secret_noise
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.fleet_robot import RobotLink, robot_context, serve_requests
-from fcslam.federated.identity import RobotIdentity, read_private_key
 from fcslam.federated.live_settings import RobotLearningSettings
 from fcslam.federated.own_examples import own_examples
-from fcslam.federated.tls import Address, check_server_certificate
 from fcslam.learning.code_training import CodeInputs
 from fcslam.wire.batches import read_batch
+from fcslam.wire.keys import read_token
 from fcslam.wire.messages import Packet, TaughtPlace
 from fcslam.wire.packets import decode
 
@@ -130,8 +130,9 @@ class LearningRobot:
 class _IdleLink(RobotLink):
     """Asks for requests only while the robot is idle and has something to learn from."""
 
-    def __init__(self, address: Address, identity: RobotIdentity, ca: Path | None, robot: LearningRobot) -> None:
-        super().__init__(address, identity, ca)
+    def __init__(self, robot: LearningRobot, url: str, name: str, token: str | None, ca: Path | None,
+                 own: tuple[Path, Path] | None) -> None:  # fmt: skip
+        super().__init__(url, name, token, ca, own)
         self._robot = robot
 
     def fetch(self) -> tuple[int, bytes] | None:
@@ -157,14 +158,12 @@ def checked_lessons(robot: str, batch: bytes) -> list[Packet]:
     return packets
 
 
-def learn(
-    address: Address, identity: RobotIdentity, ca: Path | None, robot: LearningRobot, client: RobotClient,
-    idleness: Idleness,
-) -> str:  # fmt: skip
+def learn(open_link: Callable[[], RobotLink], client: RobotClient, idleness: Idleness) -> str:
     """Join rounds until learning ends; returns why.
 
     Raises:
-        TrainingError: the server does not accept the robot, or its certificate does not fit.
+        TrainingError: the server does not accept the robot.
+        CloudError: the server's address or certificate cannot be used.
     """
     app, context = build_client_app(lambda _context: client), robot_context()
     told = ""
@@ -175,14 +174,10 @@ def learn(
             told = line
             tell(line)
 
-    is_checked = ca is None
     while True:
         idleness.wait()
         try:
-            if not is_checked and ca is not None:
-                check_server_certificate(address, ca)
-                is_checked = True
-            with _IdleLink(address, identity, ca, robot) as link:
+            with open_link() as link:
                 serve_requests(link, app, context, notice)
         except BusyRobotError:
             continue
@@ -209,12 +204,11 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("keyframes", type=Path)
     parser.add_argument("cache", type=Path)
-    parser.add_argument("host")
-    parser.add_argument("port", type=int)
+    parser.add_argument("server")
     parser.add_argument("name")
     parser.add_argument("settings", type=RobotLearningSettings.model_validate_json)
-    parser.add_argument("--ca", type=Path)
-    parser.add_argument("--robot-key", type=Path)
+    for file in ("token-file", "ca", "certificate", "key"):
+        parser.add_argument(f"--{file}", type=Path)
     given = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -223,11 +217,13 @@ def main(arguments: Sequence[str]) -> int:
     idleness = Idleness()
     threading.Thread(target=_listen, args=(idleness,), daemon=True).start()
     try:
-        identity = RobotIdentity(given.name, None if given.robot_key is None else read_private_key(given.robot_key))
+        token = None if given.token_file is None else read_token(given.token_file)
+        own = None if given.certificate is None else (given.certificate, given.key)
         client = RobotClient(given.name, given.keyframes, given.cache, secret_noise)
         robot = LearningRobot(given.keyframes, client, given.settings, idleness)
         client.on_step = robot.pause
-        tell(f"learning ends: {learn(Address(given.host, given.port), identity, given.ca, robot, client, idleness)}")
+        link = partial(_IdleLink, robot, given.server, given.name, token, given.ca, own)
+        tell(f"learning ends: {learn(link, client, idleness)}")
     except (FcslamError, OSError) as error:
         tell(f"learning ends: {error}")
     return 0

@@ -45,7 +45,6 @@ def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Rol
         _make_leaf(folder / "cloud", "fcslam cloud", [ExtendedKeyUsageOID.SERVER_AUTH], served, authority, now)
         for name in (name for name, role in names.items() if role is Role.ROBOT):
             _make_leaf(folder / "robots" / name, name, [ExtendedKeyUsageOID.CLIENT_AUTH], (), authority, now)
-            _write_public_key(folder / "robots" / name)
         _add_tokens(folder, names)
     except (OSError, ValueError) as error:
         raise OutputError(f"{folder}: cannot write credentials ({error}); name a new folder") from error
@@ -134,13 +133,6 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
     for name, role in names.items():
         if name not in known:
             add_token(path, TokenHolder(name, role), folder / "tokens" / name)
-
-
-def _write_public_key(stem: Path) -> None:
-    """Write the public key of ``stem``.key as OpenSSH does, for a service whose robots learn."""
-    key = serialization.load_pem_private_key(stem.with_name(f"{stem.name}.key").read_bytes(), None)
-    form = serialization.PublicFormat.OpenSSH
-    write_file(stem.with_name(f"{stem.name}.pub"), key.public_key().public_bytes(serialization.Encoding.OpenSSH, form))
 
 
 def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

@@ -505,10 +505,8 @@ def _chosen(arguments: Sequence[str]) -> _Chosen:
     parser.add_argument("--store")
     parser.add_argument("--lease", type=int, nargs=2, metavar=("MISSION", "FENCE"))
     parser.add_argument("--workers", default=Workers().where)
-    for file in ("ca", "certificate", "key"):
-        parser.add_argument(f"--workers-{file}", type=Path)
     given = parser.parse_args(arguments)
-    workers = Workers(given.workers, given.workers_ca, given.workers_certificate, given.workers_key)
+    workers = Workers(given.workers)
     return _Chosen(MissionFolder(given.folder), workers, given.store, Lease(*given.lease) if given.lease else None)
 
 

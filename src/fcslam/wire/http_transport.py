@@ -2,7 +2,8 @@
 
 import ipaddress
 import ssl
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -137,10 +138,16 @@ class HttpClient:
         self, method: str, path: str, content: bytes | None = None, headers: Mapping[str, str] | None = None,
         accept: str = MEDIA_TYPE,
     ) -> "httpx.Response":  # fmt: skip
+        with self._explained():
+            return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turn the client's errors into those of ``BatchTransport.state``."""
         import httpx
 
         try:
-            return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
+            yield
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
                 raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error

@@ -6,21 +6,16 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.federate.options import (
-    Ca,
-    Certificate,
-    Insecure,
-    Key,
     LocalSteps,
     Public,
     Rounds,
-    Security,
-    ServerAddress,
     SettingsFile,
     Strategy,
     federated_settings,
     parse_address,
 )
 from fcslam.cli.federate.rounds import show_rounds
+from fcslam.cli.listening import check_tls, listen
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
 from fcslam.cli.training_options import (
@@ -33,12 +28,13 @@ from fcslam.cli.training_options import (
     require_training_libraries,
 )
 
+_TLS = "TLS"
 MAX_LINES = 1000
 """Different notices that are printed, so that nobody on the network can fill a log."""
 
 
 def serve(
-    address: ServerAddress,
+    address: Annotated[str, typer.Argument(metavar="HOST:PORT", help="Address to listen on.")],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
     config: SettingsFile = None,
@@ -49,37 +45,41 @@ def serve(
     local_steps: LocalSteps = None,
     seed: TrainingSeed = None,
     device: Device = "auto",
-    ca: Ca = None,
-    certificate: Certificate = None,
-    key: Key = None,
-    robot_key: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Public key of a robot that may join: robot1.pub is that of robot1. Can be repeated.",
-            rich_help_panel="TLS",
-        ),
+    tokens: Annotated[
+        Path | None,
+        typer.Option(help="File of the robots' tokens; `fcslam certificates` makes one.", rich_help_panel=_TLS),
     ] = None,
-    insecure: Insecure = False,
+    tls_certificate: Annotated[
+        Path | None, typer.Option(help="Certificate of this machine (PEM).", rich_help_panel=_TLS)
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(help="Private key of --tls-certificate (PEM).", rich_help_panel=_TLS)
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Use neither encryption nor authentication.", rich_help_panel=_TLS)
+    ] = False,
     quick: Quick = False,
     quiet: Quiet = False,
 ) -> None:
     """Run the server of a fleet: wait for robots at HOST:PORT and train one detector with them.
 
-    Give --ca, --certificate, --key and the --robot-key of each robot; docs/howto/federated.md shows how to make
-    them. Give --insecure only in a network that nobody else can reach.
+    Give --tokens, --tls-certificate and --tls-key, which `fcslam certificates` makes. Give --insecure only in a
+    network that nobody else can reach.
     """
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.errors import ServiceError
 
     settings = federated_settings(config, quick, strategy, rounds, local_steps, seed)
     require_training_libraries("flwr", extra="federated")
     from fcslam.federated import launch
-    from fcslam.federated.identity import RobotAuthenticator, read_robot_keys
     from fcslam.federated.job import FederatedJob
+    from fcslam.service.http.authentication import Authenticator, read_tokens
 
-    security = Security(ca, certificate, key, tuple(robot_key or ()), insecure)
-    certificates, keys = security.certificates(), read_robot_keys(robot_key or ())
-    authenticator = RobotAuthenticator(None if certificates is None else keys)
-    where = parse_address(address)
+    tls = None if tls_certificate is None or tls_key is None else (tls_certificate, tls_key)
+    if insecure == (tokens is not None and tls is not None):
+        raise ServiceError("give --tokens, --tls-certificate and --tls-key, or --insecure in a network of your own")
+    check_tls(tls_certificate, tls_key)
+    host, port = parse_address(address)
     options = compute_budget(device, quick)
     console, printed = notices(quiet), set[str]()
 
@@ -88,8 +88,9 @@ def serve(
             printed.add(line)
             print_line(console, line)
 
+    authenticator = Authenticator(None if insecure or tokens is None else read_tokens(tokens))
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
-    with ProgressDisplay(console, f"output: {job.output}") as display:
+    with listen(host, port) as listener, ProgressDisplay(console, f"output: {job.output}") as display:
         progress = show_rounds(display, console, settings)
-        launch.serve(job, options, where, certificates, authenticator, progress, print_once)
+        launch.serve(job, options, listener, None if insecure else tls, authenticator, progress, print_once)
     typer.echo(str(job.output / "detector.onnx"))
