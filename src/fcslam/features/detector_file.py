@@ -6,6 +6,7 @@ from pathlib import Path
 from fcslam.errors import FeatureError
 from fcslam.features.detector import NETWORK_FORMAT, FeatureDetector, OnnxConfig, OnnxDetector
 from fcslam.records import Channel, DetectorFile
+from fcslam.untrusted import read_bytes
 
 
 def describe_detector_file(path: Path) -> DetectorFile:
@@ -39,6 +40,6 @@ def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> Fe
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except OSError as error:
         raise FeatureError(f"{path}: cannot be read ({error}); fetch it again") from error
