@@ -12,6 +12,7 @@ import lzma
 import os
 import sqlite3
 import stat
+import struct
 import warnings
 import zipfile
 import zlib
@@ -46,7 +47,8 @@ _FREE_STEPS: Final = 20_000_000
 _STEPS_PER_BYTE: Final = 20
 """Steps that SQLite may take to read a database; an honest one needs less than one per byte."""
 _BUFFER_BYTES: Final = 1 << 17
-_IMAGES: Final = ("PNG", "JPEG", "PPM", "TIFF", "BMP", "WEBP")
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_IMAGES: Final = ("JPEG", "PPM", "TIFF", "BMP", "WEBP")
 _BYTES_OF_BAND: Final = {"I": 4, "F": 4, "I;16": 2, "I;16B": 2}
 """Bytes of a pixel by Pillow's mode; the other modes have one for each band."""
 _FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -232,16 +234,31 @@ def check_image(encoded: bytes) -> None:
         LimitError: the pixels would fill the memory.
         ValueError: it is no image of a known format.
     """
+    width, height, pixel_bytes = _png_size(encoded) if encoded.startswith(_PNG) else _image_size(encoded)
+    most = most_unpacked(len(encoded), MOST_IMAGE_RATIO)
+    if width * height * pixel_bytes > most:
+        raise LimitError(
+            f"the image has {width} x {height} pixels, which would fill the memory; the limit is {_size(most)}"
+        )
+
+
+def _png_size(encoded: bytes) -> tuple[int, int, int]:
+    """Width, height and bytes of a pixel by the header, which Pillow does not read of large maps."""
+    width, height, depth, kind = struct.unpack_from(">IIBB", encoded.ljust(26, b"\0"), 16)
+    return width, height, 4 * (depth // 8 or 1) if kind else depth // 8 or 1
+
+
+def _image_size(encoded: bytes) -> tuple[int, int, int]:
+    """Width, height and bytes of a pixel by the header."""
     from PIL import Image
 
     try:
         with warnings.catch_warnings(), Image.open(io.BytesIO(encoded), formats=_IMAGES) as image:
-            (width, height), mode, bands = image.size, image.mode, len(image.getbands())
+            return (*image.size, _BYTES_OF_BAND.get(image.mode, len(image.getbands())))
+    except Image.DecompressionBombError as error:
+        raise LimitError(str(error)) from error
     except Exception as error:  # Pillow's formats raise errors of many types
-        raise ValueError("no image of a known format") from error
-    most = most_unpacked(len(encoded), MOST_IMAGE_RATIO)
-    if width * height * _BYTES_OF_BAND.get(mode, bands) > most:
-        raise LimitError(f"the image has {width} x {height} pixels; its file may hold {_size(most)} of them")
+        raise ValueError("the image cannot be read; copy it again, or save it as PGM or PNG") from error
 
 
 def _unpacked(packed: bytes, decompressor: Callable[[], Any], limit: int) -> tuple[bytes, bool]:

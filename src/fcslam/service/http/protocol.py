@@ -6,7 +6,7 @@ import socket
 import ssl
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from types import FrameType
 from typing import Any
 
@@ -14,8 +14,12 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from fcslam.service.http.strangers import WAITING
+
 MOST_CONNECTIONS = 4096
 """Connections without a request in progress; of more, one of the address that has most is closed."""
+WRITE_S = 20.0
+"""Time for a client to read what fills the buffers of its connection, 64 KiB and those of the system."""
 IDLE_S = 10.0
 """Time for the header of a request, from the connection or the response before."""
 BODY_S = 60.0
@@ -33,6 +37,12 @@ def allow_many_connections() -> None:
     most = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+@cache
+def most_connections() -> int:
+    """Connections that there may be at a time: some files are left for missions and handshakes."""
+    return min(MOST_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
 
 
 class GuardedServer(uvicorn.Server):
@@ -70,6 +80,8 @@ class GuardedProtocol(H11Protocol):
     holds idle connections would lock everybody else out.
     """
 
+    _stuck_since: float | None = None
+    """When the client stopped to read what is sent; None: it reads."""
     _idle_since = _asked_since = 0.0
     """Times of the loop: when the present request began, or when the connection was seen without one first."""
     _look: asyncio.TimerHandle | None = None
@@ -79,7 +91,7 @@ class GuardedProtocol(H11Protocol):
         super().connection_made(transport)
         self._idle_since = self._asked_since = self.loop.time()
         self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
-        if len(self.connections) > MOST_CONNECTIONS:
+        if len(self.connections) > most_connections():
             self._make_room()
         self._pass_certificate(transport)
 
@@ -94,6 +106,21 @@ class GuardedProtocol(H11Protocol):
         """Whether no request is in progress."""
         return self.cycle is None or self.cycle.response_complete
 
+    @property
+    def may_be_closed(self) -> bool:
+        """Whether the connection is idle, or its request waits among those of strangers."""
+        return self.is_idle or WAITING in self.cycle.scope["state"]
+
+    def pause_writing(self) -> None:
+        """The client reads slower than the service sends."""
+        self._stuck_since = self.loop.time()
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has read."""
+        self._stuck_since = None
+        super().resume_writing()
+
     def _enforce_timeouts(self) -> None:
         """Close the connection if it has been idle, or its request has been coming in, for too long."""
         now = self.loop.time()
@@ -103,19 +130,21 @@ class GuardedProtocol(H11Protocol):
         else:
             self._idle_since = now
             is_late = self.cycle.more_body and now - self._asked_since > BODY_S
-        if is_late:
+        if is_late or (self._stuck_since is not None and now - self._stuck_since > WRITE_S):
             self.transport.abort()
         else:
             self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
 
     def _make_room(self) -> None:
-        """Close the longest idle connection of the address that has most of them."""
-        idle = [each for each in self.connections if isinstance(each, GuardedProtocol) and each.is_idle]
+        """Close the longest idle connection of the address that has most of them; without any, this one."""
+        idle = [each for each in self.connections if isinstance(each, GuardedProtocol) and each.may_be_closed]
         held = Counter(_address(each) for each in idle if each is not self)
         if held:
             ((address, _),) = held.most_common(1)
             oldest = min((e for e in idle if e is not self and _address(e) == address), key=lambda e: e._idle_since)
             oldest.transport.abort()
+        else:
+            self.transport.abort()
 
     def _pass_certificate(self, transport: asyncio.Transport) -> None:
         """Pass the certificate to the application by ASGI's TLS extension; of its entries only ``client_cert_name``.

@@ -2,7 +2,6 @@
 
 import gzip
 import lzma
-import os
 import re
 import zlib
 from collections.abc import Iterator
@@ -38,7 +37,7 @@ def is_folder(path: Path) -> bool:
     """
     with translate_errors(path):
         mode = path.stat().st_mode
-        if not (S_ISDIR(mode) or S_ISREG(mode) or path.samefile(os.devnull)):
+        if not (S_ISDIR(mode) or S_ISREG(mode)):
             raise SourceError(f"{path}: is a pipe or device, and a recording is read twice; write it to a file first")
     return S_ISDIR(mode)
 
