@@ -181,6 +181,7 @@ def _server(
             ssl_keyfile=key,
             ssl_ca_certs=None if client_ca is None else str(client_ca),
             ssl_cert_reqs=ssl.CERT_NONE if client_ca is None else ssl.CERT_OPTIONAL,
+            backlog=512,
             log_level="error",  # a line for each request that is no HTTP would fill the disk
             proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,  # else any program of this machine names the client
             ws="none",

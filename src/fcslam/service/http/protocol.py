@@ -1,12 +1,14 @@
 """The connections of the service: how many there may be, how long they may be idle, and whose certificate they show."""
 
 import asyncio
+import itertools
 import resource
 import socket
 import ssl
 from collections import Counter
 from collections.abc import Callable
-from functools import cache, partial
+from contextlib import suppress
+from functools import cache
 from types import FrameType
 from typing import Any
 
@@ -20,12 +22,16 @@ MOST_CONNECTIONS = 4096
 """Connections without a request in progress; of more, one of the address that has most is closed."""
 WRITE_S = 20.0
 """Time for a client to read what fills the buffers of its connection, 64 KiB and those of the system."""
+REFUSAL_S = 5.0
+"""Time until what is no HTTP is answered."""
 IDLE_S = 10.0
 """Time for the header of a request, from the connection or the response before."""
 BODY_S = 60.0
 """Time for a request with its body."""
 HANDSHAKE_S = 10.0
 """Time for a TLS handshake."""
+ACCEPTED_AT_ONCE, PAUSE_S = 20, 0.01
+"""Connections that are accepted without a pause, and the pause: two thousand in a second."""
 _LOOK_EVERY_S = 2.0
 _FILES = 16_384
 """Files that may be open at a time, if the system allows it: connections whose TLS handshake is not done count, too."""
@@ -45,8 +51,11 @@ def most_connections() -> int:
     return min(MOST_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
 
 
+_Factory = Callable[[], asyncio.Protocol]
+
+
 class GuardedServer(uvicorn.Server):
-    """uvicorn's server with a limit for TLS handshakes, which come before a protocol; theirs is a minute.
+    """uvicorn's server with limits for new connections and for TLS handshakes, which come before a protocol.
 
     ``on_exit`` is called when it is asked to stop, before it waits for the answers in progress.
     """
@@ -67,10 +76,52 @@ class GuardedServer(uvicorn.Server):
 
     def _loop(self) -> asyncio.AbstractEventLoop:
         loop = (self.config.get_loop_factory() or asyncio.new_event_loop)()
-        if self.config.is_ssl:
-            limited = partial(loop.create_server, ssl_handshake_timeout=HANDSHAKE_S)
-            loop.create_server = limited  # type: ignore[method-assign]
+
+        async def listen(factory: _Factory, *, sock: socket.socket, ssl: ssl.SSLContext | None, backlog: int) -> object:
+            sock.listen(backlog)
+            return _Listener(factory, sock, ssl)
+
+        loop.create_server = listen  # type: ignore[method-assign, assignment]
         return loop
+
+
+class _Listener:
+    """Accepts connections, a few at a time: asyncio accepts all that wait at once, and requests in progress wait."""
+
+    def __init__(self, factory: _Factory, listening: socket.socket, tls: ssl.SSLContext | None) -> None:
+        self._factory, self._listening, self._tls = factory, listening, tls
+        self._handshakes: set[asyncio.Task[None]] = set()
+        listening.setblocking(False)
+        self._accepting = asyncio.get_running_loop().create_task(self._accept())
+
+    def close(self) -> None:
+        """Accept no more."""
+        self._accepting.cancel()
+
+    async def wait_closed(self) -> None:
+        """Wait for the handshakes in progress."""
+        await asyncio.wait([self._accepting, *self._handshakes])
+
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        for number in itertools.count(1):
+            try:
+                connection, _ = await loop.sock_accept(self._listening)
+            except OSError:  # no file is left: wait until a connection is closed
+                await asyncio.sleep(PAUSE_S)
+                continue
+            handshake = loop.create_task(self._connect(connection))
+            self._handshakes.add(handshake)
+            handshake.add_done_callback(self._handshakes.discard)
+            if number % ACCEPTED_AT_ONCE == 0:
+                await asyncio.sleep(PAUSE_S)
+
+    async def _connect(self, connection: socket.socket) -> None:
+        timeout_s = None if self._tls is None else HANDSHAKE_S
+        with suppress(OSError):  # the client is gone, or no client of ours
+            await asyncio.get_running_loop().connect_accepted_socket(
+                self._factory, connection, ssl=self._tls, ssl_handshake_timeout=timeout_s
+            )
 
 
 class GuardedProtocol(H11Protocol):
@@ -120,6 +171,15 @@ class GuardedProtocol(H11Protocol):
         """The client has read."""
         self._stuck_since = None
         super().resume_writing()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP, but late, so that whoever sends it again and again waits."""
+        self.transport.pause_reading()
+        self.loop.call_later(REFUSAL_S, self._refuse, msg)
+
+    def _refuse(self, msg: str) -> None:
+        if not self.transport.is_closing():
+            super().send_400_response(msg)
 
     def _enforce_timeouts(self) -> None:
         """Close the connection if it has been idle, or its request has been coming in, for too long."""
