@@ -159,12 +159,20 @@ def open_unpacked(path: Path, within: Path | None = None) -> BinaryIO:
     return cast("BinaryIO", io.BufferedReader(_Limited(unpacking, file, size), _BUFFER_BYTES))
 
 
+def open_zstd(file: BinaryIO) -> BinaryIO:
+    """Read what an opened file holds that is compressed by zstd; reading has the limits of ``open_unpacked``."""
+    from backports import zstd
+
+    limited = _Limited(zstd.open(file, "rb"), file, os.fstat(file.fileno()).st_size, is_text=False)
+    return cast("BinaryIO", io.BufferedReader(limited, _BUFFER_BYTES))
+
+
 class _Limited(io.RawIOBase):
     """Bytes of an unpacking stream, up to the limits for a compressed file of ``size`` bytes."""
 
-    def __init__(self, stream: io.BufferedIOBase, file: BinaryIO, size: int) -> None:
+    def __init__(self, stream: Any, file: BinaryIO, size: int, *, is_text: bool = True) -> None:
         self._stream, self._file, self._size = stream, file, size
-        self._unpacked, self._lines_left = 0, MOST_LINES + size
+        self._unpacked, self._lines_left = 0, MOST_LINES + size if is_text else 1 << 63
 
     def readable(self) -> bool:
         return True

@@ -10,7 +10,7 @@ from contextlib import closing
 from functools import cache
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 from urllib.parse import quote
 
 from fcslam.config import parse_yaml
@@ -23,6 +23,7 @@ from fcslam.untrusted import (
     longest_value,
     most_unpacked,
     open_database,
+    open_zstd,
     read_text,
     step_counter,
     unpack,
@@ -30,7 +31,6 @@ from fcslam.untrusted import (
 
 METADATA: Final = "metadata.yaml"
 _MOST_METADATA_BYTES: Final = 1 << 20
-_COPY_BYTES: Final = 1 << 20
 
 
 def ros1_reader(path: Path) -> Any:
@@ -138,7 +138,7 @@ def _limit_rosbags() -> None:
 
     ros1.decompressors |= {kind: _whole(kind) for kind in ("bz2", "lz4")}
     storage_mcap.DECOMPRESSORS |= {kind: _stated(kind) for kind in ("lz4", "zstd")}
-    setattr(folders, "zstd", SimpleNamespace(decompress=_whole("zstd"), open=_Unpacking))  # noqa: B010
+    setattr(folders, "zstd", SimpleNamespace(decompress=_whole("zstd"), open=lambda file, _: open_zstd(file)))  # noqa: B010
     modules: Collection[ModuleType] = (folders, storage_mcap, storage_sqlite3)
     for module in modules:
         setattr(module, "parse_qos", lambda _: [])  # noqa: B010
@@ -161,27 +161,3 @@ def _limit_database(connection: Any) -> None:
     connection.config(apsw.SQLITE_DBCONFIG_TRUSTED_SCHEMA, 0)
     connection.limit(apsw.SQLITE_LIMIT_LENGTH, longest_value(size))
     connection.set_progress_handler(step_counter(size), STEPS)
-
-
-class _Unpacking:
-    """A compressed file of a folder, as ``zstd.open`` gives it, up to the limit for its size."""
-
-    def __init__(self, file: BinaryIO, _: str) -> None:
-        from backports import zstd
-
-        self._file = zstd.open(file, "rb")
-        self._most = self._left = most_unpacked(os.fstat(file.fileno()).st_size, MOST_STREAM_RATIO)
-
-    def __enter__(self) -> "_Unpacking":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def read(self, count: int = _COPY_BYTES) -> bytes:
-        """The next bytes."""
-        content: bytes = self._file.read(count)
-        self._left -= len(content)
-        if self._left < 0:
-            raise LimitError(f"a file unpacks to more than {self._most / 1e6:.0f} MB, the limit for its size")
-        return content
