@@ -213,8 +213,9 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
                 check_edit(content)
                 store.check_named(content)
                 edits.append(store.edit(content, author, time_s))
-            with replacing(path) as unfinished:
-                store.export(unfinished)
+            with TemporaryDirectory() as place, replacing(path) as unfinished:
+                store.export(Path(place) / MISSION)  # an export has an unfinished file of its own beside it
+                shutil.copyfile(Path(place) / MISSION, unfinished)
         return edits
     except StoreError as error:
         raise SourceError(str(error)) from error
