@@ -100,5 +100,15 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
         load(MissionConfig, path)
 
 
-def test_yaml_may_merge_mappings():
-    assert parse_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}\n")["b"] == {"x": 1, "y": 2}
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a: &a {x: 1}\nb: *a\n", "aliases"),
+        ("a: {<<: {x: 1}}\n", "merge keys"),
+        ("a: 0b" + "1" * 5000, "a number of 5002 characters"),
+        ("a: " + "x" * 300_000, "the limit is"),
+    ],
+)
+def test_yaml_that_expands_is_refused(text, reason):
+    with pytest.raises(ValueError, match=reason):
+        parse_yaml(text)

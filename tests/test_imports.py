@@ -16,6 +16,7 @@ PACKAGE = Path(__file__).parents[1] / "src" / "fcslam"
 # From the ground up. A room may import itself and every room that stands before it.
 ROOMS = [
     "errors",
+    "untrusted",
     "compiled",
     "processes",
     "records",

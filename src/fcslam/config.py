@@ -10,9 +10,12 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fcslam.errors import ConfigError, printable
+from fcslam.untrusted import MOST_TEXT_BYTES, read_text
 
 LONGEST_QUOTE: Final = 300
 """Longer texts from a file are cut in messages."""
+_LONGEST_NUMBER: Final = 100
+"""Characters of a number in YAML. Python converts long integers slowly, and back to text not at all."""
 
 
 class Settings(BaseModel):
@@ -31,7 +34,7 @@ def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None)
         ConfigError: the file cannot be read, is not a mapping, or has an unknown key or a wrong value.
     """
     try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
+        content = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
     except ValueError as error:
@@ -117,26 +120,47 @@ def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(model.model_fields)}"
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """Refuses a mapping that has a key twice: YAML forbids it, and the second value would win without a word."""
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses aliases and merge keys, with which a short text expands without end, and a mapping with a key twice.
+
+    YAML forbids the latter, and the second value would win without a word.
+    """
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """As of a SafeLoader."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.constructor.ConstructorError(None, None, "aliases are not read", self.peek_event().start_mark)  # type: ignore[no-untyped-call]
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """As of a SafeLoader."""
         keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         twice = next((key for key, count in Counter(keys).items() if count > 1), None)
-        if twice is not None and twice[1] != "<<":
+        if any(tag == "tag:yaml.org,2002:merge" for tag, _ in keys):
+            raise yaml.constructor.ConstructorError(None, None, "merge keys (<<) are not read", node.start_mark)
+        if twice is not None:
             raise yaml.constructor.ConstructorError(None, None, f"the key '{twice[1]}' is there twice", node.start_mark)
         return super().construct_mapping(node, deep)
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """As of a SafeLoader."""
+        if node.tag.endswith((":int", ":float")) and len(node.value) > _LONGEST_NUMBER:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"a number of {len(node.value)} characters; the limit is {_LONGEST_NUMBER}", node.start_mark
+            )
+        return super().construct_object(node, deep)
 
-def parse_yaml(text: str | bytes) -> Any:
+
+def parse_yaml(text: str | bytes, most: int = MOST_TEXT_BYTES) -> Any:
     """Content of YAML text of unknown origin.
 
     Raises:
-        ValueError: it is not valid YAML; the message is one line.
+        ValueError: it is longer than ``most``, or not valid YAML; the message is one line.
     """
+    if len(text) > most:
+        raise ValueError(f"{len(text)} characters of YAML; the limit is {most}")
     try:
-        return yaml.load(text, _UniqueKeys)
+        return yaml.load(text, _PlainLoader)
     except Exception as error:  # beside its own errors, those of its constructors: recursion, dates, numbers, ...
         raise ValueError(f"not valid YAML ({one_line(str(error))})") from error
 

@@ -28,6 +28,7 @@ from fcslam.runs.map_files import map_stem, map_yaml, parse_map, pgm_bytes
 from fcslam.runs.ros_map import parse_ros_map
 from fcslam.runs.tables import read_robots
 from fcslam.sources import Source
+from fcslam.untrusted import read_bytes
 
 MAP_YAML: Final = "map.yaml"
 """The first map of a run folder."""
@@ -242,8 +243,4 @@ def _mission_map(path: Path, floor: str) -> OccupancyMap:
 
 
 def _content(path: Path) -> bytes:
-    with path.open("rb") as file:
-        content = file.read(LARGEST_FILE + 1)
-    if len(content) > LARGEST_FILE:
-        raise SourceError(f"{path}: larger than {LARGEST_FILE >> 20} MiB")
-    return content
+    return read_bytes(path, most=LARGEST_FILE)

@@ -31,7 +31,8 @@ from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing
 from fcslam.storage.own_files import read_own
 from fcslam.storage.state_file import State, code_version, parse_state, state_bytes
-from fcslam.wire.packets import SizedPacket, decode
+from fcslam.untrusted import LimitError, check_unpacked, open_file, read_bytes
+from fcslam.wire.packets import SizedPacket, decode, unpacked_size
 
 _log = logging.getLogger(__name__)
 
@@ -109,9 +110,13 @@ def read_mission(path: Path) -> SavedMission:
         with opened_copy(path) as store:
             mission = replace(_read(store), state=_state_beside(path))
         if mission.state is None:
+            check_unpacked(
+                sum(len(packet.data) for packet in mission.stored),
+                sum(unpacked_size(packet.data) for packet in mission.stored),
+            )
             _ = mission.packets  # beside a state that fits the file, this program has decoded them all before
         return mission
-    except PacketError as error:
+    except (PacketError, LimitError) as error:
         raise SourceError(f"{path}: {error}") from error
     except StoreError as error:
         raise SourceError(str(error)) from error
@@ -128,8 +133,8 @@ def opened_copy(path: Path | None) -> Iterator[MissionStore]:
         copy = Path(place) / MISSION
         if path is not None:
             check_mission(path)
-            with translate_errors(path):
-                shutil.copyfile(path, copy)
+            with translate_errors(path), open_file(path) as file, copy.open("wb") as copied:
+                shutil.copyfileobj(file, copied)
         with closing(MissionStore(copy)) as store:
             yield store
 
@@ -149,7 +154,7 @@ def _state_beside(path: Path) -> State | None:
         _log.info("%s: is not of this user, or was changed; all packets take effect again", place)
         return None
     try:
-        return parse_state(place, data, _fits(path.read_bytes()))
+        return parse_state(place, data, _fits(read_bytes(path)))
     except InputError as error:
         _log.info("%s; all packets take effect again", error)
         return None
@@ -208,8 +213,9 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
                 check_edit(content)
                 store.check_named(content)
                 edits.append(store.edit(content, author, time_s))
-            with replacing(path) as unfinished:
-                store.export(unfinished)
+            with TemporaryDirectory() as place, replacing(path) as unfinished:
+                store.export(Path(place) / MISSION)  # an export has an unfinished file of its own beside it
+                shutil.copyfile(Path(place) / MISSION, unfinished)
         return edits
     except StoreError as error:
         raise SourceError(str(error)) from error

@@ -16,10 +16,11 @@ from fcslam.federated.client import RobotClient, robot_seed, secret_noise, seede
 from fcslam.federated.networks import network_to_weights, weights_to_network, weights_version  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
-from fcslam.learning.arrays import read_arrays, write_arrays  # noqa: E402
+from fcslam.learning.arrays import write_arrays  # noqa: E402
 from fcslam.learning.local_training import layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, VotedImage  # noqa: E402
+from fcslam.untrusted import read_arrays  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from rosbags import rosbag1, rosbag2
 from fcslam.errors import SourceError
 from fcslam.sources import open_source
 from fcslam.sources.bags.mcap_records import CHUNK, mcap_records
-from fcslam.sources.bags.sequential import unpacked
+from fcslam.untrusted import unpack
 from tests.sources.bag_messages import drive, save
 from tests.sources.carmen_text import scans_of
 
@@ -193,8 +193,8 @@ def test_a_chunk_that_would_fill_the_memory_ends_the_reading(tmp_path):
 def test_unpacking_ends_at_the_limit(compression):
     packers = {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}
     packed = packers[compression](bytes(5_000_000))
-    assert len(unpacked(packed, compression, 1_000_000)) == 1_000_000
-    assert unpacked(packed, compression, 9_000_000) == bytes(5_000_000)
+    assert len(unpack(packed, compression, 1_000_000)) == 1_000_000
+    assert unpack(packed, compression, 9_000_000) == bytes(5_000_000)
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ def test_a_pipe_is_refused_because_it_can_be_read_only_once(tmp_path):
     pipe = tmp_path / "run.clf"
     os.mkfifo(pipe)
     assert "is a pipe or device" in refusal(pipe)
-    assert "empty" in refusal(Path(os.devnull))
+    assert "is a pipe or device" in refusal(Path(os.devnull))
 
 
 @pytest.mark.parametrize("reason", ["name too long", "denied"])

@@ -7,6 +7,7 @@ from pydantic import Field
 
 from fcslam.config import Settings, one_line, parse, parse_yaml
 from fcslam.errors import ConfigError
+from fcslam.untrusted import MOST_TEXT_BYTES, read_text
 
 _PARAMETERS = "ros__parameters"
 
@@ -36,7 +37,7 @@ def load_parameters(path: Path | None) -> NodeParameters:
     if path is None:
         return NodeParameters()
     try:
-        content: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        content: Any = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read ({one_line(str(error))})") from error
     if not isinstance(content, dict):

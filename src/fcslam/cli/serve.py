@@ -141,7 +141,9 @@ def serve(
             from fcslam.federated.relay import learning_router
 
             routers.append(learning_router(state, stack.enter_context(learning_beside(plan, state))))
-        app = create_app(state, routers, local_names=is_open, named=None if store is None else NAMED)
+        app = create_app(
+            state, routers, local_names=tokens is None and client_ca is None, named=None if store is None else NAMED
+        )
         server = _server(app, tls_certificate, tls_key, client_ca, state.close)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
@@ -153,6 +155,7 @@ def serve(
 def _server(
     app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None, on_exit: "Callable[[], None]"
 ) -> "uvicorn.Server":
+    import os
     import ssl
 
     import uvicorn
@@ -168,7 +171,9 @@ def _server(
             ssl_keyfile=key,
             ssl_ca_certs=None if client_ca is None else str(client_ca),
             ssl_cert_reqs=ssl.CERT_NONE if client_ca is None else ssl.CERT_OPTIONAL,
-            log_level="warning",
+            backlog=512,
+            log_level="error",  # a line for each request that is no HTTP would fill the disk
+            proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,  # else any program of this machine names the client
             ws="none",
             server_header=False,
             timeout_graceful_shutdown=10,

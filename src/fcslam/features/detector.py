@@ -23,6 +23,7 @@ from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_codes, sample_logits
 from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.records import CODE_BYTES, NAME, Codes, frozen
+from fcslam.untrusted import check_image, read_bytes
 
 NETWORK_FORMAT: Final = "1"
 """Format of networks that this version of fcslam reads."""
@@ -198,13 +199,15 @@ class OnnxDetector:
 
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
-    """Decode an image file to 8-bit grey levels (H, W), ignoring its EXIF orientation; None if it is broken.
+    """Decode an image file to 8-bit grey levels (H, W), ignoring its EXIF orientation; None if it is broken or would
+    fill the memory.
 
     Colours are weighted as in ITU-R BT.601, transparency is ignored, and 16-bit values keep their upper 8 bits.
     """
     try:
+        check_image(encoded)
         decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # for example, no bytes at all
+    except (OSError, ValueError, cv2.error):
         return None
     return None if decoded is None else np.asarray(decoded, np.uint8)
 
@@ -212,7 +215,7 @@ def decode_grey(encoded: bytes) -> GreyImage | None:
 def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     """An ONNX Runtime session and the metadata of the file."""
     try:
-        content = path.read_bytes()
+        content = read_bytes(path)
     except OSError as error:
         raise FeatureError(f"{path}: cannot read the network weights ({error}); name an .onnx file") from error
 

@@ -5,7 +5,9 @@ from pathlib import Path
 
 from fcslam.errors import FeatureError
 from fcslam.features.detector import NETWORK_FORMAT, FeatureDetector, OnnxConfig, OnnxDetector
+from fcslam.features.network_check import check_network
 from fcslam.records import Channel, DetectorFile
+from fcslam.untrusted import read_bytes
 
 
 def describe_detector_file(path: Path) -> DetectorFile:
@@ -14,6 +16,7 @@ def describe_detector_file(path: Path) -> DetectorFile:
     Raises:
         FeatureError: the file is not a usable network.
     """
+    check_network(path)
     version = OnnxDetector(OnnxConfig(weights=path)).version
     content = _read(path)
     digest = hashlib.sha256(content).digest()
@@ -31,6 +34,7 @@ def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> Fe
     content = _read(path)
     if len(content) != file.size or hashlib.sha256(content).digest() != file.sha256:
         raise FeatureError(f"{path}: is not the file that was announced as {file.version}; fetch it again")
+    check_network(path)
     detector = OnnxDetector(config.model_copy(update={"weights": path}))
     if detector.version != file.version:
         raise FeatureError(f"{path}: holds detector {detector.version}, but was announced as {file.version}")
@@ -39,6 +43,6 @@ def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> Fe
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except OSError as error:
         raise FeatureError(f"{path}: cannot be read ({error}); fetch it again") from error

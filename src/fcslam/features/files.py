@@ -4,7 +4,6 @@ Arrays: ``keypoints`` (N, 2) float32, x y in pixels of the image, (0, 0) the cen
 float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), width and height.
 """
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from fcslam.features.detector import GreyImage, ImageFeatures, decode_grey
 from fcslam.records import CODE_BYTES, frozen
 from fcslam.sources.images import MAX_SIDE_PX, image_size
 from fcslam.storage.files import replacing
+from fcslam.untrusted import read_arrays, read_bytes
 
 _ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
 
@@ -28,11 +28,11 @@ def read_grey(path: Path) -> GreyImage:
         FeatureError: the file cannot be read, is not an image, or is too large.
     """
     try:
-        encoded = path.read_bytes() if path.stat().st_size <= MOST_IMAGE_BYTES else None
+        encoded = read_bytes(path, most=MOST_IMAGE_BYTES)
     except OSError as error:
         raise FeatureError(f"{path}: cannot be read ({error})") from error
-    if encoded is None or _longer_side(encoded) > MAX_SIDE_PX:
-        raise FeatureError(f"{path}: an image has at most {MAX_SIDE_PX} pixels a side and {MOST_IMAGE_BYTES} bytes")
+    if _longer_side(encoded) > MAX_SIDE_PX:
+        raise FeatureError(f"{path}: an image has at most {MAX_SIDE_PX} pixels a side")
     image = decode_grey(encoded)
     if image is None or not image.size:
         raise FeatureError(f"{path}: no image that can be read; give JPEG, PNG, PPM or TIFF")
@@ -65,9 +65,9 @@ def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
         FeatureError: the file cannot be read, or is not of this format.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            keypoints, scores, descriptors, size = (archive[name] for name in _ARRAYS)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        archive = read_arrays(path)
+        keypoints, scores, descriptors, size = (archive[name] for name in _ARRAYS)
+    except (OSError, ValueError, KeyError) as error:
         raise FeatureError(f"{path}: cannot read the features ({error}); write {', '.join(_ARRAYS)}") from error
     count = len(scores) if scores.ndim == 1 else -1
     shapes = (keypoints.shape, descriptors.shape, size.shape)

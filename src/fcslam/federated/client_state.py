@@ -15,7 +15,8 @@ from torch import Tensor
 
 from fcslam.errors import TrainingError
 from fcslam.federated.weights import Weights
-from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.arrays import write_arrays
+from fcslam.untrusted import read_arrays
 
 
 def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights) -> Weights:

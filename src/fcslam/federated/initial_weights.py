@@ -13,11 +13,12 @@ from fcslam.federated.networks import network_to_weights, weights_to_network, we
 from fcslam.federated.onnx_weights import SUFFIX, read_onnx_weights, with_batch_statistics
 from fcslam.federated.public_images import calibration_images
 from fcslam.federated.settings import FederatedSettings
-from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.arrays import write_arrays
 from fcslam.learning.checkpoint import read_checkpoint
 from fcslam.learning.settings import Encoder
 from fcslam.learning.stages import StageCallback, train_on_shapes
 from fcslam.learning.trainer import ExecutionOptions
+from fcslam.untrusted import read_arrays
 
 GROUPS: Final = ("best/", "average/")
 """Prefixes of the trained weights in checkpoints of federated and of central training."""

@@ -13,8 +13,9 @@ from typing import Final
 
 from fcslam.errors import OutputError, TrainingError
 from fcslam.federated.weights import Weights
-from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.arrays import write_arrays
 from fcslam.storage.files import write_file
+from fcslam.untrusted import read_arrays
 
 INDEX: Final = "releases.json"
 

@@ -12,15 +12,12 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, cast
 
 import numpy as np
 
 from fcslam.errors import InputError
 from fcslam.graph.pose_graph import Edge, PoseGraph
-
-_MAXIMUM_BYTES = 1 << 30
-"""Largest unpacked file, against gzip bombs."""
+from fcslam.untrusted import open_unpacked
 
 _MAXIMUM_LINE = 4096
 
@@ -104,12 +101,10 @@ def _text(numbers: list[float]) -> str:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    total = 0
     try:
-        with cast(IO[bytes], gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb")) as file:
+        with open_unpacked(path) as file:
             for number, line in enumerate(iter(lambda: file.readline(_MAXIMUM_LINE + 1), b""), start=1):
-                total += len(line)
-                if len(line) > _MAXIMUM_LINE or total > _MAXIMUM_BYTES:
+                if len(line) > _MAXIMUM_LINE:
                     raise InputError(f"{path}: line {number}: too long for a pose graph")
                 yield number, line.decode("ascii")
     except (OSError, EOFError, zlib.error) as error:

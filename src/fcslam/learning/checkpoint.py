@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import OutputError, TrainingError
-from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.arrays import write_arrays
+from fcslam.untrusted import read_arrays
 
 FORMAT = 1
 """Version of the file format."""

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fcslam.errors import TrainingError
-from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.arrays import write_arrays
+from fcslam.untrusted import read_arrays
 
 SAME_POINT_PX: Final = 3.0
 """Points of two detectors that are closer than this are the same point."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fcslam.runs.folder import identity
 from fcslam.runs.map_files import PIXELS, Occupancy, parse_image, pixels_of
+from fcslam.untrusted import read_bytes, read_text
 
 WORLD_M = 512.0
 """Side of a tile at zoom 0; each zoom halves it."""
@@ -87,7 +88,7 @@ def _pyramid(folder: Path, stem: str) -> _Pyramid:
 
 
 def _read(folder: Path, stem: str) -> _Pyramid:
-    pgm, description = (folder / f"{stem}.pgm").read_bytes(), (folder / f"{stem}.yaml").read_text(encoding="utf-8")
+    pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
     image = parse_image(stem, pgm, description)
     levels: list[NDArray[np.uint8]] = [cv2.LUT(image.pixels, pixels_of(image.meaning))]
     for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / image.resolution_m, 1.0)))):

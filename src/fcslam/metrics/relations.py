@@ -5,7 +5,7 @@ pose of the robot (``base``, not the laser) at one stamp relative to its pose at
 coordinate frame and no alignment.
 """
 
-import gzip
+import io
 import lzma
 import zlib
 from collections.abc import Iterable
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
+from fcslam.untrusted import open_unpacked
 
 STAMP_TOLERANCE_S = 5.5e-6
 """Largest difference of equal stamps: half a unit of the fifth decimal, the last of some files, plus rounding."""
@@ -26,7 +27,6 @@ ACROSS_ROBOTS_GAP_S = 20.0
 """Shortest time span of a relation across robots. Shorter ones, across a cut in a log, would measure odometry."""
 
 _COLUMNS = "stamp1 stamp2 x y z roll pitch yaw"
-_OPENERS = {".gz": gzip.open, ".xz": lzma.open}
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,9 +191,8 @@ def read_relations(path: Path) -> Relations:
     Raises:
         EvaluationError: the file cannot be read, has no relation, or a line is not eight finite numbers.
     """
-    opener = _OPENERS.get(path.suffix, open)
     try:
-        with opener(path, "rt", encoding="utf-8") as lines:  # type: ignore[operator]
+        with open_unpacked(path) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
     except (OSError, EOFError, UnicodeDecodeError, zlib.error, lzma.LZMAError) as error:
         raise EvaluationError(f"{path}: cannot read the relations ({error})") from error

@@ -27,6 +27,7 @@ from fcslam.service.summaries import (
     run_of,
 )
 from fcslam.service.viewed_mission import ViewedMission
+from fcslam.untrusted import read_text
 
 MOST_CLOSURES = 5000
 """Largest number of closures of each status that the page asks for."""
@@ -68,7 +69,7 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
     located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
     if mission.run_folder is not None:
         for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):
-            texts[path] = (mission.run_folder / unquote(path)).read_text(encoding="utf-8")
+            texts[path] = read_text(mission.run_folder / unquote(path), mission.run_folder)
     return texts
 
 

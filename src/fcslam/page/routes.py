@@ -1,9 +1,10 @@
 """The files of the page. They hold no data of a mission, so nobody needs a token for them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from hashlib import sha256
 
-from fastapi import APIRouter
-from fastapi.responses import FileResponse
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
 
 from fcslam.page import ASSETS
 
@@ -40,12 +41,17 @@ def documentation_router() -> APIRouter:
 def _router(files: Mapping[str, tuple[str, str]]) -> APIRouter:
     router = APIRouter(include_in_schema=False)
     for path, (name, media_type) in files.items():
-        router.add_api_route(path, _sender(name, media_type), methods=["GET"])
+        router.add_api_route(path, _sender(name, media_type), methods=["GET"], response_class=Response)
     return router
 
 
-def _sender(name: str, media_type: str) -> Callable[[], FileResponse]:
-    def send() -> FileResponse:
-        return FileResponse(ASSETS / name, media_type=media_type, headers=HEADERS)
+def _sender(name: str, media_type: str) -> Callable[[Request], Awaitable[Response]]:
+    content = (ASSETS / name).read_bytes()
+    headers = {**HEADERS, "ETag": f'"{sha256(content).hexdigest()}"'}
+
+    async def send(request: Request) -> Response:
+        if request.headers.get("if-none-match") == headers["ETag"]:
+            return Response(status_code=304, headers=headers)
+        return Response(content, media_type=media_type, headers=headers)
 
     return send

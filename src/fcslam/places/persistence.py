@@ -5,7 +5,6 @@ numbers, the seed and the data of the last training, so a loaded index behaves e
 """
 
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +22,7 @@ from fcslam.places.vocabulary import Training, TreeState, VocabularyConfig
 from fcslam.records import Codes
 from fcslam.storage.files import replacing
 from fcslam.storage.state_file import State
+from fcslam.untrusted import read_arrays
 
 FORMAT = "fcslam place index 1"
 
@@ -122,13 +122,11 @@ def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_versio
         InputError: the file cannot be read, is damaged, or holds descriptors of another version.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in _SHAPES}
+        archive = read_arrays(path)
+        arrays = {name: archive[name] for name in _SHAPES}
         about = json.loads(arrays.pop("about").tobytes())
         state = _state(arrays, about, place_id)
-    except (
-        OSError, ValueError, KeyError, EOFError, TypeError, RecursionError, zipfile.BadZipFile, InputError
-    ) as error:  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, InputError) as error:
         raise InputError(f"{path}: not a readable place index ({_one_line(error)}); build it again") from error
     if descriptor_version not in ("", state.descriptor_version):
         raise InputError(

@@ -7,7 +7,6 @@ words as one whose descriptors are centres. It retrieves and matches them as any
 
 import hashlib
 import io
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,10 +21,9 @@ from fcslam.features.codes import code_words, nearest_codes
 from fcslam.places.kmeans_tree import TreeShape, k_means
 from fcslam.records import CODE_BYTES, NAME, Channel, Codes, frozen
 from fcslam.storage.files import write_file
+from fcslam.untrusted import Arrays, read_arrays
 
 MOST_WORDS: Final = 65536
-_MOST_BYTES: Final = 2 * (MOST_WORDS * CODE_BYTES + 4096)
-"""Largest size of a file: all words of two channels, and their names."""
 _ITERATIONS: Final = 8
 _DIGITS: Final = 12
 
@@ -114,24 +112,11 @@ def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
         InputError: the file cannot be read, or is not one.
     """
     try:
-        if not path.is_file():  # a pipe would be waited for
-            raise ValueError("no such file" if not path.exists() else "not a file")
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"more than {_MOST_BYTES} bytes")
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-            found = tuple(_read(archive, channel) for channel in Channel if f"{channel}.centres" in archive)
+        archive = read_arrays(path)
+        found = tuple(_read(archive, channel) for channel in Channel if f"{channel}.centres" in archive)
         if not found:
             raise ValueError("it holds no words")
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        TypeError,
-        zipfile.BadZipFile,
-        NotImplementedError,
-        MemoryError,
-    ) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"{path}: not a readable vocabulary ({reason}); `fcslam vocabulary RUN -o FILE` writes one"
@@ -139,12 +124,8 @@ def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
     return found
 
 
-def _read(archive: np.lib.npyio.NpzFile, channel: Channel) -> WordVocabulary:
-    assert archive.zip is not None, "it is open"
-    members = {name: archive.zip.getinfo(f"{channel}.{name}.npy") for name in ("centres", "version")}
-    if any(member.file_size > _MOST_BYTES for member in members.values()):
-        raise ValueError("an array is too large")
-    centres, version = (archive[f"{channel}.{name}"] for name in members)
+def _read(archive: Arrays, channel: Channel) -> WordVocabulary:
+    centres, version = archive[f"{channel}.centres"], archive[f"{channel}.version"]
     if centres.dtype != np.uint8 or centres.ndim != 2 or centres.shape[1] != CODE_BYTES:
         raise ValueError(f"centres are {centres.shape} {centres.dtype}")
     if not 0 < len(centres) <= MOST_WORDS:

@@ -42,6 +42,7 @@ from fcslam.runs.tables import (
 from fcslam.runs.trajectories import read_tum, write_tum
 from fcslam.storage.files import bring_back, replacing_folder
 from fcslam.storage.own_files import write_own
+from fcslam.untrusted import read_bytes, read_text
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
 LOCALIZATION, MISSION, STATE = "localization", "mission.fcslam", "mission.state"
@@ -181,17 +182,17 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
             f"{path}: no run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
         )
     try:
-        robots = read_robots(path / ROBOTS)
+        robots = read_robots(path / ROBOTS, path)
         return Run(
             trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
-            closures=read_closures(path / CLOSURES),
-            metrics=read_metrics(path / METRICS),
-            config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
-            pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
-            map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*")) if maps},
-            local_maps=_read_local_maps(path / LOCAL, robots) if maps else {},
-            mission=(path / MISSION).read_bytes() if maps and (path / MISSION).exists() else b"",
-            localized={file.stem: read_localized(file) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
+            closures=read_closures(path / CLOSURES, path),
+            metrics=read_metrics(path / METRICS, path),
+            config_yaml=read_text(path / CONFIG, path),
+            pose_graph_g2o=read_text(path / POSE_GRAPH, path),
+            map_files={file.name: read_bytes(file, path) for file in sorted(path.glob("map*.*")) if maps},
+            local_maps=_read_local_maps(path, robots) if maps else {},
+            mission=read_bytes(path / MISSION, path) if maps and (path / MISSION).exists() else b"",
+            localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
@@ -238,7 +239,7 @@ def _tum_path(folder: Path, robot: str) -> Path:
 def _read_trajectory(folder: Path, robot: str, map_index: int, floor: str) -> RobotTrajectory:
     if not _SAFE_NAME.fullmatch(robot):
         raise ValueError(f"{ROBOTS}: {robot!r} is not a robot's name")
-    stamps, poses = read_tum(_tum_path(folder, robot))
+    stamps, poses = read_tum(_tum_path(folder, robot), folder)
     return RobotTrajectory(robot, map_index, stamps, poses, floor)
 
 
@@ -248,11 +249,12 @@ def _write_local_map(folder: Path, local: LocalMap) -> None:
     (folder / f"{local.robot}.yaml").write_text(local.yaml, encoding="utf-8")
 
 
-def _read_local_maps(folder: Path, robots: Iterable[str]) -> dict[str, LocalMap]:
-    return {robot: _read_local_map(folder, robot) for robot in robots} if folder.exists() else {}
+def _read_local_maps(run: Path, robots: Iterable[str]) -> dict[str, LocalMap]:
+    return {robot: _read_local_map(run, robot) for robot in robots} if (run / LOCAL).exists() else {}
 
 
-def _read_local_map(folder: Path, robot: str) -> LocalMap:
-    stamps, poses = read_tum(folder / f"{robot}.tum")
-    pgm, yaml = (folder / f"{robot}.pgm").read_bytes(), (folder / f"{robot}.yaml").read_text(encoding="utf-8")
+def _read_local_map(run: Path, robot: str) -> LocalMap:
+    folder = run / LOCAL
+    stamps, poses = read_tum(folder / f"{robot}.tum", run)
+    pgm, yaml = read_bytes(folder / f"{robot}.pgm", run), read_text(folder / f"{robot}.yaml", run)
     return LocalMap(robot, stamps, poses, pgm, yaml)

@@ -23,6 +23,10 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*([1-9]\d{0,6})\s+([1-9]
 """Width, height; other programs write a comment after the first line."""
 
 
+FINEST_M: Final = 1e-4
+COARSEST_M: Final = 1e3
+FARTHEST_M: Final = 1e8
+"""Limits of a map's cells and origin."""
 HEADER_BYTES: Final = 4096
 """Largest header of an image: longer comments are not read."""
 
@@ -178,11 +182,24 @@ def _described(description: str) -> tuple[float, tuple[float, float], float, flo
     if not isinstance(origin, list) or len(origin) != 3:
         raise ValueError("`origin` in the description must be [x, y, theta]")
     x, y, theta = (number_in({"origin": value}, "origin") for value in origin)
-    if not (resolution_m > 0.0 and 0.0 <= free <= occupied <= 1.0):
-        raise ValueError("the description needs `resolution` > 0 and 0 <= `free_thresh` <= `occupied_thresh` <= 1")
+    check_place(resolution_m, x, y)
+    if not 0.0 <= free <= occupied <= 1.0:
+        raise ValueError("the description needs 0 <= `free_thresh` <= `occupied_thresh` <= 1")
     if content.get("negate", 0) or content.get("mode", "trinary") != "trinary" or theta != 0.0:
         raise ValueError("the description needs `negate` 0, `mode` trinary and a theta of 0 in `origin`")
     return resolution_m, (x, y), occupied, free
+
+
+def check_place(resolution_m: float, x: float, y: float) -> None:
+    """Check resolution and origin of a map: far off, its cells have no finite size or place.
+
+    Raises:
+        ValueError: one is out of range.
+    """
+    if not FINEST_M <= resolution_m <= COARSEST_M:
+        raise ValueError(f"`resolution` is {resolution_m:g}; give the side of a cell, {FINEST_M:g} to {COARSEST_M:g} m")
+    if max(abs(x), abs(y)) > FARTHEST_M:
+        raise ValueError(f"`origin` is ({x:g}, {y:g}); its limit is {FARTHEST_M:g} m")
 
 
 def number_in(description: Mapping[str, object], key: str) -> float:

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from fcslam.config import one_line, parse_yaml
 from fcslam.errors import EvaluationError
 from fcslam.records import frozen
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, number_in
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, check_place, number_in
+from fcslam.untrusted import check_image
 
 _MODES: Final = ("trinary", "scale", "raw")
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
 _PGM: Final = re.compile(rb"P([25])(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+([1-9]\d{0,4})\s")
 _MOST_PIXELS: Final = 1 << 28
-"""Largest number of pixels of a PNG, which can be small and fill the memory; cells of 2.5 cm over 400 m."""
+"""Largest number of cells of a map that is turned: cells of 2.5 cm over 400 m."""
 _PERCENT: Final = 100
 _ROUNDING: Final = 1e-6
 """Share of a cell by which a map that is turned by a right angle may seem wider."""
@@ -47,7 +47,7 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
     """
     try:
         return _map(image, description)
-    except (ValueError, cv2.error) as error:
+    except (OSError, ValueError, cv2.error) as error:
         raise EvaluationError(f"{name}: no map of map_server: {one_line(str(error))}") from error
 
 
@@ -62,8 +62,7 @@ def _map(image: bytes, description: str) -> OccupancyMap:
     if not isinstance(origin, list) or len(origin) != 3:
         raise ValueError("`origin` in the description must be [x, y, theta]")
     x, y, yaw = (number_in({"origin": value}, "origin") for value in origin)
-    if not resolution_m > 0.0:
-        raise ValueError(f"`resolution` is {resolution_m:g}; give the side of a cell in metres")
+    check_place(resolution_m, x, y)
     grey, opaque = _decoded(image)
     occupancy = _occupancy(mode, negate=number_in({"negate": 0, **content}, "negate") != 0.0)
     by_grey = np.full(256, Occupancy.UNKNOWN, np.uint8)
@@ -84,10 +83,7 @@ def _map(image: bytes, description: str) -> OccupancyMap:
 
 def _decoded(image: bytes) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Grey values and which pixels are opaque, each (H, W); None if all are."""
-    if image.startswith(_PNG):
-        width, height = (int.from_bytes(image[at : at + 4], "big") for at in (16, 20))
-        if width * height > _MOST_PIXELS:
-            raise ValueError(f"the image has {width} x {height} pixels, which would fill the memory; crop the map")
+    check_image(image)
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) if image else None

@@ -1,6 +1,7 @@
 """The tables of a run folder: robots, closures, metrics; and lists of vetoes, which are lines of a closure table."""
 
 import csv
+import io
 import json
 import math
 from collections.abc import Iterable
@@ -12,6 +13,7 @@ import numpy as np
 from fcslam.errors import ConfigError
 from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, Veto, frozen
 from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTrajectory
+from fcslam.untrusted import read_text
 
 _Value = TypeVar("_Value")
 
@@ -31,13 +33,13 @@ def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
     _write_csv(path, columns, (_robot_fields(robot)[: len(columns)] for robot in robots))
 
 
-def read_robots(path: Path) -> dict[str, tuple[int, str]]:
-    """Map index and floor by robot, in the order of robots.csv.
+def read_robots(path: Path, within: Path | None = None) -> dict[str, tuple[int, str]]:
+    """Map index and floor by robot, in the order of robots.csv; ``within``: see ``untrusted.open_file``.
 
     Raises:
         ValueError: a column is missing, a map index or a floor is none, or a robot occurs twice.
     """
-    rows = _read_csv(path, _ROBOT_COLUMNS)
+    rows = _read_csv(path, _ROBOT_COLUMNS, within)
     return _unique(path.name, ((row["robot"], (int(row["map"]), _floor(row.get(_FLOOR) or ""))) for row in rows))
 
 
@@ -52,13 +54,13 @@ def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
     _write_csv(path, _CLOSURE_COLUMNS, map(_closure_fields, closures))
 
 
-def read_closures(path: Path) -> tuple[ClosureRow, ...]:
-    """Every line of closures.csv.
+def read_closures(path: Path, within: Path | None = None) -> tuple[ClosureRow, ...]:
+    """Every line of closures.csv; ``within``: see ``untrusted.open_file``.
 
     Raises:
         ValueError: a column is missing or a value is not what the column holds.
     """
-    return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS))
+    return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS, within))
 
 
 def write_localized(path: Path, poses: LocalizedPoses) -> None:
@@ -68,14 +70,15 @@ def write_localized(path: Path, poses: LocalizedPoses) -> None:
     _write_csv(path, _LOCALIZED_COLUMNS, fields)
 
 
-def read_localized(path: Path) -> LocalizedPoses:
-    """Every line of localization/<robot>.csv.
+def read_localized(path: Path, within: Path | None = None) -> LocalizedPoses:
+    """Every line of localization/<robot>.csv; ``within``: see ``untrusted.open_file``.
 
     Raises:
         ValueError: a column is missing or a value is not a number.
     """
     rows = [
-        [float(row[column] or "nan") for column in _LOCALIZED_COLUMNS] for row in _read_csv(path, _LOCALIZED_COLUMNS)
+        [float(row[column] or "nan") for column in _LOCALIZED_COLUMNS]
+        for row in _read_csv(path, _LOCALIZED_COLUMNS, within)
     ]
     table: FloatArray = frozen(np.array(rows, dtype=np.float64).reshape(-1, len(_LOCALIZED_COLUMNS)))
     return LocalizedPoses(path.stem, table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7])
@@ -117,14 +120,14 @@ def metrics_json(metrics: Iterable[Metric]) -> str:
     return json.dumps(rows, indent=2) + "\n"
 
 
-def read_metrics(path: Path) -> dict[str, Metric]:
-    """Every metric of metrics.json by its name; null is NaN.
+def read_metrics(path: Path, within: Path | None = None) -> dict[str, Metric]:
+    """Every metric of metrics.json by its name; null is NaN; ``within``: see ``untrusted.open_file``.
 
     Raises:
         ValueError: it is not a list of name, value, unit, or a name occurs twice.
     """
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
+        rows = json.loads(read_text(path, within))
         values = [math.nan if row["value"] is None else _number(row["value"]) for row in rows]
         return _unique(
             path.name, ((row["name"], Metric(row["name"], v, row["unit"])) for row, v in zip(rows, values, strict=True))
@@ -191,10 +194,9 @@ def _write_csv(path: Path, columns: list[str], rows: Iterable[list[Any]]) -> Non
         writer.writerows(rows)
 
 
-def _read_csv(path: Path, columns: list[str]) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
-        rows, heading = list(reader), list(reader.fieldnames or ())
+def _read_csv(path: Path, columns: list[str], within: Path | None = None) -> list[dict[str, str]]:
+    reader = csv.DictReader(io.StringIO(read_text(path, within), newline=""))
+    rows, heading = list(reader), list(reader.fieldnames or ())
     if not rows and not set(columns) <= set(heading):
         raise ValueError(f"{path.name}, line 1: expected the columns {', '.join(columns)}")
     for number, row in enumerate(rows, start=2):

@@ -7,6 +7,7 @@ import numpy as np
 
 from fcslam.errors import EvaluationError
 from fcslam.records import FloatArray, frozen
+from fcslam.untrusted import read_text
 
 _TUM_LINE = "%.9f %.9f %.9f 0 0 0 %.9f %.9f\n"
 
@@ -22,14 +23,14 @@ def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray)
         path.write(text)
 
 
-def read_tum(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Stamps (N,) and poses (N, 3) of a TUM file, in its order.
+def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
+    """Stamps (N,) and poses (N, 3) of a TUM file, in its order; ``within``: see ``untrusted.open_file``.
 
     Raises:
         EvaluationError: the file cannot be read or a line is not eight finite numbers.
     """
     try:
-        rows = [_tum_fields(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        rows = [_tum_fields(line) for line in read_text(path, within).splitlines() if line.strip()]
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     except (OSError, ValueError) as error:
         raise EvaluationError(f"{path}: not a TUM trajectory ({error})") from error

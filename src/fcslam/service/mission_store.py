@@ -4,7 +4,6 @@ The service writes packets, edits and requests; the worker writes results. A pac
 Packets are numbered by **arrival**. The order in which they take effect follows from it: ``cloud.packet_log``.
 """
 
-import sqlite3
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -24,6 +23,7 @@ from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction
+from fcslam.untrusted import check_unpacked, open_database, unpack
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
 from fcslam.wire.packets import Label, decode
@@ -36,8 +36,6 @@ VERSION = 7
 """Version of the schema and of the packets."""
 MOST_PACKETS = 2**53
 """No mission has as many."""
-LARGEST_TRACK = 1 << 28
-"""Largest size of one column of a session's scans, bytes."""
 NEARBY_S = 1.0
 """So far outside of a session an edit may name a moment: stamps are rounded when they are printed."""
 _AT_ONCE = 10_000
@@ -362,7 +360,18 @@ class MissionStore:
             StoreError: they are broken.
         """
         rows = self._database.rows("SELECT robot, epoch, stamps, keyscans, offsets FROM tracks", ())
-        return {(robot, epoch): _read_track(f"{robot}, epoch {epoch}", *blobs) for robot, epoch, *blobs in rows}
+        packed = unpacked = 0
+        tracks: dict[tuple[str, int], Track] = {}
+        for robot, epoch, *blobs in rows:
+            name = f"{robot}, epoch {epoch}"
+            try:
+                columns = [unpack(blob, "zlib") for blob in blobs]
+                packed, unpacked = packed + sum(map(len, blobs)), unpacked + sum(map(len, columns))
+                check_unpacked(packed, unpacked)
+                tracks[robot, epoch] = _track(*columns)
+            except (OSError, ValueError) as error:
+                raise StoreError(f"the scans of {name} are broken ({error})") from error
+        return tracks
 
     def traffic(self) -> Ledger:
         """Traffic of accepted packets by label, and of refused ones."""
@@ -419,7 +428,7 @@ def check_mission(path: Path) -> None:
     check_file(path, SCHEMA, VERSION)
     with (
         translate_errors(path),
-        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as opened,
+        closing(open_database(path)) as opened,
     ):
         labels = opened.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
         facts = dict(opened.execute("SELECT name, value FROM facts").fetchall())
@@ -499,31 +508,24 @@ def _known(database: Transaction, packets: Sequence[StoredPacket]) -> dict[tuple
     return known
 
 
-def _read_track(name: str, *blobs: bytes) -> Track:
-    try:
-        stamps, keyscans, offsets = (_inflated(blob) for blob in blobs)
-        track = Track(
-            frozen(np.frombuffer(stamps, "<f8")),
-            np.frombuffer(keyscans, "<i8"),
-            frozen(np.frombuffer(offsets, "<f8").reshape(-1, 3)),
-        )
-        if not len(track.stamps) == len(track.keyscans) == len(track.T_keyscan_base):
-            raise ValueError("its columns have different lengths")
-        if not (np.isfinite(track.stamps).all() and np.isfinite(track.T_keyscan_base).all()):
-            raise ValueError("a number is not finite")
-        if len(track.keyscans) and (track.keyscans.min() < 0):
-            raise ValueError("a keyscan has a negative number")
-    except (ValueError, zlib.error) as error:
-        raise StoreError(f"the scans of {name} are broken ({error})") from error
+def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
+    """Read the columns of a session's scans.
+
+    Raises:
+        ValueError: they do not fit each other, or hold a number that is not one of theirs.
+    """
+    track = Track(
+        frozen(np.frombuffer(stamps, "<f8")),
+        np.frombuffer(keyscans, "<i8"),
+        frozen(np.frombuffer(offsets, "<f8").reshape(-1, 3)),
+    )
+    if not len(track.stamps) == len(track.keyscans) == len(track.T_keyscan_base):
+        raise ValueError("its columns have different lengths")
+    if not (np.isfinite(track.stamps).all() and np.isfinite(track.T_keyscan_base).all()):
+        raise ValueError("a number is not finite")
+    if len(track.keyscans) and (track.keyscans.min() < 0):
+        raise ValueError("a keyscan has a negative number")
     return track
-
-
-def _inflated(blob: bytes) -> bytes:
-    inflate = zlib.decompressobj()
-    content = inflate.decompress(blob, LARGEST_TRACK)
-    if inflate.unconsumed_tail:
-        raise ValueError(f"more than {LARGEST_TRACK >> 20} MiB")
-    return content
 
 
 def _packet(

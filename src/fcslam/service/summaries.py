@@ -25,6 +25,7 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
+from fcslam.untrusted import open_file, read_bytes
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode
 
@@ -143,9 +144,9 @@ def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
     """Zoom and extent of a map as in ``MapSummary``."""
     if folder is None or not (folder / f"{stem}.yaml").exists():
         return {"zoom": 0, "extent": None}
-    with (folder / f"{stem}.pgm").open("rb") as image:
+    with open_file(folder / f"{stem}.pgm", folder) as image:
         header = image.read(HEADER_BYTES)
-    area = area_of(stem, header, (folder / f"{stem}.yaml").read_text(encoding="utf-8", errors="replace"))
+    area = area_of(stem, header, read_bytes(folder / f"{stem}.yaml", folder).decode(errors="replace"))
     return {"zoom": finest_zoom(area.resolution_m), "extent": area.extent_m}
 
 

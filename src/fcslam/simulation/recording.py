@@ -16,6 +16,7 @@ from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings
 from fcslam.sources import RecordingWriter
 from fcslam.sources.recording.layout import META
 from fcslam.storage.files import write_file
+from fcslam.untrusted import read_text
 
 SETTINGS = "simulation.yaml"
 """File with the settings of the fleet in a folder, which determine all its recordings."""
@@ -78,7 +79,7 @@ def _writer(robot: SimulatedRobot, folder: Path, resume: bool) -> RecordingWrite
 
 def _check_same(path: Path, wanted: dict[str, Any]) -> None:
     try:
-        found = parse_yaml(path.read_text(encoding="utf-8"))
+        found = parse_yaml(read_text(path))
     except ValueError as error:
         raise OutputError(f"{path}: cannot be read, so nothing can go on here; choose another place") from error
     if found != wanted:

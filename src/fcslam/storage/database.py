@@ -12,6 +12,7 @@ from typing import Any
 from fcslam.errors import StoreError
 from fcslam.storage.group_commit import GroupCommit
 from fcslam.storage.row_store import Result, StoreTable
+from fcslam.untrusted import open_database
 
 BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
@@ -152,9 +153,8 @@ def check_file(path: Path, schema: str, version: int) -> None:
     """
     with (
         translate_errors(path),
-        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
+        closing(open_database(path)) as found,
     ):
-        found.execute("PRAGMA trusted_schema=OFF")
         _check(path, found, schema, version)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.storage.files import write_file
+from fcslam.untrusted import read_bytes
 
 MOST_BYTES: Final = 4 * 2**30
 """A larger file is not read."""
@@ -37,9 +38,9 @@ def read_own(path: Path) -> bytes | None:
     """
     key = _key()
     try:
-        if key is None or not path.is_file() or path.stat().st_size > MOST_BYTES:  # a pipe would wait for ever
+        if key is None:
             return None
-        content = path.read_bytes()
+        content = read_bytes(path, most=MOST_BYTES)
     except OSError:
         return None
     data = content[_HASH_BYTES:]
@@ -58,7 +59,7 @@ def _key() -> bytes | None:
         if not path.exists():
             folder.mkdir(parents=True, exist_ok=True)
             write_file(path, secrets.token_bytes(_KEY_BYTES), private=True)
-        key = path.read_bytes()
+        key = read_bytes(path)
     except (OSError, RuntimeError):  # no home
         return None
     return key if len(key) == _KEY_BYTES else None

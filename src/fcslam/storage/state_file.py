@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import InputError
 from fcslam.storage.files import write_file
+from fcslam.untrusted import read_bytes
 
 State = dict[str, Any]
 """JSON values and, below any depth of dictionaries with keys of text, arrays."""
@@ -59,7 +60,7 @@ def read_state(path: Path, fits: str) -> State | None:
         InputError: the file cannot be read, is damaged, or does not fit.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except FileNotFoundError:
         return None
     except OSError as error:

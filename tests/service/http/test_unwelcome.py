@@ -1,5 +1,6 @@
 """Requests that nobody should send cost little, and what they say is not repeated."""
 
+import asyncio
 import logging
 import socket
 import ssl
@@ -12,9 +13,9 @@ import pytest
 import uvicorn
 
 from fcslam.service.credentials import make_credentials
-from fcslam.service.http import protocol
+from fcslam.service.http import protocol, strangers
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
-from fcslam.service.token_buckets import TokenBuckets
+from fcslam.service.http.strangers import Strangers
 from tests.service.http.desk import A
 
 API = "/api/v1"
@@ -39,11 +40,50 @@ def test_an_aborted_body_is_no_fault_of_the_service(desk, caplog):
 
 
 def test_requests_without_a_token_are_limited_and_those_with_one_are_not(desk):
-    desk.state.unknown = TokenBuckets(lambda: 0.0, 1.0, 3.0)
-    answers = [desk.ask("GET", f"{API}/fleet", headers={"Authorization": "Bearer guess"}) for _ in range(5)]
-    assert [answer.status_code for answer in answers] == [401, 401, 401, 429, 429]
-    assert answers[-1].headers["connection"] == "close"
-    assert desk.ask("GET", f"{API}/robots/a/state", "a").status_code == 200
+    url, many = desk.client.base_url, 400
+    asked = b"GET /healthz HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer guess\r\n\r\n" * many
+    with socket.create_connection((url.host, url.port)) as connection:
+        connection.sendall(asked)
+        began = time.monotonic()
+        assert desk.ask("GET", f"{API}/robots/a/state", "a").status_code == 200
+        assert connection.recv(1 << 20).count(b"HTTP/1.1") < many
+        assert time.monotonic() - began < many / strangers.PER_S, "the robot does not wait for the strangers"
+
+
+def test_strangers_wait_for_each_other_and_addresses_take_turns():
+    answered = []
+
+    async def app(scope, receive, send):
+        answered.append(scope["client"][0])
+
+    async def ask():
+        gate = Strangers(app, lambda scope: scope["client"][0] == "robot")
+        many = [("crowd", n) for n in range(60)] + [("other", 0), ("robot", 0)]
+        await asyncio.gather(*(gate({"type": "http", "client": who, "state": {}}, None, None) for who in many))
+
+    asyncio.run(ask())
+    assert answered.index("robot") <= strangers.AT_ONCE
+    assert answered.index("other") <= strangers.AT_ONCE + 3
+    assert len(answered) == 62
+
+
+def test_too_many_waiting_strangers_are_refused(monkeypatch):
+    monkeypatch.setattr(strangers, "MOST_WAITING", 2)
+    told = []
+
+    async def app(scope, receive, send):
+        pass
+
+    async def send(message):
+        told.append(message.get("status"))
+
+    async def ask():
+        gate = Strangers(app, lambda _: False)
+        crowd = (gate({"type": "http", "client": ("x", 1), "state": {}}, None, send) for _ in range(30))
+        await asyncio.gather(*crowd)
+
+    asyncio.run(ask())
+    assert told.count(429) == 30 - int(strangers.AT_ONCE) - 2
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import numpy as np
 
 from fcslam.errors import EvaluationError
 from fcslam.records import FloatArray, frozen
+from fcslam.untrusted import read_text
 
 
 class SceneKind(StrEnum):
@@ -82,7 +83,7 @@ def _read_scene(folder: Path) -> Scene:
 
 def _read_homography(path: Path) -> FloatArray:
     try:
-        H = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+        H = np.array([float(word) for word in read_text(path).split()])
     except (OSError, ValueError) as error:
         raise EvaluationError(f"{path}: cannot read the homography ({error}); give 3 x 3 numbers") from error
     if H.shape != (9,) or not np.isfinite(H).all() or H[8] == 0.0 or abs(np.linalg.det(H.reshape(3, 3))) < 1e-12:

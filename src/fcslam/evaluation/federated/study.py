@@ -44,7 +44,7 @@ from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.networks import weights_to_network
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
-from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.arrays import write_arrays
 from fcslam.learning.export import export_onnx
 from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork
@@ -52,6 +52,7 @@ from fcslam.learning.pairs import ViewPair
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
 from fcslam.learning.trainer import ExecutionOptions, TrainingProgress
 from fcslam.records import FloatArray
+from fcslam.untrusted import read_arrays
 
 TEST_SHARE: Final = 0.25
 """Share of each robot's images that no arm trains on, chosen by their names."""

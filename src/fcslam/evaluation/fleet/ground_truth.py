@@ -10,14 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fcslam.config import parse_yaml
+from fcslam.config import one_line, parse_yaml
 from fcslam.errors import EvaluationError
 from fcslam.evaluation.fleet.relations import pose_table
+from fcslam.features.detector import decode_grey
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.metrics.relations import PoseTable
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, read_tum
+from fcslam.runs.map_files import check_place
+from fcslam.untrusted import read_bytes, read_text
 
 GAP_S = 0.25
 """Longest gap between true poses that is interpolated."""
@@ -78,13 +81,14 @@ def read_grid(path: Path) -> LabelledGrid:
         EvaluationError: one of the two files is missing or invalid.
     """
     try:
-        meta = parse_yaml(path.read_text(encoding="utf-8"))
-        pixels = cv2.imdecode(np.fromfile(path.parent / meta["image"], dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+        meta = parse_yaml(read_text(path))
+        pixels = decode_grey(read_bytes(path.parent / meta["image"], path.parent))
         if pixels is None:
-            raise ValueError(f"{meta['image']} is not an image")
+            raise ValueError(f"{one_line(str(meta['image']))} is not an image")
         resolution_m, origin = float(meta["resolution"]), np.array(meta["origin"], dtype=np.float64)
         occupied_over, free_under = float(meta["occupied_thresh"]), float(meta["free_thresh"])
-        if not (resolution_m > 0.0 and origin.shape == (3,) and np.isfinite(origin).all()):
+        check_place(resolution_m, *origin[:2].tolist())
+        if not (origin.shape == (3,) and np.isfinite(origin).all()):
             raise ValueError("resolution or origin is wrong")
     except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
         raise EvaluationError(f"{path}: not a map of ROS map_server ({error!r})") from error

@@ -19,6 +19,7 @@ Online: every image queries the earlier images, except the most recent ones.
 """
 
 import csv
+import io
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from fcslam.evaluation.places.tum_sequence import read_sequence
 from fcslam.evaluation.places.view_overlap import view_overlap
 from fcslam.metrics.retrieval import Pairs, PairTruth
 from fcslam.places.sequence import excluding_recent
+from fcslam.untrusted import read_text
 
 LABELLED: Final = "dataset.csv"
 FLEET: Final = "simulation.yaml"
@@ -105,7 +107,7 @@ def _stream(folder: Path, images: tuple[Path, ...], admitted: Pairs, question: s
 
 
 def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
-    with (folder / LABELLED).open(encoding="utf-8", newline="") as file:
+    with io.StringIO(read_text(folder / LABELLED), newline="") as file:
         rows = [row for row in csv.DictReader(file) if not labels or row["label"] in labels]
     frames = [_FRAME.fullmatch(str(Path(row["image"]).with_suffix(""))) for row in rows]
     wrong = [row["image"] for row, frame in zip(rows, frames, strict=True) if frame is None]
@@ -134,7 +136,7 @@ def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
 def _read_tour(folder: Path) -> PlaceSet:
     images = {int(path.stem): path for path in sorted(folder.iterdir()) if path.stem.isdecimal()}
     numbers = sorted(images)
-    pairs = np.loadtxt(folder / "loop_pairs.txt", dtype=np.int64, usecols=(0, 1), ndmin=2)
+    pairs = np.loadtxt(io.StringIO(read_text(folder / "loop_pairs.txt")), dtype=np.int64, usecols=(0, 1), ndmin=2)
     missing = sorted(set(pairs.ravel()) - set(numbers))
     if missing:
         raise EvaluationError(f"{folder}: loop_pairs.txt names image {missing[0]}, which is not there")
@@ -176,7 +178,7 @@ def _read_generic(folder: Path) -> PlaceSet:
         for name, paths in (("queries", queries), ("gallery", gallery))
     )
     matches, ignored = (np.zeros((len(queries), len(gallery)), np.bool_) for _ in range(2))
-    with (folder / "matches.csv").open(encoding="utf-8", newline="") as file:
+    with io.StringIO(read_text(folder / "matches.csv"), newline="") as file:
         for line in csv.DictReader(file):
             relation = line["relation"]
             if relation not in ("match", "ignored"):

@@ -12,6 +12,7 @@ from fcslam.errors import EvaluationError
 from fcslam.evaluation.places.view_overlap import DepthCamera
 from fcslam.features.files import read_grey
 from fcslam.records import FloatArray
+from fcslam.untrusted import read_bytes, read_text
 
 DEPTH_UNITS_PER_M: Final = 5000.0
 GAP_S: Final = 0.2
@@ -60,7 +61,7 @@ def read_sequence(folder: Path) -> Sequence:
 
 def _lines(path: Path) -> list[str]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except OSError as error:
         raise EvaluationError(f"{path}: cannot be read ({error}); a sequence needs it") from error
     return [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
@@ -82,7 +83,7 @@ def _poses_at(stamps: FloatArray, poses: FloatArray) -> FloatArray:
 
 
 def _read_depth(path: Path) -> FloatArray:
-    depth = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    depth = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
     if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
         raise EvaluationError(f"{path}: no depth image of 16 bits")
     return np.asarray(depth, np.float64) / DEPTH_UNITS_PER_M

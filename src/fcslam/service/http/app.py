@@ -1,11 +1,15 @@
 """The ASGI application; what it needs is given to it."""
 
-from collections.abc import AsyncIterator, Sequence
+import json
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
+from functools import cache
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import fcslam
@@ -19,6 +23,7 @@ from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.robots import detector_router, robot_router
 from fcslam.service.http.state import ACTOR, ServiceState
+from fcslam.service.http.strangers import Strangers
 from fcslam.service.http.viewers import fleet_router, map_router
 
 PREFIX = "/api/v1"
@@ -32,6 +37,8 @@ class Service(FastAPI):
 
     def openapi(self) -> dict[str, Any]:
         """The interface, in OpenAPI 3.1."""
+        if self.openapi_schema:
+            return self.openapi_schema
         described = super().openapi()
         for operation in (one for path in described["paths"].values() for one in path.values()):
             operation["responses"].pop("422", None)
@@ -62,6 +69,7 @@ def create_app(
         version=fcslam.__version__,
         docs_url=None,
         redoc_url=None,
+        openapi_url=None,  # its route would write the description anew for each request
         redirect_slashes=False,  # a redirect repeats whatever Host the request names
         lifespan=lifespan,
     )
@@ -69,14 +77,29 @@ def create_app(
     for make in (*ROUTERS, *VIEWER_ROUTERS):
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(operations_router(state))
+    app.add_route("/openapi.json", _description(app), include_in_schema=False)
     for router in more:
         app.include_router(router)
     if local_names:
         app.add_middleware(LocalNames)
     app.add_middleware(_Watch, state=state)
+    app.add_middleware(Strangers, is_known=state.is_known)
     if named is not None:
         app.add_middleware(NamedMissions, named=named)
     return app
+
+
+def _description(app: FastAPI) -> Callable[[Request], Response]:
+    """The route of the interface's description, which is written once."""
+
+    @cache
+    def written() -> bytes:
+        return json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
+
+    def send(_: Request) -> Response:
+        return Response(written(), media_type="application/json")
+
+    return send
 
 
 class _Watch:

@@ -3,7 +3,9 @@
 A page may have its own name pointed to this machine (DNS rebinding), or send a form to it (cross-site request forgery).
 """
 
+from functools import cache
 from ipaddress import ip_address
+from socket import gethostname
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
@@ -16,7 +18,7 @@ READING = ("GET", "HEAD", "OPTIONS")
 
 
 class LocalNames:
-    """Refuses requests that name this machine neither by an address nor as localhost, and changes from other pages.
+    """Refuses requests by a name that is not this machine's, and changes that pages of other sites send.
 
     A service that knows nobody's token needs it: a browser sends the name of the page that asks.
     """
@@ -30,7 +32,9 @@ class LocalNames:
         if scope["type"] == "http":
             headers = Headers(scope=scope)
             if not is_local_name(headers.get("host", "")):
-                text = "a service without tokens answers to localhost and to addresses only; ask it by one of these"
+                text = (
+                    "a service without tokens answers to its address, its host name and localhost; ask by one of these"
+                )
                 app = problem(421, text)
             elif scope["method"] not in READING and is_cross_site(headers):
                 app = problem(
@@ -47,10 +51,16 @@ def is_cross_site(headers: Headers) -> bool:
     return origin is not None and urlsplit(origin).netloc != headers.get("host")
 
 
+@cache
+def _own_names() -> frozenset[str]:
+    host = gethostname().lower()
+    return frozenset({"localhost", host, f"{host.partition('.')[0]}.local"})
+
+
 def is_local_name(host: str) -> bool:
-    """Whether a Host header is an IP address or localhost, with or without a port."""
+    """Whether a Host header is an IP address, localhost or this machine's own name, with or without a port."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
-        return name == "localhost" or bool(ip_address(name))
+        return name in _own_names() or bool(ip_address(name))
     except ValueError:
         return False

@@ -1,12 +1,14 @@
 """The connections of the service: how many there may be, how long they may be idle, and whose certificate they show."""
 
 import asyncio
+import itertools
 import resource
 import socket
 import ssl
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from contextlib import suppress
+from functools import cache
 from types import FrameType
 from typing import Any
 
@@ -14,14 +16,22 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from fcslam.service.http.strangers import WAITING
+
 MOST_CONNECTIONS = 4096
 """Connections without a request in progress; of more, one of the address that has most is closed."""
+WRITE_S = 20.0
+"""Time for a client to read what fills the buffers of its connection, 64 KiB and those of the system."""
+REFUSAL_S = 5.0
+"""Time until what is no HTTP is answered."""
 IDLE_S = 10.0
 """Time for the header of a request, from the connection or the response before."""
 BODY_S = 60.0
 """Time for a request with its body."""
 HANDSHAKE_S = 10.0
 """Time for a TLS handshake."""
+ACCEPTED_AT_ONCE, PAUSE_S = 20, 0.01
+"""Connections that are accepted without a pause, and the pause: two thousand in a second."""
 _LOOK_EVERY_S = 2.0
 _FILES = 16_384
 """Files that may be open at a time, if the system allows it: connections whose TLS handshake is not done count, too."""
@@ -35,8 +45,17 @@ def allow_many_connections() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
+@cache
+def most_connections() -> int:
+    """Connections that there may be at a time: some files are left for missions and handshakes."""
+    return min(MOST_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+
+
+_Factory = Callable[[], asyncio.Protocol]
+
+
 class GuardedServer(uvicorn.Server):
-    """uvicorn's server with a limit for TLS handshakes, which come before a protocol; theirs is a minute.
+    """uvicorn's server with limits for new connections and for TLS handshakes, which come before a protocol.
 
     ``on_exit`` is called when it is asked to stop, before it waits for the answers in progress.
     """
@@ -57,10 +76,52 @@ class GuardedServer(uvicorn.Server):
 
     def _loop(self) -> asyncio.AbstractEventLoop:
         loop = (self.config.get_loop_factory() or asyncio.new_event_loop)()
-        if self.config.is_ssl:
-            limited = partial(loop.create_server, ssl_handshake_timeout=HANDSHAKE_S)
-            loop.create_server = limited  # type: ignore[method-assign]
+
+        async def listen(factory: _Factory, *, sock: socket.socket, ssl: ssl.SSLContext | None, backlog: int) -> object:
+            sock.listen(backlog)
+            return _Listener(factory, sock, ssl)
+
+        loop.create_server = listen  # type: ignore[method-assign, assignment]
         return loop
+
+
+class _Listener:
+    """Accepts connections, a few at a time: asyncio accepts all that wait at once, and requests in progress wait."""
+
+    def __init__(self, factory: _Factory, listening: socket.socket, tls: ssl.SSLContext | None) -> None:
+        self._factory, self._listening, self._tls = factory, listening, tls
+        self._handshakes: set[asyncio.Task[None]] = set()
+        listening.setblocking(False)
+        self._accepting = asyncio.get_running_loop().create_task(self._accept())
+
+    def close(self) -> None:
+        """Accept no more."""
+        self._accepting.cancel()
+
+    async def wait_closed(self) -> None:
+        """Wait for the handshakes in progress."""
+        await asyncio.wait([self._accepting, *self._handshakes])
+
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        for number in itertools.count(1):
+            try:
+                connection, _ = await loop.sock_accept(self._listening)
+            except OSError:  # no file is left: wait until a connection is closed
+                await asyncio.sleep(PAUSE_S)
+                continue
+            handshake = loop.create_task(self._connect(connection))
+            self._handshakes.add(handshake)
+            handshake.add_done_callback(self._handshakes.discard)
+            if number % ACCEPTED_AT_ONCE == 0:
+                await asyncio.sleep(PAUSE_S)
+
+    async def _connect(self, connection: socket.socket) -> None:
+        timeout_s = None if self._tls is None else HANDSHAKE_S
+        with suppress(OSError):  # the client is gone, or no client of ours
+            await asyncio.get_running_loop().connect_accepted_socket(
+                self._factory, connection, ssl=self._tls, ssl_handshake_timeout=timeout_s
+            )
 
 
 class GuardedProtocol(H11Protocol):
@@ -70,6 +131,8 @@ class GuardedProtocol(H11Protocol):
     holds idle connections would lock everybody else out.
     """
 
+    _stuck_since: float | None = None
+    """When the client stopped to read what is sent; None: it reads."""
     _idle_since = _asked_since = 0.0
     """Times of the loop: when the present request began, or when the connection was seen without one first."""
     _look: asyncio.TimerHandle | None = None
@@ -79,7 +142,7 @@ class GuardedProtocol(H11Protocol):
         super().connection_made(transport)
         self._idle_since = self._asked_since = self.loop.time()
         self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
-        if len(self.connections) > MOST_CONNECTIONS:
+        if len(self.connections) > most_connections():
             self._make_room()
         self._pass_certificate(transport)
 
@@ -94,6 +157,30 @@ class GuardedProtocol(H11Protocol):
         """Whether no request is in progress."""
         return self.cycle is None or self.cycle.response_complete
 
+    @property
+    def may_be_closed(self) -> bool:
+        """Whether the connection is idle, or its request waits among those of strangers."""
+        return self.is_idle or WAITING in self.cycle.scope["state"]
+
+    def pause_writing(self) -> None:
+        """The client reads slower than the service sends."""
+        self._stuck_since = self.loop.time()
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has read."""
+        self._stuck_since = None
+        super().resume_writing()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP, but late, so that whoever sends it again and again waits."""
+        self.transport.pause_reading()
+        self.loop.call_later(REFUSAL_S, self._refuse, msg)
+
+    def _refuse(self, msg: str) -> None:
+        if not self.transport.is_closing():
+            super().send_400_response(msg)
+
     def _enforce_timeouts(self) -> None:
         """Close the connection if it has been idle, or its request has been coming in, for too long."""
         now = self.loop.time()
@@ -103,19 +190,21 @@ class GuardedProtocol(H11Protocol):
         else:
             self._idle_since = now
             is_late = self.cycle.more_body and now - self._asked_since > BODY_S
-        if is_late:
+        if is_late or (self._stuck_since is not None and now - self._stuck_since > WRITE_S):
             self.transport.abort()
         else:
             self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
 
     def _make_room(self) -> None:
-        """Close the longest idle connection of the address that has most of them."""
-        idle = [each for each in self.connections if isinstance(each, GuardedProtocol) and each.is_idle]
+        """Close the longest idle connection of the address that has most of them; without any, this one."""
+        idle = [each for each in self.connections if isinstance(each, GuardedProtocol) and each.may_be_closed]
         held = Counter(_address(each) for each in idle if each is not self)
         if held:
             ((address, _),) = held.most_common(1)
             oldest = min((e for e in idle if e is not self and _address(e) == address), key=lambda e: e._idle_since)
             oldest.transport.abort()
+        else:
+            self.transport.abort()
 
     def _pass_certificate(self, transport: asyncio.Transport) -> None:
         """Pass the certificate to the application by ASGI's TLS extension; of its entries only ``client_cert_name``.

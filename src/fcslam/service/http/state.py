@@ -1,7 +1,6 @@
 """State shared by all routes of the HTTP service."""
 
 import asyncio
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import Protocol
 from fastapi import Depends, HTTPException, Request, Security
 from fastapi.params import Depends as Dependency
 from fastapi.security import HTTPBearer
+from starlette.requests import HTTPConnection
+from starlette.types import Scope
 
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
@@ -18,11 +19,8 @@ from fcslam.service.http.events import Watched
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import OpenMission, ServedMissions
-from fcslam.service.token_buckets import TokenBuckets
 from fcslam.service.viewed_mission import ViewedMission
 
-UNKNOWN_PER_S, UNKNOWN_BURST = 50.0, 1000.0
-"""Requests without a known token that are answered 401, on average and at once; further ones are hung up on."""
 ANYBODY = "anybody"
 """The author of what is done without authentication."""
 ACTOR = "actor"
@@ -68,8 +66,6 @@ class ServiceState:
     learning: Path | None = None
     """Output folder of a federated training, for viewers."""
     measures: ServiceMetrics = field(default_factory=ServiceMetrics)
-    unknown: TokenBuckets = field(default_factory=lambda: TokenBuckets(time.monotonic, UNKNOWN_PER_S, UNKNOWN_BURST))
-    """Requests of those who have no known token, all together; requests with one never wait for them."""
     closing: bool = False
     """Whether the service is stopping and takes no new requests."""
     changing: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -97,7 +93,7 @@ class ServiceState:
     def require(self, *roles: Role) -> list[Dependency]:
         """Dependencies of a route: whoever asks has one of the roles, and a robot that of itself alone.
 
-        Refuses (HTTPException): 401 without a token that is known, 403 with another one's, 429 too many requests.
+        Refuses (HTTPException): 401 without a token that is known, 403 with another one's.
         """
 
         async def check(request: Request) -> None:
@@ -108,10 +104,6 @@ class ServiceState:
                 return
             who = self._who(request)
             if who is None:
-                wait_s = self.unknown.wait_s("", 1.0)
-                if wait_s > 0.0:
-                    later = {"Retry-After": str(int(wait_s) + 1), "Connection": "close"}
-                    raise HTTPException(429, "too many requests without a known token", later)
                 headers = {"WWW-Authenticate": "Bearer"}
                 raise HTTPException(
                     401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
@@ -134,7 +126,11 @@ class ServiceState:
         who = None if self.authenticator.is_open else self._who(request)
         return self.authenticator.is_open or (who is not None and who.role in roles)
 
-    def _who(self, request: Request) -> Identity | None:
+    def is_known(self, scope: Scope) -> bool:
+        """Whether a request has a token or certificate that is known, or needs none."""
+        return self.authenticator.is_open or self._who(HTTPConnection(scope)) is not None
+
+    def _who(self, request: HTTPConnection) -> Identity | None:
         tls = request.scope.get("extensions", {}).get("tls", {})
         return self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
 

@@ -41,6 +41,7 @@ from fcslam.service.summaries import (
     run_of,
     sessions_of,
 )
+from fcslam.untrusted import check_file, read_bytes
 
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
@@ -200,7 +201,7 @@ def map_router(state: ViewerState) -> APIRouter:
         up to now.
         """
         path = _existing(state, f"{TRAJECTORIES}/{session}.tum")
-        poses = path.read_bytes()
+        poses = read_bytes(path)
         known = after if after <= len(poses) and digest == hashlib.sha256(poses[:after]).hexdigest() else 0
         headers = {"Fcslam-After": str(known), "Fcslam-Digest": hashlib.sha256(poses).hexdigest()}
         return Response(poses[known:], media_type=TEXT, headers=headers)
@@ -248,7 +249,9 @@ def _existing(state: ViewerState, name: str) -> Path:
 
     Refuses (HTTPException 404): there is none.
     """
-    path = _folder_of(state) / name
-    if not path.is_file():
-        raise HTTPException(404, f"there is no {name}")
-    return path
+    folder = _folder_of(state)
+    try:
+        check_file(folder / name, folder)
+    except OSError as error:
+        raise HTTPException(404, f"there is no {name} that can be read ({error.strerror or error})") from error
+    return folder / name

@@ -14,20 +14,20 @@ from heapq import merge
 from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
-from urllib.parse import quote
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import OLD_TRANSFORMS, SCANS, TRANSFORMS, MessageCodec
-from fcslam.sources.bags.mcap_records import MCAP_MAGIC, largest_chunk_bytes, profile_of
-from fcslam.sources.bags.sequential import LARGEST_CHUNK_BYTES, SequentialReader, unpacked
+from fcslam.sources.bags.limited_rosbags import METADATA, check_chunks, check_tables, ros1_reader, ros2_reader
+from fcslam.sources.bags.mcap_records import MCAP_MAGIC, chunk_bytes, profile_of
+from fcslam.sources.bags.sequential import LARGEST_CHUNK_BYTES, SequentialReader
 from fcslam.sources.logs.archive import translate_errors
+from fcslam.untrusted import MOST_CHUNKS_RATIO, check_unpacked, open_file, unpack
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 _ROS1, _MCAP, _SQLITE = b"#ROSBAG V", MCAP_MAGIC, b"SQLite format 3\x00"
-_METADATA = "metadata.yaml"
 _PROFILE = "ros2"
 _LONGEST_REASON = 200
 _SQLITE_HEADER_BYTES = 100
@@ -75,7 +75,7 @@ class _Reader(Protocol):
 def is_bag(path: Path, head: bytes) -> bool:
     """Whether there is a bag at ``path``, a file that starts with ``head`` or a folder."""
     if path.is_dir():
-        return (path / _METADATA).is_file() or any(_storage_files(path))
+        return (path / METADATA).is_file() or any(_storage_files(path))
     return head.startswith((_ROS1, _MCAP, _SQLITE))
 
 
@@ -83,7 +83,7 @@ def parts_of(path: Path) -> tuple[Path, ...]:
     """The files of one recording: of a folder without metadata, or several joined by commas; else the path itself."""
     if os.path.isdir(path):
         with translate_errors(path):
-            return (path,) if (path / _METADATA).is_file() else tuple(_storage_files(path)) or (path,)
+            return (path,) if (path / METADATA).is_file() else tuple(_storage_files(path)) or (path,)
     names = str(path).split(",")
     return (path,) if os.path.lexists(path) or not all(names) else tuple(map(Path, names))
 
@@ -144,7 +144,7 @@ class BagFile:
         """
         payload = message.payload
         if not self._codec.ros1 and payload.startswith(ZSTD):
-            payload = unpacked(payload, "zstd", LARGEST_CHUNK_BYTES)
+            payload = unpack(payload, "zstd")
         return self._codec.decode(payload, message.topic.type)
 
     @cached_property
@@ -218,7 +218,7 @@ class _Part:
     def _magic(self) -> bytes:
         if self.path.is_dir():
             return b""
-        with translate_errors(self.path), self.path.open("rb") as file:
+        with translate_errors(self.path), open_file(self.path) as file:
             return file.read(len(_SQLITE))
 
     @property
@@ -300,7 +300,7 @@ class _Part:
             SourceError: one would fill the memory, or is none of ROS 2.
         """
         for path in self.path.glob("*.mcap") if self.path.is_dir() else [self.path]:
-            with path.open("rb") as file:
+            with open_file(path) as file:
                 if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
                     _check_mcap(path, file)
         return self.path
@@ -334,7 +334,7 @@ def _short(error: BaseException) -> str:
 
 
 def _is_cut_mcap(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             return False
         file.seek(-len(MCAP_MAGIC), os.SEEK_END)
@@ -356,35 +356,36 @@ def is_transforms(topic: Topic) -> bool:
 
 
 def _reader(path: Path, magic: bytes) -> _Reader:
-    from rosbags import rosbag1, rosbag2
-
+    reader: _Reader
     if path.is_dir():
         for database in path.glob("*.db3"):
             _check_database(database)
-        return rosbag2.Reader(path)
-    if magic.startswith(_ROS1):
-        return rosbag1.Reader(path)
-    if magic.startswith(_SQLITE):
+        reader = ros2_reader(path, "dir")
+    elif magic.startswith(_ROS1):
+        reader = ros1_reader(path)
+    elif magic.startswith(_SQLITE):
         _check_database(path)
-        # rosbags puts the path into a URI as it is
-        return rosbag2.Reader.STORAGE_PLUGINS[".db3"](Path(quote(str(path))))
-    if magic.startswith(_MCAP):
-        return rosbag2.Reader.STORAGE_PLUGINS[".mcap"](path)
-    raise SourceError(f"{path}: the whole bag is compressed; unpack it first, as by `gunzip`, `xz -d` or `zstd -d`")
+        reader = ros2_reader(path, ".db3")
+    elif magic.startswith(_MCAP):
+        reader = ros2_reader(path, ".mcap")
+    else:
+        raise SourceError(f"{path}: the whole bag is compressed; unpack it first, as by `gunzip`, `xz -d` or `zstd -d`")
+    return reader
 
 
 def _check_mcap(path: Path, file: BinaryIO) -> None:
-    profile, chunk_bytes = profile_of(file), largest_chunk_bytes(file)
+    profile, chunks = profile_of(file), list(chunk_bytes(file))
     if profile is not None and profile != _PROFILE:
         raise SourceError(
             f"{path}: has the profile {one_line(repr(profile))}, and the bags of ROS 2 have {_PROFILE!r}; "
             "write it again with this profile, as `ros2 bag convert` does"
         )
-    if chunk_bytes > LARGEST_CHUNK_BYTES:
+    if max(chunks, default=0) > LARGEST_CHUNK_BYTES:
         raise SourceError(
-            f"{path}: has a chunk of {chunk_bytes / 1e6:.0f} MB, which would fill the memory; "
+            f"{path}: has a chunk of {max(chunks) / 1e6:.0f} MB, which would fill the memory; "
             "write it again with smaller chunks, as `mcap compress` does"
         )
+    check_unpacked(os.fstat(file.fileno()).st_size, sum(chunks), MOST_CHUNKS_RATIO)
 
 
 def _read_without_index(reader: Any) -> None:
@@ -393,6 +394,8 @@ def _read_without_index(reader: Any) -> None:
 
     for storage in getattr(reader, "storages", [reader]):
         is_mcap = isinstance(storage, rosbag2.Reader.STORAGE_PLUGINS[".mcap"])
+        if is_mcap:
+            check_chunks(storage)
         if not is_mcap or any(chunk.message_index_offsets for chunk in storage.chunks):
             continue
         storage.chunks.clear()
@@ -410,13 +413,14 @@ def _check_database(database: Path) -> None:
             f"{database}: was not closed, {journal.name} holds its end; close it with "
             f'`sqlite3 {database.name} "PRAGMA wal_checkpoint(TRUNCATE)"`'
         )
-    with database.open("rb") as file:
+    with open_file(database) as file:
         header = file.read(_SQLITE_HEADER_BYTES)
     page_bytes, changes, pages, counted_at = (
         int.from_bytes(header[start:end], "big") for start, end in ((16, 18), (24, 28), (28, 32), (92, 96))
     )
     if changes == counted_at and database.stat().st_size < page_bytes * pages:
         raise ValueError("the file is truncated")
+    check_tables(database)
 
 
 def _storage_files(folder: Path) -> list[Path]:

@@ -46,14 +46,12 @@ def profile_of(file: BinaryIO) -> str | None:
     return content[4 : 4 + int.from_bytes(content[:4], "little")].decode(errors="replace")
 
 
-def largest_chunk_bytes(file: BinaryIO) -> int:
-    """The size of the largest chunk without compression, as the file states it; 0 without chunks."""
-    largest = 0
+def chunk_bytes(file: BinaryIO) -> Iterator[int]:
+    """The size of each chunk without compression, as the file states it."""
     for record in mcap_records(file):
         if record.opcode == CHUNK:
             file.seek(record.start + _SIZE_AT)
-            largest = max(largest, int.from_bytes(file.read(8), "little"))
-    return largest
+            yield int.from_bytes(file.read(8), "little")
 
 
 def end_mcap(path: Path) -> bool:

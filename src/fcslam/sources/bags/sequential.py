@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from fcslam.sources.bags.mcap_records import CHUNK, DATA_END, HEADER, MCAP_MAGIC
+from fcslam.untrusted import MOST_CHUNKS_RATIO, check_unpacked, open_file, unpack
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -52,6 +53,7 @@ class SequentialReader:
         self.damage_bytes: int | None = None
         """Where in the file the reading ended; None if it was at the end."""
         self.size_bytes = path.stat().st_size
+        self._unpacked = 0
 
     def open(self) -> None:
         """Find and count all messages."""
@@ -70,9 +72,9 @@ class SequentialReader:
 
     def _records(self) -> Iterator[_Record]:
         """All messages; ``damage_bytes`` says afterwards where they ended."""
-        self.damage_bytes = None
+        self.damage_bytes, self._unpacked = None, 0
         records = self._ros1_records if self._ros1 else self._mcap_records
-        with self._path.open("rb") as file:
+        with open_file(self._path) as file:
             file.seek(_ROS1_MAGIC_BYTES if self._ros1 else len(MCAP_MAGIC))
             try:
                 yield from records(file)
@@ -93,6 +95,7 @@ class SequentialReader:
             is_cut = len(content) < size
             if opcode == CHUNK and not inside:
                 records, is_whole = _mcap_chunk(content, is_cut)
+                self._count(len(records))
                 yield from _in_time(self._mcap_records(BytesIO(records), schemas), is_whole)
             if is_cut:
                 raise _DamageError
@@ -107,6 +110,10 @@ class SequentialReader:
                 schemas.clear()
         if not inside:
             raise _DamageError  # there is no end of the data
+
+    def _count(self, unpacked: int) -> None:
+        self._unpacked += unpacked
+        check_unpacked(self.size_bytes, self._unpacked, MOST_CHUNKS_RATIO)
 
     def _add_channel(self, content: bytes, schemas: dict[int, str]) -> None:
         from rosbags.interfaces import ConnectionExtRosbag2
@@ -128,6 +135,7 @@ class SequentialReader:
             content = file.read(size)
             if kind == _ROS1_CHUNK and not inside:
                 records, is_whole = _ros1_chunk(fields, content)
+                self._count(len(records))
                 yield from _in_time(self._ros1_records(BytesIO(records), inside=True), is_whole)
             if len(content) < size:
                 raise _DamageError
@@ -160,36 +168,6 @@ def _in_time(records: Iterator[_Record], is_whole: bool) -> Iterator[_Record]:
         raise damage
 
 
-def unpacked(packed: bytes, compression: str, limit_bytes: int) -> bytes:
-    """Unpack bytes, as far as they go or to the limit.
-
-    Raises:
-        ValueError: the bytes are damaged, or the compression is unknown.
-    """
-    if compression in ("", "none"):
-        return packed
-    try:
-        return bytes(_unpacker(compression).decompress(packed, max_length=limit_bytes))
-    except Exception as error:  # three libraries, each with errors of its own
-        raise _DamageError from error
-
-
-def _unpacker(compression: str) -> Any:
-    if compression == "bz2":
-        from bz2 import BZ2Decompressor
-
-        return BZ2Decompressor()
-    if compression == "lz4":
-        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-
-        return LZ4FrameDecompressor()
-    if compression == "zstd":
-        from backports.zstd import ZstdDecompressor
-
-        return ZstdDecompressor()
-    raise _DamageError
-
-
 def _mcap_chunk(content: bytes, is_cut: bool) -> tuple[bytes, bool]:
     """The records of a chunk, as many as there are, and whether these are all."""
     size, crc = struct.unpack_from("<QI", content, 16)
@@ -197,7 +175,7 @@ def _mcap_chunk(content: bytes, is_cut: bool) -> tuple[bytes, bool]:
     if size > LARGEST_CHUNK_BYTES:
         raise _DamageError
     packed_bytes = int.from_bytes(content[at : at + 8], "little")
-    records = unpacked(content[at + 8 : at + 8 + packed_bytes], compression, size)
+    records = unpack(content[at + 8 : at + 8 + packed_bytes], compression, size)
     if not is_cut and crc and len(records) == size and crc32(records) != crc:
         raise _DamageError
     return records, len(records) == size
@@ -207,7 +185,7 @@ def _ros1_chunk(fields: dict[bytes, bytes], content: bytes) -> tuple[bytes, bool
     size = int.from_bytes(fields[b"size"], "little")
     if size > LARGEST_CHUNK_BYTES:
         raise _DamageError
-    records = unpacked(content, fields[b"compression"].decode(errors="replace"), size)
+    records = unpack(content, fields[b"compression"].decode(errors="replace"), size)
     return records, len(records) == size
 
 

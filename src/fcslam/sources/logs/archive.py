@@ -1,26 +1,22 @@
 """Reads log files, compressed or not, as lines of bytes."""
 
-import bz2
 import gzip
 import lzma
-import os
 import re
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from io import BufferedReader
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
-from typing import BinaryIO, cast
 
 from fcslam.errors import SourceError
+from fcslam.untrusted import open_unpacked
 
 MAX_LINE_BYTES = 1 << 18
 """Longer lines are split, so that a file without line ends does not fill the memory."""
 
 _HEAD_BYTES = 1 << 16
-_BUFFER_BYTES = 1 << 17
 _LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|dat|txt|carmen|bag|mcap|db3|active|fcslam)$", re.IGNORECASE)
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
@@ -41,7 +37,7 @@ def is_folder(path: Path) -> bool:
     """
     with translate_errors(path):
         mode = path.stat().st_mode
-        if not (S_ISDIR(mode) or S_ISREG(mode) or path.samefile(os.devnull)):
+        if not (S_ISDIR(mode) or S_ISREG(mode)):
             raise SourceError(f"{path}: is a pipe or device, and a recording is read twice; write it to a file first")
     return S_ISDIR(mode)
 
@@ -52,7 +48,7 @@ def head(path: Path) -> bytes:
     Raises:
         SourceError: the path is missing or not a file, or the file is empty or damaged.
     """
-    with translate_errors(path), _open(path) as stream:
+    with translate_errors(path), open_unpacked(path) as stream:
         content = stream.read(_HEAD_BYTES)
     if not content:
         raise SourceError(f"{path}: the file is empty; give a recording with laser scans")
@@ -65,26 +61,8 @@ def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
     Raises:
         SourceError: the file cannot be read to its end.
     """
-    with translate_errors(path), _open(path) as stream:
+    with translate_errors(path), open_unpacked(path) as stream:
         yield from enumerate(iter(partial(stream.readline, MAX_LINE_BYTES), b""), start=1)
-
-
-def _open(path: Path) -> BinaryIO:
-    """Open a file by its first bytes, because its suffix may be wrong."""
-    with path.open("rb") as raw:
-        magic = raw.read(6)
-    if magic.startswith(b"\x1f\x8b"):
-        return _buffered(gzip.open(path))
-    if magic.startswith(b"\xfd7zXZ\x00"):
-        return _buffered(lzma.open(path))
-    if magic.startswith(b"BZh"):
-        return _buffered(bz2.open(path))
-    return path.open("rb", buffering=_BUFFER_BYTES)
-
-
-def _buffered(stream: gzip.GzipFile | lzma.LZMAFile | bz2.BZ2File) -> BinaryIO:
-    """Buffer a compressed file; lines are then read several times faster."""
-    return BufferedReader(cast("BinaryIO", stream), _BUFFER_BYTES)  # type: ignore[type-var]
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from fcslam.sources.recording.layout import (
     check_sweep,
     is_whole,
 )
+from fcslam.untrusted import open_file
 
 _BLOCK_FRAMES = 256
 
@@ -133,7 +134,7 @@ class RangesFile:
 
     @cached_property
     def _file(self) -> BinaryIO:
-        return self._stack.enter_context(self._path.open("rb"))
+        return self._stack.enter_context(open_file(self._path, self._path.parent))
 
 
 def merged_frames(folder: Path, files: Sequence[FrameFile]) -> Iterator[Frame]:
@@ -169,7 +170,7 @@ def _pieces(path: Path, file: FrameFile) -> Iterator[memoryview]:
     try:
         if not path.is_file():
             raise SourceError(f"{path}: is missing; copy the whole folder again")
-        with path.open("rb") as stream:
+        with open_file(path, path.parent) as stream:
             header = stream.read(HEADER_BYTES)
             if header != file.header:
                 raise SourceError(f"{path}: does not fit {META} (its header is another one); copy both again")

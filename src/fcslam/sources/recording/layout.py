@@ -24,6 +24,7 @@ from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams, CameraModel, LaserModel, Sweep
 from fcslam.sources.images import check_camera
 from fcslam.storage.files import write_file
+from fcslam.untrusted import read_bytes
 
 META = "meta.yaml"
 SCANS = "scans.bin"
@@ -168,9 +169,7 @@ def read_meta(folder: Path) -> Meta:
     """
     path = folder / META
     try:
-        with path.open("rb") as file:
-            text = file.read(_MAX_META_BYTES + 1)
-        content = parse_yaml(text) if len(text) <= _MAX_META_BYTES else None
+        content = parse_yaml(read_bytes(path, folder, _MAX_META_BYTES))
     except FileNotFoundError as error:
         raise SourceError(f"{path}: is missing; it says how the laser measures, so copy the whole folder") from error
     except (OSError, ValueError) as error:

@@ -46,6 +46,7 @@ from fcslam.sources.recording.layout import (
     scans_file,
 )
 from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.untrusted import read_bytes
 
 _MAX_COORDINATE = 1e7
 """Metres, or radians of a heading that was never wrapped."""
@@ -120,7 +121,7 @@ class Recording:
         """
         path = self._path / GROUND_TRUTH
         if path.is_file() and path.stat().st_size:
-            for stamp, pose in zip(*read_tum(path), strict=True):
+            for stamp, pose in zip(*read_tum(path, self._path), strict=True):
                 yield GroundTruth(float(stamp), frozen(pose))
 
     @cached_property
@@ -179,10 +180,7 @@ class Recording:
         if suffix not in _SUFFIXES or size > MAX_IMAGE_BYTES:
             raise ValueError("no image of this kind")
         path = image_path(self._path, frame.number - 1, suffix.decode())
-        if not path.is_file():
-            raise ValueError("no file")
-        with path.open("rb") as file:
-            encoded = file.read(size + 1)
+        encoded = read_bytes(path, self._path, MAX_IMAGE_BYTES)
         if len(encoded) != size or crc32(encoded) != frame.content["file_crc32"]:
             raise ValueError("another file")
         check_image(encoded, camera)

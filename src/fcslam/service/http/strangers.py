@@ -1,0 +1,83 @@
+"""One budget for all requests without a known token, so that they cannot delay the robots.
+
+Each waits for its turn, and a connection has one request at a time: so clients that send without pause slow down
+themselves. Turns go round the addresses, so that one address cannot take those of the others.
+"""
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Callable
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+PER_S, AT_ONCE = 100.0, 20.0
+"""Requests that are answered, on average and at once: each takes about a millisecond of the process."""
+MOST_WAITING = 4096
+"""Requests that wait for a turn; further ones are refused."""
+WAITING = "waiting"
+"""Key in the state of a request that waits: its connection may be closed to make room."""
+
+
+class Strangers:
+    """Lets the requests of strangers through at a limited rate; others pass at once."""
+
+    def __init__(self, app: ASGIApp, is_known: Callable[[Scope], bool]) -> None:
+        self._app, self._is_known = app, is_known
+        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
+        """By address, that of the next turn first."""
+        self._count = 0
+        self._credit, self._at = AT_ONCE, 0.0
+        """Requests that may pass now, as of a time of the loop."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on when it is its turn, or refuse it."""
+        if scope["type"] == "http" and not self._is_known(scope) and not self._passes():
+            if self._count >= MOST_WAITING:
+                await _refuse(send)
+                return
+            await self._turn(scope)
+        await self._app(scope, receive, send)
+
+    def _passes(self) -> bool:
+        """Whether a request may pass at once."""
+        now = asyncio.get_running_loop().time()
+        self._credit = min(AT_ONCE, self._credit + (now - self._at) * PER_S)
+        self._at = now
+        if self._waiting or self._credit < 1.0:
+            return False
+        self._credit -= 1.0
+        return True
+
+    async def _turn(self, scope: Scope) -> None:
+        loop = asyncio.get_running_loop()
+        turn = loop.create_future()
+        if not self._waiting:
+            loop.call_later(1.0 / PER_S, self._next)
+        self._waiting.setdefault((scope.get("client") or ("",))[0], deque()).append(turn)
+        self._count += 1
+        scope["state"][WAITING] = True
+        try:
+            await turn
+        finally:
+            del scope["state"][WAITING]
+
+    def _next(self) -> None:
+        """Give the turn to the next address that waits."""
+        address, turns = next(iter(self._waiting.items()))
+        del self._waiting[address]
+        turn = turns.popleft()
+        self._count -= 1
+        if turns:
+            self._waiting[address] = turns
+        if not turn.done():
+            turn.set_result(None)
+        if self._waiting:
+            asyncio.get_running_loop().call_later(1.0 / PER_S, self._next)
+
+
+async def _refuse(send: Send) -> None:
+    body = json.dumps({"error": f"{MOST_WAITING} requests without a known token wait already; send a token"}).encode()
+    headers = [(b"content-type", b"application/json"), (b"retry-after", b"60"), (b"connection", b"close")]
+    await send({"type": "http.response.start", "status": 429, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

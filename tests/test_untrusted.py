@@ -1,0 +1,310 @@
+"""Files from somebody else: what they cannot do to whoever opens them, and that no reader goes past the one module."""
+
+import ast
+import bz2
+import gzip
+import os
+import sqlite3
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+from backports import zstd
+
+from fcslam import untrusted
+from fcslam.config import load
+from fcslam.errors import ConfigError, EvaluationError, SourceError
+from fcslam.mission import MissionConfig
+from fcslam.runs import open_run
+from fcslam.sources import open_source
+from fcslam.sources.logs.archive import numbered_lines
+from tests.sources.bag_messages import drive, mounted, save
+
+SOURCE = Path(untrusted.__file__).parent
+SECRET = "the content of a private file"
+BOMB_BYTES = 1 << 30
+
+OWN = {
+    "compiled.py": "the cache of this user",
+    "bridges/record.py": "the recording that this process writes",
+    "cli/robot.py": "the robot's own token",
+    "cli/serve_learning.py": "written by the training that this service started",
+    "federated": "the folder of this user's training",
+    "features/onnx_runtime.py": "no file",
+    "learning": "the folder of this user's training",
+    "mission_file.py": "what this process wrote",
+    "page/report.py": "files of the package",
+    "page/routes.py": "files of the package",
+    "service": "the folder of the service",
+    "simulation/recording.py": "the settings that this process writes",
+    "sources/logs/carmen_writer.py": "the log that this process writes",
+    "sources/bags/mcap_records.py": "the recording that this process writes",
+    "sources/recording/writer.py": "the recording that this process writes",
+    "storage": "the folder of the service or of this user",
+    "evaluation/federated": "the folder of this user's training",
+    "wire/prediction.py": "files of the package",
+}
+"""Where files of this user are read that nobody else wrote, by module or folder, and which ones."""
+READERS = {
+    "read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "imread", "safe_load",
+    "copyfile", "ZipFile", "LZMAFile", "GzipFile", "BZ2File", "connect", "load_from_string", "InferenceSession",
+}  # fmt: skip
+MODULES = {"np", "cv2", "yaml", "shutil", "zipfile", "gzip", "lzma", "bz2", "sqlite3", "onnx"}
+
+
+def reads(node):
+    """Whether a call reads a file by its path."""
+    name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+    owner = node.func.value.id if isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name) else ""
+    if name == "open":
+        modes = [arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)]
+        return owner in MODULES or any(set(mode) <= set("rbt") for mode in modes)
+    return name in READERS and isinstance(node.func, ast.Attribute) and (owner in MODULES or name.startswith("read_"))
+
+
+def test_no_reader_goes_past_the_one_module():
+    found = set()
+    for path in sorted(SOURCE.rglob("*.py")):
+        name = path.relative_to(SOURCE).as_posix()
+        if name == "untrusted.py" or any(name == own or name.startswith(f"{own}/") for own in OWN):
+            continue
+        calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+        found |= {f"{name}:{call.lineno}: {ast.unparse(call)[:80]}" for call in calls if reads(call)}
+    assert not {line for line in found if "StringIO" not in line and "_PlainLoader" not in line}, (
+        "of text that was read"
+    )
+
+
+@pytest.mark.parametrize("kind", ["link", "folder link", "pipe", "device", "way out"])
+def test_only_regular_files_of_a_folder_are_opened(tmp_path, kind):
+    folder, outside = tmp_path / "run", tmp_path / "outside"
+    folder.mkdir()
+    outside.mkdir()
+    (outside / "file").write_text(SECRET)
+    name = "file"
+    match kind:
+        case "link":
+            (folder / name).symlink_to(outside / "file")
+        case "folder link":
+            (folder / "inner").symlink_to(outside)
+            name = "inner/file"
+        case "pipe":
+            os.mkfifo(folder / name)
+        case "device":
+            (folder / name).symlink_to("/dev/zero")
+        case "way out":
+            name = "../outside/file"
+    with pytest.raises(OSError, match=r"link|pipe|not inside"):
+        untrusted.read_bytes(folder / name, folder)
+
+
+def test_a_link_that_the_user_names_is_followed(tmp_path):
+    (tmp_path / "file").write_text(SECRET)
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    assert untrusted.read_text(tmp_path / "link") == SECRET
+    for kind in ("/dev/zero", tmp_path):
+        with pytest.raises(OSError, match=r"pipe or device|a folder"):
+            untrusted.read_bytes(Path(kind))
+
+
+PACKERS = {
+    "zlib": lambda data: zlib.compress(data, 9),
+    "bz2": bz2.compress,
+    "lz4": lz4.frame.compress,
+    "zstd": zstd.compress,
+}
+
+
+@pytest.mark.parametrize("compression", PACKERS)
+def test_every_decompressor_stops_at_its_limit(compression, monkeypatch):
+    monkeypatch.setattr(untrusted, "FREE_BYTES", 100_000)
+    with pytest.raises(untrusted.LimitError, match="unpack to more than"):
+        untrusted.unpack(PACKERS[compression](bytes(1 << 23)), compression)
+    content = np.random.default_rng(0).integers(0, 9, 100_000).astype(np.uint8).tobytes()
+    packed = PACKERS[compression](content)
+    assert untrusted.unpack(packed, compression) == content
+    assert untrusted.unpack(packed, compression, 1000) == content[:1000]
+    for damaged in (packed[:-9], b"?" + packed):
+        with pytest.raises(ValueError, match=compression):
+            untrusted.unpack(damaged, compression)
+
+
+@pytest.mark.parametrize("packer", [gzip.compress, bz2.compress])
+@pytest.mark.parametrize(("content", "limit"), [(bytes(1 << 22), "MB"), (b"\n" * 40_000, "lines")])
+def test_a_log_that_expands_is_refused(tmp_path, monkeypatch, packer, content, limit):
+    monkeypatch.setattr(untrusted, "FREE_BYTES", 1 << 20)
+    monkeypatch.setattr(untrusted, "MOST_LINES", 10_000)
+    path = tmp_path / "log.gz"
+    path.write_bytes(packer(content))
+    with pytest.raises(SourceError, match=f"unpack to more than .* {limit}"):
+        list(numbered_lines(path))
+
+
+def test_arrays_that_expand_are_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(untrusted, "FREE_BYTES", 1 << 20)
+    np.savez_compressed(tmp_path / "a.npz", a=np.zeros(1 << 20))
+    with pytest.raises(OSError, match="unpack to more than"):
+        untrusted.read_arrays(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE VIEW schema AS WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT sum(x) FROM n",
+        "CREATE TABLE t (a, b AS (zeroblob(1000000000)))",
+        "CREATE VIRTUAL TABLE t USING fts5(a)",
+    ],
+)
+def test_a_database_has_tables_only(tmp_path, statement):
+    path = tmp_path / "bag.db3"
+    save(path, [mounted(), *drive(3)])
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE IF EXISTS schema")
+        database.execute(statement)
+    database.close()
+    with pytest.raises(SourceError, match="only tables are read"):
+        open_source(path).survey()
+
+
+def test_a_query_without_an_end_is_stopped(tmp_path):
+    with sqlite3.connect(tmp_path / "a.db") as database:
+        database.execute("CREATE TABLE t (a)")
+    database.close()
+    opened = untrusted.open_database(tmp_path / "a.db")
+    with pytest.raises(sqlite3.OperationalError, match="interrupted"):
+        opened.execute(
+            "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT sum(x) FROM n"
+        ).fetchone()
+    opened.close()
+
+
+MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 10)}]}}\n" for n in range(1, 12))
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run folder that can be read, made by hand."""
+    folder = tmp_path / "run"
+    (folder / "trajectories").mkdir(parents=True)
+    (folder / "robots.csv").write_text("robot,map,path_length_m,scans\na,0,1.0,1\n")
+    (folder / "trajectories" / "a.tum").write_text("0.0 0 0 0 0 0 0 1\n")
+    columns = "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"
+    (folder / "closures.csv").write_text(f"{columns}\n")
+    (folder / "metrics.json").write_text("[]")
+    (folder / "config.yaml").write_text("seed: 0\n")
+    (folder / "pose_graph.g2o").write_text("")
+    (folder / "map.pgm").write_bytes(b"P5\n1 1\n255\n\x00")
+    (folder / "map.yaml").write_text(
+        "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+    return folder
+
+
+FILES = ("robots.csv", "trajectories/a.tum", "closures.csv", "metrics.json", "config.yaml", "pose_graph.g2o", "map.pgm")
+
+
+@pytest.mark.parametrize("name", [*FILES, "map_9.bin", "mission.fcslam"])
+@pytest.mark.parametrize("kind", ["link", "device", "pipe"])
+def test_a_run_folder_reads_no_file_but_its_own(run, tmp_path, name, kind):
+    assert open_run(run).maps
+    (tmp_path / "private").write_text(SECRET)
+    (run / name).unlink(missing_ok=True)
+    if kind == "pipe":
+        os.mkfifo(run / name)
+    else:
+        (run / name).symlink_to(tmp_path / "private" if kind == "link" else "/dev/zero")
+    with pytest.raises(EvaluationError) as caught:
+        open_run(run)
+    assert SECRET not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("0.05", "1.0e+300", "`resolution` is 1e"),
+        ("0.05", "1.0e-300", "`resolution` is 1e"),
+        ("[0, 0, 0]", "[1.0e+300, 0, 0]", "`origin` is"),
+        ("image: map.pgm\n", MERGES, "aliases"),
+    ],
+)
+def test_a_description_of_a_map_that_cannot_be_is_refused(run, old, new, reason):
+    (run / "map.yaml").write_text((run / "map.yaml").read_text().replace(old, new))
+    with pytest.raises(EvaluationError, match=reason):
+        _ = open_run(run).maps
+
+
+def test_settings_that_expand_are_refused(tmp_path):
+    (tmp_path / "config.yaml").write_text(MERGES)
+    with pytest.raises(ConfigError, match="aliases"):
+        load(MissionConfig, tmp_path / "config.yaml")
+
+
+def test_an_image_that_fills_the_memory_is_not_decoded():
+    header = b"IHDR" + struct.pack(">IIBBBBB", 40_000, 40_000, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    with pytest.raises(untrusted.LimitError, match="40000 x 40000"):
+        untrusted.check_image(png)
+    with pytest.raises(ValueError, match="cannot be read"):
+        untrusted.check_image(b"?" * 100)
+
+
+def chunk(content, compression, stated):
+    """An MCAP file with one chunk."""
+    text = compression.encode()
+    body = struct.pack("<QQQI", 0, 1, stated, 0) + struct.pack("<I", len(text)) + text
+    body += struct.pack("<Q", len(content)) + content
+    header = struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0)
+    records = ((1, header), (6, body), (15, bytes(4)), (2, bytes(20)))
+    magic = b"\x89MCAP0\r\n"
+    return magic + b"".join(bytes([kind]) + struct.pack("<Q", len(data)) + data for kind, data in records) + magic
+
+
+OPEN = """
+import resource, sys, time
+from pathlib import Path
+from fcslam.errors import FcslamError
+from fcslam.sources import open_source
+from fcslam.sources.logs.archive import numbered_lines
+began = time.process_time()
+try:
+    open_source(Path(sys.argv[1])).survey()
+except FcslamError as error:
+    print(error)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+@pytest.mark.parametrize("stated", [100, 1 << 31])
+def test_a_chunk_that_expands_takes_little_memory(tmp_path, stated):
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(chunk(zstd.compress(bytes(BOMB_BYTES)), "zstd", stated))
+    ended = subprocess.run([sys.executable, "-c", OPEN, path], capture_output=True, text=True, check=True, timeout=60)
+    *reason, peak_mb = ended.stdout.splitlines()
+    assert len(reason) == 1
+    assert int(peak_mb) < 500
+
+
+def test_files_of_a_folder_are_named_once_and_are_its_own(tmp_path):
+    path = tmp_path / "bag"
+    save(path, [mounted(), *drive(3)])
+    open_source(path).survey()
+    (data,) = [file for file in path.iterdir() if file.name != "metadata.yaml"]
+    data.rename(tmp_path / "elsewhere")
+    data.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SourceError, match="is a link"):
+        open_source(path).survey()
+
+
+def test_metadata_of_a_folder_does_not_expand(tmp_path):
+    path = tmp_path / "bag"
+    save(path, [mounted(), *drive(3)])
+    metadata = path / "metadata.yaml"
+    metadata.write_text(MERGES + metadata.read_text())
+    with pytest.raises(SourceError, match="aliases"):
+        open_source(path).survey()
