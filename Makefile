@@ -18,6 +18,8 @@ RCLPY := ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-sensor-msgs==5.5.1 ros
 ROSPY := python3-rospy python3-roslaunch python3-rosmaster python3-sensor-msgs python3-nav-msgs python3-std-srvs python3-tf2-ros
 # What the tests of the page drive; axe-core looks for faults of accessibility.
 AXE := axe-core@4.14.1
+# The linter of the page's script.
+BIOME := @biomejs/cli-linux-x64@2.3.8
 HAS_BROWSER := $(BIN)/python -c "import playwright, shutil, sys; sys.exit(not shutil.which('chromium'))" 2>/dev/null
 # torch's build for processors is a tenth of the size of the one that PyPI has.
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
@@ -141,6 +143,9 @@ check: $(INSTALLED)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/codespell .
+	@test -x $(VENV)/biome/package/biome || { mkdir -p $(VENV)/biome && cd $(VENV)/biome && npm pack --silent $(BIOME) >/dev/null 2>&1 && \
+	    tar xzf *.tgz && chmod +x package/biome; } || echo "No Biome from npm, so the page's script is not checked."
+	@test ! -x $(VENV)/biome/package/biome || $(VENV)/biome/package/biome lint --error-on-warnings
 
 bench: $(INSTALLED)
 	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done

@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ import httpx
 import numpy as np
 import processes
 
+from fcslam.maps import palette
 from fcslam.page.routes import ASSETS, FILES
 
 LOGS = Path(__file__).parents[1] / "examples" / "logs"
@@ -45,10 +47,10 @@ PAINTED = """() => {
     const canvas = document.getElementById("map"), pen = canvas.getContext("2d");
     const pixels = pen.getImageData(0, 0, canvas.width, canvas.height).data;
     for (let k = 0; k < pixels.length; k += 4)
-        if (pixels[k + 3] === 255 && pixels[k] === 0 && pixels[k + 1] === 0 && pixels[k + 2] === 0) return true;
+        if (pixels[k] === 31 && pixels[k + 1] === 42 && pixels[k + 2] === 51) return true;
     return false;
 }"""
-"""Whether a wall is drawn."""
+"""Whether a wall is drawn, in the colour of a light page (``palette.WALL``)."""
 FRAMES = """(seconds) => new Promise((done) => {
     const times = [], began = performance.now();
     const next = (now) => {
@@ -147,7 +149,8 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
     ]  # fmt: skip
     fleet = {
         "mission": "many", "version": "1", "read_only": False, "packets": 0, "applied": 0, "waiting": 0,
-        "robots": names, "maps": 1, "metrics": {},
+        "robots": names, "maps": 1, "metrics": {}, "worker_ready": True, "may_edit": False, "map_age_s": 0.0,
+        "free_bytes": None,
     }  # fmt: skip
     fixed = {
         "fleet": fleet, "maps": [{"map": 0, "floor": "", "robots": names, "zoom": 3, "extent": EXTENT}],
@@ -161,8 +164,9 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
         return [
             {"robot": name, "session": name, "epoch": 0, "packets": 1, "map": 0, "floor": "", "path_length_m": 1.0,
              "keyscans": POSES, "T_map_base": [*way[row], 0.1 * row], "T_map_odom": None, "correction": 0,
-             "quality": 0.5, "detectors": {}, "removed": False, "last_heard_s": 0.1}
-            for name, way in zip(names, ways.tolist(), strict=True)
+             "quality": 0.5, "detectors": {}, "removed": False, "last_heard_s": 0.1, "color": f"#{color:06x}",
+             "first_s": 0.0, "last_s": 0.1 * POSES}
+            for name, way, color in zip(names, ways.tolist(), cycle(palette.ROBOTS), strict=False)
         ]  # fmt: skip
 
     class Fleet(BaseHTTPRequestHandler):
@@ -203,6 +207,7 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
         page = browser.new_page(viewport=SIZE)
         page.goto(f"http://127.0.0.1:{server.server_port}/")
         page.wait_for_function(f"document.querySelectorAll('#robots li').length === {ROBOTS}")
+        page.evaluate("document.getElementById('layer-closures').click()")
         found = dragged(page, seconds)
         page.close()
         server.shutdown()

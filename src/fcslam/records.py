@@ -540,6 +540,8 @@ class RegionUse(StrEnum):
 
     ERASE = "erase"
     """Its cells are unknown."""
+    FREE = "free"
+    """Its cells are free."""
     KEEP_OUT = "keep-out"
     """Robots must not enter it."""
     AREA = "area"

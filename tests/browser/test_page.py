@@ -8,12 +8,15 @@ import socket
 from contextlib import closing, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
+from zipfile import ZipFile
 
 import httpx
 import pytest
 
 from fcslam.cli import main
-from fcslam.page.routes import ASSETS
+from fcslam.maps.palette import FLOOR, ROBOTS, WALL
+from fcslam.page import ASSETS
+from fcslam.runs.map_files import parse_map
 from tests.cli.test_serve import API, Service, send
 
 pytestmark = pytest.mark.system
@@ -49,8 +52,13 @@ def says(page, selector, text):
     playwright.expect(page.locator(selector)).to_contain_text(text, timeout=WAIT_MS)
 
 
-def options(page, selector):
-    return page.locator(f"{selector} option").all_inner_texts()
+def maps(page):
+    """Titles of the maps; the page hides them while there is one."""
+    return page.locator("#tabs button").all_text_contents()
+
+
+def view(page, name):
+    page.locator(f"nav [data-view={name}]").click()
 
 
 def until(page, condition, what):
@@ -61,31 +69,25 @@ def until(page, condition, what):
     pytest.fail(f"the page never came to it: {what}")
 
 
-def painted(page):
-    """Shades of grey on the map's canvas: paper, floor and walls once there is a map."""
+def pixels(page, colours):
+    """Number of pixels of the map's canvas in each of these colours."""
     return page.evaluate(
-        """() => {
-            const canvas = document.getElementById("map"), pen = canvas.getContext("2d");
-            const pixels = pen.getImageData(0, 0, canvas.width, canvas.height).data, shades = new Set();
-            for (let k = 0; k < pixels.length; k += 4)
-                if (pixels[k + 3] && pixels[k] === pixels[k + 1] && pixels[k] === pixels[k + 2]) shades.add(pixels[k]);
-            return shades.size;
-        }"""
+        """(colours) => {
+            const canvas = document.getElementById("map"), pen = canvas.getContext("2d"), counts = {};
+            const { data } = pen.getImageData(0, 0, canvas.width, canvas.height);
+            for (let k = 0; k < data.length; k += 4) {
+                const colour = (data[k] << 16) | (data[k + 1] << 8) | data[k + 2];
+                counts[colour] = (counts[colour] ?? 0) + 1;
+            }
+            return colours.map((colour) => counts[colour] ?? 0);
+        }""",
+        colours,
     )
 
 
-def coloured(page):
-    """Pixels of the map's canvas that are not grey: paths, robots and closures."""
-    return page.evaluate(
-        """() => {
-            const canvas = document.getElementById("map"), pen = canvas.getContext("2d");
-            const pixels = pen.getImageData(0, 0, canvas.width, canvas.height).data;
-            let count = 0;
-            for (let k = 0; k < pixels.length; k += 4)
-                count += pixels[k] !== pixels[k + 1] || pixels[k] !== pixels[k + 2];
-            return count;
-        }"""
-    )
+def has_map(page):
+    """Whether walls and floor are drawn, in the colours of a light page."""
+    return min(pixels(page, [WALL, FLOOR])) > 100
 
 
 @pytest.fixture(scope="module")
@@ -102,75 +104,146 @@ def mapped(packets, tmp_path_factory):
 def test_robots_join_before_the_eyes_of_a_viewer(page, packets, tmp_path):
     with closing(Service(tmp_path / "data")) as service:
         page.goto(service.url)
-        says(page, "#status", "live")
+        says(page, "#empty", "No robot has sent anything yet")
         play(service.url, packets, ("robot_1",))
         says(page, "#robots", "robot_1")
-        until(page, lambda: painted(page) >= 3, "the map of the first robot")
+        until(page, lambda: has_map(page), "the map of the first robot")
+        assert not page.locator("#empty").is_visible()
         play(service.url, packets, ("robot_2", "robot_3"))
         says(page, "#robots", "robot_3")
-        until(page, lambda: options(page, "#maps") == ["0: robot_1, robot_2, robot_3"], "one map")
-        says(page, "#events", "robot_2 begins")
+        until(page, lambda: maps(page) == ["robot_1, robot_2 and robot_3"], "one map")
+        view(page, "history")
+        says(page, "#events", "robot_2 begins to map")
+        says(page, "#events", "saw the same place for the first time")
+        says(page, "#status", "Live")
 
 
 def test_a_veto_separates_maps_and_its_undo_joins_them_again(page, packets, tmp_path):
     with closing(Service(tmp_path / "data")) as service:
         play(service.url, packets, ("robot_1", "robot_2"))
         page.goto(service.url)
-        until(page, lambda: options(page, "#maps") == ["0: robot_1, robot_2"], "one map")
-        vetoes = 0
-        while len(options(page, "#maps")) == 1:
-            between = page.locator("#list option").filter(has_text=re.compile("robot_1.*robot_2"))
-            until(page, lambda: between.count() or len(options(page, "#maps")) == 2, "a closure or two maps")  # noqa: B023
-            if not between.count():
+        until(page, lambda: maps(page) == ["robot_1 and robot_2"], "one map")
+        view(page, "evidence")
+        pairs, vetoes = page.locator("#list tr"), 0
+        while len(maps(page)) == 1:
+            until(page, lambda: pairs.count() or len(maps(page)) == 2, "a pair or two maps")
+            if not pairs.count():
                 break
-            page.locator("#list").select_option(between.first.get_attribute("value"))
-            says(page, "#facts-of-closure", "robot_1 (blue) and robot_2 (orange)")
+            key = pairs.first.get_attribute("data-key")
+            pairs.first.locator("button").click()
             page.locator("#veto").click()
             vetoes += 1
-            says(page, "#message", f"Edit {vetoes} (veto) is stored")
-            until(
-                page,
-                lambda: "vetoed" in page.locator("#facts-of-closure").inner_text() or len(options(page, "#maps")) == 2,
-                "the veto",
-            )
-        assert page.locator("#separations li").count() == 1
-        pictures = page.locator("#previews button")
-        assert pictures.count() == 2
+            says(page, "#message", f"Saved as edit {vetoes}")
+            vetoed = page.locator(f'#list tr[data-key="{key}"]')
+            until(page, lambda: not vetoed.count() or len(maps(page)) == 2, "the veto")  # noqa: B023
+        view(page, "attention")
+        says(page, "#attention", "robot_1 and robot_2 have separate maps.")
+        page.get_by_role("button", name="Open edits").click()
+        tabs = page.locator("#tabs button")
         for number in (1, 0):
-            pictures.nth(number).click()
-            assert page.locator("#maps").input_value() == str(number)
-            assert pictures.nth(number).get_attribute("aria-pressed") == "true"
+            tabs.nth(number).click()
+            assert page.locator('#tabs [aria-pressed="true"]').get_attribute("data-map") == str(number)
+        view(page, "edits")
         for number in range(1, vetoes + 1):
             page.get_by_role("button", name=f"Undo edit {number}", exact=True).click()
-        until(page, lambda: options(page, "#maps") == ["0: robot_1, robot_2"], "one map again")
+        until(page, lambda: maps(page) == ["robot_1 and robot_2"], "one map again")
 
 
-def test_a_closure_is_selected_on_the_map_and_shows_both_submaps(page, mapped):
+def test_a_line_on_the_map_is_selected_and_shows_what_both_robots_saw(page, mapped):
     page.goto(mapped.url)
-    until(page, lambda: page.locator("#list option").count() > 0 and painted(page) >= 3, "closures")
+    until(page, lambda: has_map(page), "the map")
+    page.locator("#layers summary").click()
+    page.locator("#layer-closures").check()
     box = page.locator("#map").bounding_box()
-    for across in range(20, int(box["width"]), 7):
+    for across in range(300, int(box["width"]), 7):
         page.mouse.click(box["x"] + across, box["y"] + box["height"] / 2)
         if page.locator("#closure").is_visible():
             break
-    says(page, "#facts-of-closure", "Similarity")
+    says(page, "#facts-of-closure", "Off by")
     playwright.expect(page.locator("#overlay")).to_be_visible(timeout=WAIT_MS)
 
 
+def test_the_evidence_is_sorted_and_filtered(page, mapped):
+    page.goto(f"{mapped.url}#view=evidence")
+    cells = page.locator("#list tr td:nth-child(6)")
+    until(page, lambda: cells.count() > 3, "pairs")
+    for down in (False, True):
+        page.get_by_role("button", name="Off by").click()
+        shown = [0.5 if "under" in text else float(text.split()[0]) for text in cells.all_inner_texts()]
+        assert shown == sorted(shown, reverse=down)
+    page.locator("#of-robot").select_option("robot_3")
+    until(page, lambda: all("robot_3" in text for text in page.locator("#list tr").all_inner_texts()), "one robot")
+
+
 def test_the_past_of_a_mission_is_shown(page, mapped):
-    page.goto(mapped.url)
-    until(page, lambda: page.locator("#list option").count() > 0 and painted(page) >= 3, "the map")
+    page.goto(f"{mapped.url}#view=history")
+    until(page, lambda: has_map(page) and page.locator("#events li").count() > 3, "the map")
     page.wait_for_timeout(1000)
-    now = coloured(page)
+
+    def coloured():
+        return sum(pixels(page, list(ROBOTS[:3])))
+
+    now = coloured()
     page.locator("#moment").fill("10")
-    told = re.search(r"(\d+) of (\d+) keyscans, (\d+) of (\d+) closures", page.locator("#until").inner_text())
-    shown, total, closures, accepted = map(int, told.groups())
+    shown, total = map(int, re.search(r"(\d+) of (\d+) scans", page.locator("#share").inner_text()).groups())
     assert shown == -(-total // 100)
-    assert closures < accepted
-    until(page, lambda: coloured(page) < now / 4, "paths that end in the past")
+    says(page, "#until", "min into the drive")
+    until(page, lambda: coloured() < now / 2, "paths that end in the past")
     page.locator("#moment").fill("1000")
     says(page, "#until", "now")
-    until(page, lambda: coloured(page) == now, "the paths of now")
+    until(page, lambda: coloured() == now, "the paths of now")
+
+
+def test_a_distance_is_measured_and_a_link_opens_the_same_view(page, browser, mapped):
+    page.goto(f"{mapped.url}#view=map")
+    until(page, lambda: has_map(page), "the map")
+    page.locator("[data-tool=distance]").click()
+    metres = page.evaluate("() => Number(document.getElementById('metres').textContent.split(' ')[0])")
+    bar = page.locator("#bar").bounding_box()["width"]
+    box = page.locator("#map").bounding_box()
+    for across in (300, 300 + bar):
+        page.mouse.click(box["x"] + across, box["y"] + 300)
+    assert float(page.locator("#measured").inner_text().split()[0]) == pytest.approx(metres, rel=0.03)
+    page.keyboard.press("Escape")
+    page.locator("#map").focus()
+    for key in ("+", "+", "ArrowLeft"):
+        page.keyboard.press(key)
+    until(page, lambda: "scale" in page.url, "the view in the address")
+    page.wait_for_timeout(500)
+    place = page.url
+    with closing(browser.new_page(viewport=page.viewport_size)) as other:
+        other.goto(place)
+        until(other, lambda: has_map(other), "the same view")
+        assert other.locator("#metres").inner_text() == page.locator("#metres").inner_text()
+        until(other, lambda: other.url == place, "the same address")
+
+
+def test_a_keep_out_is_drawn_and_taken_back_and_the_map_is_downloaded(page, mapped, tmp_path):
+    page.goto(f"{mapped.url}#view=edits")
+    until(page, lambda: has_map(page), "the map")
+    page.get_by_role("button", name="Keep robots out").click()
+    box = page.locator("#map").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 50, y + 50)
+    page.mouse.move(x + 100, y + 80)
+    page.mouse.up()
+    says(page, "#measured", "4 points")
+    page.locator("#save").click()
+    says(page, "#edits", "drew a keep-out")
+    edit = httpx.get(f"{mapped.url}{API}/edits").json()[-1]
+    assert (edit["kind"], edit["content"]["use"], len(edit["content"]["polygon"])) == ("region", "keep-out", 4)
+    page.get_by_role("button", name=f"Undo edit {edit['number']}", exact=True).click()
+    says(page, "#edits", f"taken back by edit {edit['number'] + 1}")
+    view(page, "files")
+    with page.expect_download() as downloaded:
+        page.get_by_role("button", name="Map for Nav2").click()
+    downloaded.value.save_as(tmp_path / "map.zip")
+    with ZipFile(tmp_path / "map.zip") as archive:
+        assert archive.testzip() is None
+        content = {name: archive.read(name) for name in ("map.pgm", "map.yaml")}
+    assert parse_map("map", content["map.pgm"], content["map.yaml"].decode()).cells.size > 0
 
 
 def test_rounds_of_a_federated_training_are_drawn(page, tmp_path):
@@ -178,7 +251,7 @@ def test_rounds_of_a_federated_training_are_drawn(page, tmp_path):
     (tmp_path / "rounds.csv").write_text(f"{head}\n1,a,0,anna | bob,,0.5,0.25\n2,b,1,anna,bob: too late,0.25,0.375\n")
     with closing(Service(tmp_path / "data", "--learning", str(tmp_path))) as service:
         page.goto(service.url)
-        page.get_by_text("Federated training").click()
+        page.get_by_text("Shared training").click()
         says(page, "#learned", "2 rounds, 1 released")
         assert page.locator("#curves polyline").count() == 2
         assert page.locator("#curves circle").count() == 2
@@ -195,9 +268,9 @@ def test_the_page_recovers_when_the_service_is_killed_and_comes_back(page, packe
     page.goto(service.url)
     says(page, "#robots", "robot_1")
     service.kill()
-    says(page, "#status", "no connection; trying again")
+    says(page, "#status", "No connection to the service; trying again")
     with closing(Service(tmp_path / "data", "--port", str(port))) as service:
-        says(page, "#status", "live")
+        says(page, "#status", "Live")
         play(service.url, packets, ("robot_2",))
         says(page, "#robots", "robot_2")
 
@@ -217,17 +290,22 @@ def test_a_viewer_sees_and_may_not_veto(page, packets, credentials, tmp_path):
         for robot in ("robot_1", "robot_2"):
             play(service.url, packets, (robot,), Authorization=f"Bearer {token(robot)}")
         page.goto(service.url)
-        says(page, "#status", "needs")
+        says(page, "#status", "needs a token")
         page.get_by_label("Token").fill("wrong")
         page.keyboard.press("Enter")
-        says(page, "#status", "needs")
+        says(page, "#status", "needs a token")
         page.get_by_label("Token").fill(token("eye"))
         page.keyboard.press("Enter")
-        says(page, "#status", "live")
-        until(page, lambda: page.locator("#list option").count() > 0, "closures")
-        page.locator("#list").select_option(index=0)
-        page.locator("#veto").click()
-        says(page, "#message", "'eye' is a viewer; this needs the role admin")
+        says(page, "#status", "Live")
+        says(page, "#robots", "robot_2")
+        view(page, "evidence")
+        until(page, lambda: page.locator("#list tr").count() > 0, "pairs")
+        page.locator("#list button").first.click()
+        playwright.expect(page.locator("#locate")).to_be_visible(timeout=WAIT_MS)
+        view(page, "edits")
+        says(page, "#locked", "Your token may look")
+        assert page.locator(".admin:visible").count() == 0
+        assert "Mission file" not in page.locator("#files").text_content()
         with httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {token('eye')}"}) as client:
             assert client.get(f"{API}/edits").json() == []
 
@@ -245,20 +323,20 @@ def test_a_token_that_expires_is_asked_for_again_and_nothing_is_lost(page, packe
         says(page, "#robots", "robot_1")
         assert main(["tokens", "revoke", "--tokens", str(tokens), "eye"]) == 0
         service.process.send_signal(signal.SIGHUP)
-        page.get_by_role("checkbox", name="robot_1").uncheck()
-        page.locator("#state").select_option("rejected")
-        says(page, "#status", "needs")
+        page.get_by_role("button", name="robot_1").click()
+        says(page, "#status", "needs a token")
         playwright.expect(page.get_by_label("Token")).to_be_visible(timeout=WAIT_MS)
         says(page, "#robots", "robot_1")
-        assert not page.get_by_role("checkbox", name="robot_1").is_checked()
+        assert page.get_by_role("button", name="robot_1").get_attribute("aria-pressed") == "true"
 
 
 def test_the_page_fits_a_phone(browser, mapped):
     with closing(browser.new_page(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)) as phone:
         phone.goto(mapped.url)
-        says(phone, "#robots", "robot_1")
-        until(phone, lambda: painted(phone) >= 3, "the map")
-        assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+        until(phone, lambda: has_map(phone), "the map")
+        for name in ("evidence", "edits", "files", "map"):
+            view(phone, name)
+            assert phone.evaluate("document.documentElement.scrollWidth") <= 390
         box = phone.locator("#map").bounding_box()
         assert box["width"] == 390
         assert box["height"] > 300
@@ -266,36 +344,36 @@ def test_the_page_fits_a_phone(browser, mapped):
 
 def test_the_keyboard_is_enough(page, mapped):
     page.goto(mapped.url)
-    until(page, lambda: page.locator("#list option").count() > 0 and painted(page) >= 3, "the map")
+    until(page, lambda: has_map(page), "the map")
 
-    def focused():
-        return page.evaluate("document.activeElement.id")
-
-    def tab_to(name):
+    def tab_to(selector):
         for _ in range(60):
             page.keyboard.press("Tab")
-            if focused() == name:
+            if page.evaluate("selector => document.activeElement.matches(selector)", selector):
                 return
-        pytest.fail(f"the keyboard does not reach {name}")
+        pytest.fail(f"the keyboard does not reach {selector}")
 
-    tab_to("map")
+    tab_to("[data-view=evidence]")
+    page.keyboard.press("Enter")
+    until(page, lambda: page.locator("#list tr").count() > 0, "pairs")
+    tab_to("#list button")
+    page.keyboard.press("Enter")
+    playwright.expect(page.locator("#closure")).to_be_visible(timeout=WAIT_MS)
+    tab_to("#pin")
+    page.keyboard.press("Enter")
+    says(page, "#message", "Saved as edit")
+    view(page, "map")
+    page.locator("body").focus()
+    tab_to("#map")
     before = page.locator("#map").screenshot()
     for key in ("ArrowLeft", "+", "+", "ArrowUp"):
         page.keyboard.press(key)
     page.wait_for_timeout(500)
     assert page.locator("#map").screenshot() != before
-    page.keyboard.press("0")
-    tab_to("list")
-    page.keyboard.press("ArrowDown")
-    playwright.expect(page.locator("#closure")).to_be_visible(timeout=WAIT_MS)
-    tab_to("veto")
-    page.keyboard.press("Enter")
-    says(page, "#message", "(veto) is stored")
 
 
-def colour_of(page, robot):
-    row = page.locator("#robots li").filter(has_text=f"{robot}:")
-    return row.locator(".swatch").evaluate("swatch => swatch.style.background")
+def colours_in(page, selector):
+    return page.locator(f"{selector} .swatch").evaluate_all("all => all.map((one) => one.style.background)")
 
 
 def test_an_edit_shows_at_once_and_what_it_removes_is_gone(page, packets, tmp_path):
@@ -305,19 +383,19 @@ def test_an_edit_shows_at_once_and_what_it_removes_is_gone(page, packets, tmp_pa
         play(service.url, packets, ("robot_2",))
         page.goto(service.url)
         says(page, "#robots", "robot_2")
-        colour = colour_of(page, "robot_2")
+        (colour,) = colours_in(page, "#robots")
         play(service.url, packets, ("robot_1",))
-        until(page, lambda: options(page, "#maps") == ["0: robot_2, robot_1"], "one map")
-        assert colour_of(page, "robot_2") == colour, "a robot keeps its colour, whoever comes before it in the list"
-        between = page.locator("#list option").filter(has_text=re.compile("robot_2 . robot_1"))
-        page.locator("#list").select_option(between.first.get_attribute("value"))
-        says(page, "#facts-of-closure", "robot_2 (blue) and robot_1 (orange)")
-        until(page, lambda: painted(page) >= 3, "the map")
+        until(page, lambda: maps(page) == ["robot_2 and robot_1"], "one map")
+        until(page, lambda: colours_in(page, "#robots")[1:] == [colour], "a robot keeps its colour")
+        view(page, "evidence")
+        page.locator("#list button").first.click()
+        until(page, lambda: colour in colours_in(page, "#sides"), "the same colour")
+        until(page, lambda: has_map(page), "the map")
         before = len(tiles)
         removal = {"kind": "removal", "content": {"robot": "robot_2"}}
         assert httpx.post(f"{service.url}{API}/edits", json=removal, timeout=60.0).status_code == 201
-        says(page, "#robots", "robot_2: removed")
-        says(page, "#message", "The selected closure is no longer there")
+        says(page, "#robots", "Removed by hand")
+        says(page, "#message", "The chosen pair is no longer there")
         assert not page.locator("#closure").is_visible()
         until(page, lambda: len(tiles) > before, "the tiles of the edited map")
 
@@ -325,9 +403,9 @@ def test_an_edit_shows_at_once_and_what_it_removes_is_gone(page, packets, tmp_pa
 def test_a_connection_that_falls_silent_is_noticed(page, mapped):
     page.route("**/api/v1/events", lambda _: None)  # nothing ever comes
     page.goto(mapped.url)
-    says(page, "#status", "no connection; trying again")
+    says(page, "#status", "No connection to the service; trying again")
     page.unroute("**/api/v1/events")
-    says(page, "#status", "live")
+    says(page, "#status", "Live")
 
 
 def test_a_fault_of_the_service_is_said(page, mapped):
@@ -336,12 +414,12 @@ def test_a_fault_of_the_service_is_said(page, mapped):
     page.goto(mapped.url)
     says(page, "#status", "the disk is full or broken; free some space; trying again")
     page.unroute("**/api/v1/edits")
-    says(page, "#status", "live")
+    says(page, "#status", "Live")
 
 
 def test_shortcuts_of_the_browser_are_left_to_it_and_the_pointer_has_coordinates(page, mapped):
     page.goto(mapped.url)
-    until(page, lambda: painted(page) >= 3, "the map")
+    until(page, lambda: has_map(page), "the map")
     page.locator("#map").focus()
     taken = """key => !document.getElementById("map").dispatchEvent(
         new KeyboardEvent("keydown", { key, ctrlKey: true, cancelable: true }))"""
@@ -355,13 +433,15 @@ def test_a_robot_with_a_hostile_name_is_text(page, mapped):
     """No robot can have such a name; a page must not rely on that."""
     evil = "<script>window.evil=1</script><img src=x onerror=window.evil=1>"
 
-    robots = [{**robot, "session": evil} for robot in httpx.get(f"{mapped.url}{API}/robots").json()]
+    robots = [{**robot, "session": evil, "robot": evil} for robot in httpx.get(f"{mapped.url}{API}/robots").json()]
     page.route("**/api/v1/robots", lambda route: route.fulfill(body=json.dumps(robots)))
     page.route("**/api/v1/trajectories/**", lambda route: route.fulfill(body="0 0 0 0 0 0 0 1\n"))
     page.goto(mapped.url)
     says(page, "#robots", evil)
+    for name in ("attention", "evidence", "history", "edits", "files"):
+        view(page, name)
     assert page.evaluate("window.evil") is None
-    assert page.locator("#robots img, #robots script").count() == 0
+    assert page.locator("main img, main script").count() == 0
 
 
 def test_the_page_is_small():
@@ -375,11 +455,15 @@ def test_axe_finds_no_serious_fault(browser, mapped):
         context = browser.new_context(bypass_csp=True, color_scheme=scheme)
         with closing(context), closing(context.new_page()) as page:
             page.goto(mapped.url)
-            until(page, lambda: page.locator("#list option").count() > 0, "closures")
-            page.locator("#list").select_option(index=0)
+            says(page, "#robots", "robot_1")
+            page.locator("#layers summary").click()
             page.add_script_tag(path=AXE)
-            found = page.evaluate("axe.run()")["violations"]
-            assert [v["id"] for v in found if v["impact"] in ("serious", "critical")] == []
+            for name in ("map", "fleet", "attention", "evidence", "history", "edits", "files"):
+                view(page, name)
+                if name == "evidence":
+                    page.locator("#list button").first.click()
+                found = page.evaluate("axe.run()")["violations"]
+                assert [(name, v["id"]) for v in found if v["impact"] in ("serious", "critical")] == []
 
 
 def test_a_slow_reader_of_events_keeps_nobody_waiting(page, mapped):
@@ -390,7 +474,7 @@ def test_a_slow_reader_of_events_keeps_nobody_waiting(page, mapped):
         for one in idle:
             one.sendall(b"GET /api/v1/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
     page.goto(mapped.url)
-    says(page, "#status", "live")
+    says(page, "#status", "Live")
     says(page, "#robots", "robot_1")
     for one in idle:
         one.close()

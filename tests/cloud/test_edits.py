@@ -195,6 +195,7 @@ def edits_that_can_be_undone(result):
         "cut": Cut(i, at_i - 3.0, at_i + 3.0),
         "pin": Pin(i, j, (at_i, at_j)),
         "closure": ManualClosure(i, at_i, j, at_j, T_i_j, (0.001, 0.001)),
+        "rough closure": ManualClosure(i, at_i, j, at_j, T_i_j, (0.5, 0.1)),
         "placement": Placement(i, at_i, (3.0, 4.0, 1.0)),
         "region": MapRegion(RegionUse.AREA, "Room 1", i, at_i, ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0))),
     }
@@ -207,7 +208,7 @@ def told(result):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["veto", "cut", "pin", "closure", "placement", "region"])
+@pytest.mark.parametrize("kind", ["veto", "cut", "pin", "closure", "rough closure", "placement", "region"])
 def test_an_edit_counts_whenever_it_is_made_and_its_undo_leaves_no_trace(plain, two, kind):
     late, unedited = plain
     before, change = told(unedited), edits_that_can_be_undone(unedited)[kind]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.placement import PlacedRegion
-from fcslam.cloud.regions import erased, region_files
+from fcslam.cloud.regions import region_files, with_regions
 from fcslam.records import RegionUse
 from fcslam.runs import OccupancyMap
 from fcslam.runs.map_files import Occupancy, parse_map
@@ -31,7 +31,7 @@ def is_inside(corners, x, y):
 
 @pytest.mark.parametrize("corners", [TRIANGLE, TRIANGLE[::-1], L_SHAPE], ids=["triangle", "clockwise", "L"])
 def test_an_erased_region_covers_the_cells_with_their_centre_inside_and_at_most_those_at_its_edge(corners):
-    changed = erased(MAP, [region(RegionUse.ERASE, corners)]).cells != MAP.cells
+    changed = with_regions(MAP, [region(RegionUse.ERASE, corners)]).cells != MAP.cells
     height, width = MAP.cells.shape
     xs, ys = (MAP.origin_xy[axis] + (np.arange(n) + 0.5) * SIDE_M for axis, n in ((0, width), (1, height)))
     inside = np.array([[is_inside(corners, x, y) for x in xs] for y in ys], dtype=bool)
@@ -43,9 +43,9 @@ def test_an_erased_region_covers_the_cells_with_their_centre_inside_and_at_most_
 
 def test_a_region_may_be_larger_than_the_map_or_beside_it():
     all_of_it = [(-1e5, -1e5), (1e5, -1e5), (1e5, 1e5), (-1e5, 1e5)]
-    assert (erased(MAP, [region(RegionUse.ERASE, all_of_it)]).cells == Occupancy.UNKNOWN).all()
+    assert (with_regions(MAP, [region(RegionUse.ERASE, all_of_it)]).cells == Occupancy.UNKNOWN).all()
     beside = [(90.0, 0.0), (91.0, 0.0), (90.0, 1.0)]
-    assert erased(MAP, [region(RegionUse.ERASE, beside)]).cells.tobytes() == MAP.cells.tobytes()
+    assert with_regions(MAP, [region(RegionUse.ERASE, beside)]).cells.tobytes() == MAP.cells.tobytes()
 
 
 @pytest.mark.parametrize("side_m", [0.05, 0.002, 0.001])
@@ -55,7 +55,7 @@ def test_a_corner_far_away_moves_no_edge(side_m, far_m):
     fine = replace(MAP, resolution_m=side_m, origin_xy=(-30 * side_m, -20 * side_m))
     slope = 0.3
     corners = [(-slope * far_m, -far_m), (far_m, -far_m), (far_m, far_m), (slope * far_m, far_m)]
-    changed = erased(fine, [region(RegionUse.ERASE, corners)]).cells != fine.cells
+    changed = with_regions(fine, [region(RegionUse.ERASE, corners)]).cells != fine.cells
     y, x = ((np.arange(count) + 0.5 - count / 2.0) for count in fine.cells.shape)
     right_of_it = x[None] - slope * y[:, None]
     assert changed[right_of_it > 0.1].all()
@@ -65,16 +65,25 @@ def test_a_corner_far_away_moves_no_edge(side_m, far_m):
 def test_a_far_part_of_a_region_in_two_pieces_covers_nothing_between_them():
     """A U that is open to the right, with its bottom a kilometre to the left: two bars cross the map."""
     bars = [(-1e5, -0.8), (1e5, -0.8), (1e5, -0.3), (-1e3, -0.3), (-1e3, 1.0), (1e5, 1.0), (1e5, 1.5), (-1e5, 1.5)]
-    changed = erased(MAP, [region(RegionUse.ERASE, bars)]).cells != MAP.cells
+    changed = with_regions(MAP, [region(RegionUse.ERASE, bars)]).cells != MAP.cells
     y = MAP.origin_xy[1] + (np.arange(len(changed)) + 0.5) * SIDE_M
     covered = ((y > -0.8) & (y < -0.3)) | ((y > 1.0) & (y < 1.5))
     assert changed[covered].all()
     assert not changed[np.abs(y - 0.35) < 0.5].any()
 
 
+def test_a_freed_region_is_free_and_of_two_regions_the_later_one_counts():
+    both = [region(RegionUse.ERASE, TRIANGLE), region(RegionUse.FREE, TRIANGLE)]
+    inside = with_regions(MAP, both[:1]).cells == Occupancy.UNKNOWN
+    for regions, becomes in ((both, Occupancy.FREE), (both[::-1], Occupancy.UNKNOWN)):
+        cells = with_regions(MAP, regions).cells
+        assert (cells[inside] == becomes).all()
+        assert np.array_equal(cells[~inside], MAP.cells[~inside])
+
+
 def test_only_an_erasure_erases():
     for use in (RegionUse.AREA, RegionUse.KEEP_OUT):
-        assert erased(MAP, [region(use, TRIANGLE)]) is MAP
+        assert with_regions(MAP, [region(use, TRIANGLE)]) is MAP
 
 
 def test_the_mask_of_nav2_has_the_cells_of_the_map():
@@ -83,7 +92,9 @@ def test_the_mask_of_nav2_has_the_cells_of_the_map():
     mask = parse_map("mask", files["map_1_keepout.pgm"], files["map_1_keepout.yaml"].decode())
     assert b"image: map_1_keepout.pgm" in files["map_1_keepout.yaml"]
     assert (mask.resolution_m, mask.origin_xy, mask.cells.shape) == (SIDE_M, MAP.origin_xy, MAP.cells.shape)
-    covered = erased(MAP, [region(RegionUse.ERASE, corners) for corners in (TRIANGLE, L_SHAPE)]).cells != MAP.cells
+    covered = (
+        with_regions(MAP, [region(RegionUse.ERASE, corners) for corners in (TRIANGLE, L_SHAPE)]).cells != MAP.cells
+    )
     assert np.array_equal(mask.cells, np.where(covered, Occupancy.OCCUPIED, Occupancy.FREE))
 
 

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fcslam.maps import palette
 from fcslam.maps.drawing import (
     CLOSURE,
     CLOSURES_APART_M,
@@ -13,7 +14,6 @@ from fcslam.maps.drawing import (
     LINE_HEIGHT_PX,
     LONG_SIDE_PX,
     PAPER,
-    ROBOTS,
     WALL,
     DrawnClosure,
     map_png,
@@ -22,6 +22,7 @@ from fcslam.maps.drawing import (
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 SIDE_M = 0.05
+ROBOTS = tuple((rgb & 255, rgb >> 8 & 255, rgb >> 16) for rgb in palette.ROBOTS)
 
 
 def walled(height, width, origin_xy=(-3.0, 2.0), resolution_m=SIDE_M):
@@ -67,7 +68,7 @@ def test_the_long_side_is_about_1600_pixels_and_walls_are_crisp(shape):
 
 def test_trajectories_lie_on_the_map_with_y_up():
     fused = walled(120, 180)  # the hall spans x -1.5 .. 4.5, y 3 .. 7
-    image = seen(map_png(fused, {"one": way((-1.0, 3.5), (4.0, 3.5)), "two": way((4.0, 6.5), (3.0, 6.5))}, []))
+    image = seen(map_png(fused, {"robot_1": way((-1.0, 3.5), (4.0, 3.5)), "robot_2": way((4.0, 6.5), (3.0, 6.5))}, []))
     top, left = where(image, WALL).min(axis=0)
     bottom, right = where(image, WALL).max(axis=0)
 
@@ -139,7 +140,7 @@ def test_beams_through_a_window_do_not_widen_the_picture():
 
 def test_a_robot_outside_the_known_area_is_shown():
     fused = walled(120, 180)
-    image = seen(map_png(fused, {"lost": way((-2.5, 2.3), (-2.5, 2.6))}, []))
+    image = seen(map_png(fused, {"a": way((-2.5, 2.3), (-2.5, 2.6))}, []))
     assert len(where(image[:-80], ROBOTS[0])) > 50
 
 
@@ -177,3 +178,13 @@ def test_a_map_of_nothing_is_still_a_picture(shape):
 @pytest.mark.parametrize(("given", "expected"), [(0.99, 0.5), (1.0, 1.0), (4.99, 2.0), (7.3, 5.0), (123.0, 100.0)])
 def test_lengths_are_rounded_down_to_1_2_5(given, expected):
     assert round_length(given) == pytest.approx(expected)
+
+
+def test_a_robot_has_one_colour_whoever_else_is_there():
+    alone = palette.robot_colors(["robot_2"])["robot_2"]
+    fleet = palette.robot_colors(["robot_1", "robot_2", "robot_2+1", "robot_3"])
+    assert fleet["robot_2"] == fleet["robot_2+1"] == alone
+    assert len(set(fleet.values())) == 3
+    names = [f"{letter}{k}" for letter in "ab" for k in range(1, 5)]
+    assert len(set(palette.robot_colors(names).values())) == 8, "names that want one colour get different ones"
+    assert len(palette.robot_colors([f"r{k}" for k in range(30)])) == 30

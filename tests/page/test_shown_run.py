@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import gzip
 import hashlib
 import json
 import re
@@ -19,9 +20,8 @@ from fastapi.routing import iter_route_contexts
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EvaluationError
 from fcslam.mission_file import as_stored, mission_bytes
-from fcslam.page import viewer
+from fcslam.page import ASSETS, MODULES, viewer
 from fcslam.page.report import MOST_TILES, report_html
-from fcslam.page.routes import ASSETS
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
@@ -215,6 +215,10 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
     assert len(deepest) == 4  # 8 m from -3 m and -2 m on, in tiles of 16 m
     (tile,) = ask(shown, f"/api/v1/{deepest[0]}")
     assert base64.b64decode(responses["pictures"][deepest[0]]) == tile.content
+    files = responses["files"]
+    assert {"maps/0.pgm", "maps/0.yaml", "maps/1.pgm"} <= set(files)
+    (pgm,) = ask(shown, "/api/v1/maps/0.pgm")
+    assert gzip.decompress(base64.b64decode(files["maps/0.pgm"])) == pgm.content
 
 
 @pytest.mark.parametrize(("resolution_m", "zoom"), [(2.0, 0), (8.0, 0), (64.0, -1)])
@@ -245,16 +249,23 @@ def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
     command = [CHROMIUM, *options, "--virtual-time-budget=3000", "--dump-dom", f"file://{tmp_path / 'report.html'}"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0)
     elements = Elements(done.stdout)
-    assert [text for attributes, text in elements.of("p") if attributes.get("id") == "status"] == ["read-only"]
+    assert [text for attributes, text in elements.of("p") if attributes.get("id") == "status"] == ["Finished run"]
     assert [text for _, text in elements.of("title")] == ["fcslam: run"]
-    assert [text.strip() for _, text in elements.of("option")][:2] == ["0: a, a+1", "1: b"]
-    labels = [attributes.get("aria-label", "") for attributes, _ in elements.of("button")]
-    assert [label for label in labels if label.startswith("Follow")] == ["Follow a", "Follow a+1", "Follow b"]
+    tabs = [text for attributes, text in elements.of("button") if "data-map" in attributes]
+    assert tabs == ["a and a+1", "b"]
+    states = [text for attributes, text in elements.of("p") if attributes.get("class") == "state"]
+    assert states[:2] == ["Finished, not joined with the others yet"] * 2
 
 
 def test_a_report_holds_every_path_that_the_page_names():
-    script = (ASSETS / "page.js").read_text(encoding="utf-8")
+    script = "".join((ASSETS / name).read_text(encoding="utf-8") for name in MODULES)
     named = re.findall(r'\b(?:json|ask)\("([^"]+)"\)', script)
     assert "maps" in named
     assert set(named) - {"events"} <= set(ASKED)
-    assert "import" not in script
+
+
+def test_a_module_imports_only_modules_before_it():
+    for k, name in enumerate(MODULES):
+        script = (ASSETS / name).read_text(encoding="utf-8")
+        assert set(re.findall(r'from "\./([^"]+)"', script)) <= set(MODULES[:k])
+        assert not re.search(r"^(import [^;]*( as |\*)|export (default|let|\{))", script, re.MULTILINE)

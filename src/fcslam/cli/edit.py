@@ -195,6 +195,14 @@ def erase(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: 
     _draw(run, RegionUse.ERASE, "", corners, map_index, author)
 
 
+@app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit free runs/building "1,2 3,4"'))
+def free(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
+    """Mark a part of the map as free, where something stood only for a while."""
+    from fcslam.records import RegionUse
+
+    _draw(run, RegionUse.FREE, "", corners, map_index, author)
+
+
 @app.command("keep-out", context_settings=_NEGATIVE, epilog=examples('fcslam edit keep-out runs/building "1,2 3,4"'))
 def keep_out(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
     """Forbid a part of the map: map_keepout.pgm and map_keepout.yaml, the mask of Nav2's keepout filter."""

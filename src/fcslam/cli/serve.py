@@ -106,7 +106,7 @@ def serve(
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
     from fcslam.errors import ServiceError
-    from fcslam.page.routes import documentation_router, page_router
+    from fcslam.page.routes import documentation_router, page_router, report_router
     from fcslam.service.http.app import create_app
     from fcslam.service.shared.missions import NAMED
     from fcslam.service.warmup import warm_up_decoding
@@ -136,7 +136,7 @@ def serve(
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
-        routers = [page_router(), *([documentation_router()] if docs else [])]
+        routers = [page_router(), report_router(state), *([documentation_router()] if docs else [])]
         if plan is not None:
             from fcslam.federated.relay import learning_router
 

@@ -11,6 +11,7 @@ from fcslam.records import (
     Channel,
     ClosureStatus,
     Constraint,
+    FloatArray,
     KeyscanId,
     LoopClosure,
     ManualClosure,
@@ -103,11 +104,12 @@ class ClosureLog:
         )  # fmt: skip
         return self._add(ClosureEntry(closure, independent=False, edge=edge))
 
-    def add_by_hand(self, made: ManualClosure, i: KeyscanId, j: KeyscanId) -> ClosureEntry:
-        """Add a user's own closure between two keyscans."""
-        information = np.diag([1.0 / made.tolerance[0] ** 2] * 2 + [1.0 / made.tolerance[1] ** 2])
+    def add_by_hand(
+        self, made: ManualClosure, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray
+    ) -> ClosureEntry:
+        """Add a user's own closure between two keyscans, with its pose (3,) and information (3, 3)."""
         closure = LoopClosure(
-            i, j, Channel.LIDAR, 0.0, frozen(made.T_i_j), frozen(information), ClosureStatus.VERIFIED,
+            i, j, Channel.LIDAR, 0.0, frozen(T_i_j), frozen(information), ClosureStatus.VERIFIED,
             Reason(ReasonCode.MADE_BY_HAND),
         )  # fmt: skip
         return self._add(ClosureEntry(closure, independent=False, pinned=True, made_by_hand=made))

@@ -9,6 +9,7 @@ from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
+from fcslam.cloud.manual_closures import Scans, measured
 from fcslam.cloud.map_comparison import MapComparison
 from fcslam.cloud.reevaluation import reevaluate
 from fcslam.cloud.result import Fusion
@@ -18,6 +19,7 @@ from fcslam.geometry import se2
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
+from fcslam.lidar.scan import keyscan_points
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Change,
@@ -41,6 +43,8 @@ CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
 the same evidence would be weighed again at every place."""
 
+REFINED_KEYSCANS = 15
+"""Scans before and after each end of a closure by hand whose walls refine it: a few metres of path."""
 DECIDED_GROWTH = 1.05
 """Sessions whose evidence fell short are decided again when it has grown by this factor, or in a re-evaluation. A
 decision tests every pair of closures: at each place, it would take longer than all else where robots meet for hours."""
@@ -140,7 +144,9 @@ class ClosureDecisions:
         ``final``: no packet comes after it, so closures by hand may end at the last keyscan of a session.
         """
         for made in self._missing(final):
-            self._mark(self.closures.add_by_hand(made, *self._ends(made)))
+            i, j = self._ends(made)
+            T_i_j, information = measured(made, self._scans(i), self._scans(j), self._config.matcher.verification)
+            self._mark(self.closures.add_by_hand(made, i, j, T_i_j, information))
         fusion = reevaluate(
             self._graph,
             self.closures,
@@ -248,6 +254,14 @@ class ClosureDecisions:
     def _ends(self, made: ManualClosure) -> tuple[KeyscanId, KeyscanId]:
         """The keyscans that a closure by hand connects."""
         return self._sessions.nearest(made.robot_i, made.stamp_i), self._sessions.nearest(made.robot_j, made.stamp_j)
+
+    def _scans(self, end: KeyscanId) -> Scans:
+        """Scans around a keyscan, with their poses (3,) in its base."""
+        first, last = max(end.number - REFINED_KEYSCANS, 0), end.number + REFINED_KEYSCANS
+        poses, lasers = self._graph.chain(end.robot, first, last), self._sessions.lasers(end.robot)
+        base = poses[end.number - first]
+        keyscans = self._sessions.keyscans(end.robot, first, first + len(poses) - 1)
+        return [(keyscan_points(k, lasers), se2.between(base, poses[k.id.number - first])) for k in keyscans]
 
     def _accept_if_consistent(self, entry: ClosureEntry) -> bool:
         """Accept a verified closure that fits the joint map; False if only a cluster may accept it."""

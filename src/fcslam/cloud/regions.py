@@ -1,4 +1,4 @@
-"""Regions that users drew, in the files of a map: erased cells, the mask of Nav2's keep-out filter, named areas."""
+"""Regions that users drew, in the files of a map: changed cells, the mask of Nav2's keep-out filter, named areas."""
 
 import json
 from collections.abc import Sequence
@@ -18,12 +18,17 @@ _MARGIN_CELLS = 1000
 """Polygons are cut off this far outside the map: 100 km in cells of 2 mm would overflow OpenCV's 32 bits."""
 
 
-def erased(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> OccupancyMap:
-    """The map without what users erased: the cells of such a region are unknown."""
-    inside = _inside(occupancy, [region for region in regions if region.use is RegionUse.ERASE])
-    if not inside.any():
-        return occupancy
-    return replace(occupancy, cells=frozen(np.where(inside, Occupancy.UNKNOWN, occupancy.cells), np.uint8))
+_CELLS = {RegionUse.ERASE: Occupancy.UNKNOWN, RegionUse.FREE: Occupancy.FREE}
+"""Regions that change the map, and what their cells become."""
+
+
+def with_regions(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> OccupancyMap:
+    """The map with the cells that users erased or freed; of regions that overlap, the later one counts."""
+    cells = occupancy.cells
+    for region in regions:
+        if region.use in _CELLS and (inside := _inside(occupancy, [region])).any():
+            cells = np.where(inside, _CELLS[region.use], cells)
+    return occupancy if cells is occupancy.cells else replace(occupancy, cells=frozen(cells, np.uint8))
 
 
 def region_files(occupancy: OccupancyMap, stem: str, regions: Sequence[PlacedRegion]) -> dict[str, bytes]:

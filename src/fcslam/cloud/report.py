@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.regions import erased, region_files
+from fcslam.cloud.regions import region_files, with_regions
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
@@ -158,7 +158,7 @@ def _map_files(
     for k, members in sorted(maps.items()):
         stem = map_stem(k)
         regions = [region for region in result.regions if region.map_index == k]
-        fused = erased(fuse_members(members, grid), regions)
+        fused = with_regions(fuse_members(members, grid), regions)
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
         files |= region_files(fused, stem, regions)

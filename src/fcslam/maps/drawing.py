@@ -6,7 +6,6 @@ Drawn with OpenCV, which takes a sixth of the time of matplotlib and does not in
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -60,7 +59,6 @@ FLOOR: Final = _bgr(palette.FLOOR)
 WALL: Final = _bgr(palette.WALL)
 INK: Final = _bgr(palette.INK)
 CLOSURE: Final = _bgr(palette.CLOSURES[Channel.LIDAR])
-ROBOTS: Final = tuple(map(_bgr, palette.ROBOTS))
 CHANGES: Final = _bgr(palette.APPEARED), _bgr(palette.DISAPPEARED)
 _APPEARED, _DISAPPEARED = len(Occupancy), len(Occupancy) + 1
 """Cells of a picture besides ``Occupancy``; in small pictures the highest number of a block is drawn."""
@@ -94,7 +92,8 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
     """
     view = _view(fused, trajectories.values())
     canvas = _canvas(view)
-    ways = [(view.pixels(points), color) for points, color in zip(trajectories.values(), cycle(ROBOTS), strict=False)]
+    colors = {robot: _bgr(color) for robot, color in palette.robot_colors(trajectories).items()}
+    ways = [(view.pixels(points), colors[robot]) for robot, points in trajectories.items()]
     shared = [closure for closure in closures if closure.robot_a != closure.robot_b]
     for pixels, color in ways:
         _draw_trajectory(canvas, pixels, color)
@@ -102,7 +101,7 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
         _draw_line(canvas, view.pixels(np.array((closure.xy_a, closure.xy_b))), CLOSURE, 1)
     for pixels, color in ways:
         _draw_start(canvas, pixels, color)
-    labels = list(zip(trajectories, cycle(ROBOTS), strict=False))
+    labels = list(colors.items())
     if shared:
         labels.append((f"{len(shared)} closure{'s' * (len(shared) > 1)} between robots", CLOSURE))
     picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))

@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,7 +17,7 @@ from fcslam.errors import OutputError
 from fcslam.geometry import se2
 from fcslam.maps.charts import Chart, FleetCharts, MatchedPlaces, spread
 from fcslam.maps.drawing import round_length
-from fcslam.maps.palette import CLOSURES, FLOOR, FURNITURE, INK, PAPER, ROBOTS, WALL
+from fcslam.maps.palette import CLOSURES, FLOOR, FURNITURE, INK, PAPER, WALL, robot_colors
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, FloatArray
 
@@ -97,7 +96,7 @@ def draw_figure(charts: FleetCharts) -> "Figure":
     lines = [(match.channel, _line(match, local)) for match in _chosen(charts)]
     titles_px = max(_top(upper), *(line[:, 1].max() for _, line in lines), 0.0)
     figure, axes = _sheet(titles_px + TITLE_PX)
-    colors = {robot: _hex(color) for robot, color in zip(charts.local, cycle(ROBOTS), strict=False)}
+    colors = {robot: _hex(color) for robot, color in robot_colors(charts.local).items()}
     for panel in (*upper, *lower):
         _draw_chart(axes, panel, colors)
     for channel, line in lines:

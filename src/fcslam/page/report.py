@@ -1,6 +1,7 @@
 """The page over a finished run as one file: it holds what the page asks for, and asks nobody."""
 
 import base64
+import gzip
 import hashlib
 import itertools
 import json
@@ -13,9 +14,9 @@ from urllib.parse import quote, unquote
 from fcslam.config import Settings
 from fcslam.errors import EvaluationError
 from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
-from fcslam.page import ASSETS
+from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
-from fcslam.runs import CONFIG, METRICS, TRAJECTORIES, OccupancyMap, open_run
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, OccupancyMap, open_run
 from fcslam.runs.map_files import map_stem
 from fcslam.service.summaries import (
     all_edits,
@@ -33,6 +34,8 @@ MOST_CLOSURES = 5000
 """Largest number of closures of each status that the page asks for."""
 MOST_TILES = 200
 """Most tiles of all maps together: a tile has about 15 kB. For a larger map, the file holds coarser tiles."""
+_IMPORT = re.compile(r"^import (\{[^}]*\}) from \"\./(\w+)\.js\";\n", re.MULTILINE)
+_EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
 SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="stylesheet" href="page.css">'
 """Elements of the page that the file holds instead."""
 
@@ -45,14 +48,15 @@ def report_html(mission: ViewedMission) -> str:
     """
     maps = {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
     zooms = {k: _zoom(occupancy, MOST_TILES // len(maps)) for k, occupancy in maps.items()}
-    return _page({"texts": _texts(mission, zooms), "pictures": _pictures(mission, maps, zooms)})
+    pictures = _pictures(mission, maps, zooms)
+    return _page({"texts": _texts(mission, zooms), "pictures": pictures, "files": _files(mission, maps)})
 
 
 def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
     """Responses of the service to the page, by path. Maps have tiles down to ``zooms``."""
     sessions = all_sessions(mission)
     texts = {
-        "fleet": _json(fleet_summary(mission, read_only=True)),
+        "fleet": _json(fleet_summary(mission, read_only=True, may_edit=False)),
         "maps": _json(one.model_copy(update={"zoom": zooms.get(one.map, 0)}) for one in map_summaries(mission)),
         "separations": _json(map_separations(mission)),
         "robots": _json(sessions),
@@ -83,6 +87,20 @@ def _pictures(mission: ViewedMission, maps: Mapping[int, OccupancyMap], zooms: M
         for k, occupancy in maps.items()
         if folder is not None
         for zoom, column, row in _tiles(occupancy, zooms[k])
+    }
+
+
+def _files(mission: ViewedMission, maps: Iterable[int]) -> dict[str, str]:
+    """What the page downloads, compressed with gzip and in base64, by path."""
+    if mission.run_folder is None:
+        return {}
+    named = {f"maps/{k}.{suffix}": f"{map_stem(k)}.{suffix}" for k in maps for suffix in ("pgm", "yaml", "png")}
+    named[POSE_GRAPH] = POSE_GRAPH
+    files = {path: mission.run_folder / name for path, name in named.items()}
+    return {
+        path: base64.b64encode(gzip.compress(file.read_bytes(), mtime=0)).decode()
+        for path, file in files.items()
+        if file.is_file()
     }
 
 
@@ -124,7 +142,7 @@ def _covered(occupancy: OccupancyMap, zoom: int) -> tuple[range, range]:
 
 def _page(responses: dict[str, Any]) -> str:
     """The page with script, style and responses in it."""
-    html, script, style = (_asset(name) for name in ("index.html", "page.js", "page.css"))
+    html, style, script = _asset("index.html"), _asset("page.css"), "".join(map(_inlined, MODULES))
     data = json.dumps(responses).replace("<", "\\u003c")  # what would end the element, whoever named a robot so
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
@@ -135,6 +153,14 @@ def _page(responses: dict[str, Any]) -> str:
         f'<script type="module">{script}</script>',
     }
     return re.sub("|".join(map(re.escape, parts)), lambda found: parts[found[0]], html)
+
+
+def _inlined(name: str) -> str:
+    """A module of the page as part of one script: an object with its exports, from which later modules take theirs."""
+    script = _asset(name)
+    exported = ", ".join(name for _, name in _EXPORT.findall(script))
+    body = _EXPORT.sub(r"\1", _IMPORT.sub(r"const \1 = \2_js;\n", script))
+    return f"const {name.removesuffix('.js')}_js = (() => {{\n{body}return {{ {exported} }};\n}})();\n"
 
 
 def _asset(name: str) -> str:

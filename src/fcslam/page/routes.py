@@ -6,11 +6,15 @@ from hashlib import sha256
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from fcslam.page import ASSETS
+from fcslam.page import ASSETS, MODULES
+from fcslam.page.report import report_html
+from fcslam.service.http.app import PREFIX
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.state import ViewerState
 
 FILES = {
     "/": ("index.html", "text/html"),
-    "/page.js": ("page.js", "text/javascript"),
+    **{f"/{name}": (name, "text/javascript") for name in MODULES},
     "/page.css": ("page.css", "text/css"),
 }
 DOCUMENTATION = {
@@ -31,6 +35,19 @@ HEADERS = {
 def page_router() -> APIRouter:
     """The page at ``/``, its script and its style."""
     return _router(FILES)
+
+
+def report_router(state: ViewerState) -> APIRouter:
+    """The report of the open mission, for viewers."""
+    router = APIRouter(include_in_schema=False, dependencies=state.require(Role.VIEWER, Role.ADMIN))
+
+    @router.get(f"{PREFIX}/report.html")
+    def get_report() -> Response:
+        """The page as one file."""
+        headers = {"Content-Disposition": 'attachment; filename="report.html"', "X-Content-Type-Options": "nosniff"}
+        return Response(report_html(state.mission), media_type="text/html", headers=headers)
+
+    return router
 
 
 def documentation_router() -> APIRouter:

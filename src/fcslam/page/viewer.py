@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from fastapi.params import Depends as Dependency
 
 import fcslam
-from fcslam.page.routes import page_router
+from fcslam.page.routes import page_router, report_router
 from fcslam.runs.folder import identity
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
@@ -62,6 +62,7 @@ def viewer_app(state: ReadOnly) -> FastAPI:
     for make in VIEWER_ROUTERS:
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(page_router())
+    app.include_router(report_router(state))
     app.add_middleware(LocalNames)
     return app
 

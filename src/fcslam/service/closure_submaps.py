@@ -8,6 +8,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import SPACING_M
 from fcslam.maps.closure_picture import closure_png
+from fcslam.maps.palette import ROBOTS, robot_colors
 from fcslam.records import FloatArray, Keyscan
 from fcslam.runs import ClosureRow, Run
 from fcslam.service.mission_store import MissionStore
@@ -28,7 +29,11 @@ def overlay_png(store: MissionStore, run: Run, closure: ClosureRow) -> bytes:
     """
     i = _submap(store, run, closure.robot_i, closure.stamp_i)
     j = se2.transform(closure.T_i_j, _submap(store, run, closure.robot_j, closure.stamp_j))
-    return closure_png((i, j), (np.zeros(3), closure.T_i_j))
+    colors = robot_colors(run.trajectories)
+    first, second = colors[closure.robot_i], colors[closure.robot_j]
+    if first == second:  # both ends are the same robot's
+        second = next(color for color in ROBOTS if color != first)
+    return closure_png((i, j), (np.zeros(3), closure.T_i_j), (first, second))
 
 
 def _submap(store: MissionStore, run: Run, session: str, stamp: float) -> FloatArray:

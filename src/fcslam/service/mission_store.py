@@ -236,6 +236,19 @@ class MissionStore:
         statement = f"SELECT data FROM packets WHERE {where} ORDER BY abs(time - ?) LIMIT ?"
         return [data for (data,) in self._database.rows(statement, (robot, epoch, PacketKind.KEYSCAN, time, limit))]
 
+    def newest_keyscan(self, robot: str, epoch: int) -> bytes | None:
+        """The session's newest keyscan, encoded."""
+        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL"
+        statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence DESC LIMIT 1"
+        keyscan: bytes | None = self._database.value(statement, (robot, epoch, PacketKind.KEYSCAN))
+        return keyscan
+
+    def constraints_since(self, robot: str, epoch: int, time: float) -> list[bytes]:
+        """Constraints of a session that it sent at this time or later, in their order, encoded."""
+        where = "robot = ? AND epoch = ? AND kind = ? AND time >= ? AND refusal IS NULL"
+        statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence"
+        return [data for (data,) in self._database.rows(statement, (robot, epoch, PacketKind.CONSTRAINT, time))]
+
     def progress(self, applied: int, corrections: Sequence[SessionCorrection]) -> None:
         """Note how many packets took effect; corrections that are news get a new version."""
         with self._database.transaction() as database:

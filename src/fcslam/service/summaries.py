@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache
@@ -11,6 +13,7 @@ from typing import Any
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
+from fcslam.maps.palette import robot_colors
 from fcslam.maps.tiles import finest_zoom
 from fcslam.records import Channel, ClosureStatus, Edit
 from fcslam.runs import ClosureRow, Run, separations
@@ -23,6 +26,7 @@ from fcslam.service.http.responses import (
     MapSummary,
     SessionSummary,
 )
+from fcslam.service.live_poses import live_pose
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes
@@ -30,13 +34,16 @@ from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode
 
 
-def fleet_summary(mission: ViewedMission, read_only: bool) -> FleetSummary:
-    """Counts; ``read_only``: nobody can change the mission."""
-    run, counts = run_of(mission), mission.packet_counts()
+def fleet_summary(mission: ViewedMission, read_only: bool, may_edit: bool) -> FleetSummary:
+    """Counts; ``read_only``: nobody can change the mission; ``may_edit``: whoever asks can."""
+    run, counts, folder = run_of(mission), mission.packet_counts(), mission.run_folder
     return FleetSummary(
         mission=mission.name,
         version=fcslam.__version__,
         read_only=read_only,
+        may_edit=may_edit,
+        map_age_s=None if folder is None or read_only else max(time.time() - folder.stat().st_mtime, 0.0),
+        free_bytes=None if folder is None or read_only else shutil.disk_usage(folder).free,
         packets=counts.arrived,
         applied=counts.applied,
         waiting=counts.waiting,
@@ -57,10 +64,14 @@ def all_sessions(mission: ViewedMission) -> list[SessionSummary]:
 def sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
     """The sessions of one robot."""
     store, mapped = mission.store, run_of(mission).trajectories
-    sessions, changes = [], in_force(store.edits())
+    colors = robot_colors({session_name(*session[:2]) for session in mission.sessions()})
+    sessions, changes, heard_s = [], in_force(store.edits()), mission.last_heard_s(robot)
     for session in mission.sessions(robot):
         name = session_name(robot, session.epoch)
         known, correction = mapped.get(name), store.correction(robot, session.epoch)
+        pose = known.T_map_base[-1] if known else None
+        if known and heard_s is not None:  # nobody is heard in a finished run
+            pose = live_pose(store, robot, session.epoch, known)
         sessions.append(
             SessionSummary(
                 robot=robot,
@@ -71,13 +82,16 @@ def sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
                 floor=known.floor if known else "",
                 path_length_m=known.path_length_m if known else 0.0,
                 keyscans=len(known.stamps) if known else 0,
-                T_map_base=known.T_map_base[-1].tolist() if known else None,
+                color=f"#{colors[name]:06x}",
+                first_s=float(known.stamps[0]) if known else None,
+                last_s=float(known.stamps[-1]) if known else None,
+                T_map_base=pose.tolist() if pose is not None else None,
                 T_map_odom=correction.correction.T_map_odom.tolist() if correction else None,
                 correction=correction.correction.version if correction else -1,
                 quality=correction.correction.quality if correction else 0.0,
                 removed=is_removed(name, changes),
                 detectors=_detectors(store, robot, session.epoch),
-                last_heard_s=mission.last_heard_s(robot),
+                last_heard_s=heard_s,
             )
         )
     return sessions
@@ -135,7 +149,13 @@ def map_summaries(mission: ViewedMission) -> list[MapSummary]:
 def map_separations(mission: ViewedMission) -> list[MapSeparation]:
     """Why maps of one floor are separate, for every two of them."""
     return [
-        MapSeparation(maps=s.maps, candidates=s.candidates, verified=s.verified, explanation=str(s))
+        MapSeparation(
+            maps=s.maps,
+            candidates=s.candidates,
+            verified=s.verified,
+            reason=None if s.reason is None else s.reason.code,
+            explanation=str(s),
+        )
         for s in separations(run_of(mission))
     ]
 

@@ -67,6 +67,11 @@ class FleetSummary(Settings):
     mission: str
     version: str = Field(description="of fcslam; a page of another version must be loaded again")
     read_only: bool = Field(description="whether nobody can change the mission here: it is a finished run")
+    may_edit: bool = Field(description="whether whoever asks may change the mission")
+    map_age_s: float | None = Field(
+        description="seconds since the map was drawn; null before that, and for a finished run"
+    )
+    free_bytes: int | None = Field(description="free on the disk of the map; null as for its age")
     packets: int
     applied: int = Field(description="packets that took effect")
     waiting: int = Field(description="packets that wait for an earlier one")
@@ -87,7 +92,10 @@ class SessionSummary(Settings):
     floor: str = Field(description="floor that it named; empty: none, or not mapped yet")
     path_length_m: float
     keyscans: int
-    T_map_base: Pose | None
+    color: str = Field(description="of the robot in all pictures, as #rrggbb")
+    first_s: float | None = Field(description="stamp of the first pose in the map, seconds")
+    last_s: float | None = Field(description="stamp of the last pose in the map, seconds")
+    T_map_base: Pose | None = Field(description="newest pose; it may be newer than the map")
     T_map_odom: Pose | None
     correction: int = Field(description="version of the newest correction; -1: none")
     quality: float = Field(description="how well other sessions support the pose, in [0, 1]; 0: no support")
@@ -153,6 +161,7 @@ class MapSeparation(Settings):
     maps: tuple[int, int]
     candidates: int = Field(description="closures between them that failed verification")
     verified: int = Field(description="closures between them that passed it, and were not enough")
+    reason: ReasonCode | None = Field(description="what keeps them apart; null if no two of their places look alike")
     explanation: str = Field(description="the binding reason, with its numbers")
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
+from pydantic import Field
 
 from fcslam.errors import EvaluationError
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
@@ -30,6 +31,7 @@ from fcslam.service.http.responses import (
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
 from fcslam.service.learning_rounds import read_rounds
+from fcslam.service.live_poses import live_scan
 from fcslam.service.summaries import (
     all_edits,
     all_sessions,
@@ -42,11 +44,13 @@ from fcslam.service.summaries import (
     sessions_of,
 )
 from fcslam.untrusted import check_file, read_bytes
+from fcslam.wire.limits import MAXIMUM_EPOCH
 
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
 Index = Annotated[int, PathParameter(ge=0, le=MOST)]
 Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
+Point = Annotated[list[float], Field(min_length=2, max_length=2, description="x and y in metres")]
 Stamp = Annotated[float, PathParameter(allow_inf_nan=False, description="of a keyscan, seconds")]
 KEPT = {"Cache-Control": "private, max-age=60"}
 """Headers of answers that are computed for a request and hardly change."""
@@ -64,9 +68,10 @@ def fleet_router(state: ViewerState) -> APIRouter:
     )
 
     @router.get("/fleet")
-    def get_fleet() -> FleetSummary:
+    def get_fleet(request: Request) -> FleetSummary:
         """Counts."""
-        return fleet_summary(state.mission, state.read_only)
+        may_edit = not state.read_only and state.admits(request, Role.ADMIN)
+        return fleet_summary(state.mission, state.read_only, may_edit)
 
     @router.get("/robots")
     def get_robots() -> list[SessionSummary]:
@@ -107,6 +112,12 @@ def fleet_router(state: ViewerState) -> APIRouter:
     def get_closure(channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp) -> ClosureSummary:
         """One closure as it is now."""
         return closure_summary(_closure_of(run_of(state.mission), channel, robot_i, stamp_i, robot_j, stamp_j))
+
+    @router.get("/robots/{robot}/scans/{epoch}", responses=refusals(400, 404))
+    def get_scan(robot: Name, epoch: Annotated[int, PathParameter(ge=0, le=MAXIMUM_EPOCH)]) -> list[Point]:
+        """Points of the newest scan of a session in the robot's base frame, metres; empty before the first scan."""
+        points: list[Point] = live_scan(state.mission.store, robot, epoch).round(3).tolist()
+        return points
 
     @router.get("/edits")
     def get_edits() -> list[EditSummary]:

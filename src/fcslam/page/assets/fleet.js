@@ -1,0 +1,79 @@
+// The state of the mission, as the service gave it last.
+
+import { Outdated, ask, at, json, report } from "./service.js";
+
+const MOST_CLOSURES = 5000; // that the page asks for
+
+export const fleet = {
+  counts: null, mission: null, robots: [], maps: [], separations: [], edits: [], regions: [], accepted: [], contradicted: [],
+  trails: new Map(), until: Infinity, // the moment that the map shows: paths and evidence until then
+  selected: null, scan: null, readOnly: false, mayEdit: false, readAt: 0,
+};
+let release = null;
+
+export const robotNamed = (session) => fleet.robots.find((r) => r.session === session);
+export const colourOf = (session) => robotNamed(session)?.color ?? "#777777";
+export const firstStamp = () => Math.min(...fleet.robots.map((r) => r.first_s ?? Infinity));
+export const keyOf = (c) => [c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j].map(encodeURIComponent).join("/");
+export const isPast = (c) => Math.max(c.stamp_i, c.stamp_j) <= fleet.until;
+
+// Paths grow, and older poses seldom move: the service sends what follows the bytes that the page has.
+const received = new Map();
+async function trail(name) {
+  const path = `trajectories/${encodeURIComponent(name)}.tum`, known = received.get(name);
+  const answer = await ask(known ? `${path}?after=${known.bytes}&digest=${known.digest}` : path);
+  const text = await answer.text(), after = Number(answer.headers.get("Fcslam-After")), digest = answer.headers.get("Fcslam-Digest");
+  const poses = text.split("\n").filter((l) => l && l[0] !== "#").map((l) => {
+    const [stamp, x, y, , , , qz, qw] = l.split(" ").map(Number);
+    return [stamp, x, y, 2 * Math.atan2(qz, qw)];
+  });
+  const all = after ? known.poses.concat(poses) : poses;
+  if (digest) received.set(name, { bytes: after + text.length, digest, poses: all });
+  return all;
+}
+
+// Where a robot was at a stamp: x, y, heading in its map; undefined if nobody knows.
+export function poseAt(name, stamp) {
+  const path = fleet.trails.get(name);
+  if (!path?.length) return undefined;
+  let low = 0, high = path.length - 1;
+  while (low < high) { const half = (low + high) >> 1; if (path[half][0] < stamp - 1e-6) low = half + 1; else high = half; }
+  return path[low].slice(1);
+}
+
+// The closure with both ends in the map; `map` is null if they are in different ones.
+export function placed(c) {
+  const [map, other] = [c.robot_i, c.robot_j].map((name) => robotNamed(name)?.map ?? null), ends = [poseAt(c.robot_i, c.stamp_i), poseAt(c.robot_j, c.stamp_j)];
+  return { ...c, ends, map: map === other && ends.every(Boolean) ? map : null };
+}
+export const closures = async (status) => (await json(`closures?status=${status}&limit=${MOST_CLOSURES}`)).map(placed);
+
+// Reads all that is new. One at a time, and another one after it if something happened meanwhile: no answer overtakes a later one.
+export async function update(forget) {
+  const counts = await json("fleet");
+  release ??= counts.version;
+  if (counts.version !== release) { at("reload").hidden = false; throw new Outdated("The service has another version: reload the page."); }
+  const [maps, separations, robots, closed, edits] = await Promise.all(
+    [json("maps"), json("separations"), json("robots"), json(`closures?status=accepted&limit=${MOST_CLOSURES}`), json("edits")]);
+  if (fleet.mission !== null && counts.mission !== fleet.mission) { received.clear(); forget(); }
+  const seen = robots.filter((r) => r.map !== null), paths = await Promise.all(seen.map((r) => trail(r.session)));
+  Object.assign(fleet, { counts, mission: counts.mission, maps, separations, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
+  fleet.trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
+  fleet.accepted = closed.map(placed);
+  fleet.regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
+  const contested = ["rejected", "revoked"].filter((status) => counts.metrics[`inter_robot_closures_${status}`]);
+  fleet.contradicted = (await Promise.all(contested.map(closures))).flat();
+}
+
+// Poses and times are newer than the map: the service knows them from the packets.
+export async function look() {
+  const [counts, robots] = await Promise.all([json("fleet"), json("robots")]), known = new Map(robots.map((r) => [r.session, r]));
+  for (const robot of fleet.robots) {
+    const now = known.get(robot.session);
+    if (now?.map === robot.map) robot.T_map_base = now.T_map_base;
+    robot.last_heard_s = now?.last_heard_s ?? null;
+  }
+  fleet.counts = counts; fleet.readAt = Date.now();
+  const robot = robotNamed(fleet.selected);
+  fleet.scan = robot && !report ? { session: robot.session, points: await json(`robots/${encodeURIComponent(robot.robot)}/scans/${robot.epoch}`).catch(() => []) } : null;
+}

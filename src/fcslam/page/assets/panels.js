@@ -1,0 +1,316 @@
+// The panels beside the map. Texts are set as text, because a name is never markup.
+
+import { colourOf, closures, firstStamp, fleet, keyOf, placed, robotNamed } from "./fleet.js";
+import { between, distance, middle, turned } from "./geometry.js";
+import { canvas, chart, choose, goTo, openMap, redraw } from "./map.js";
+import { ask, at, json, link, report } from "./service.js";
+import { change, tell } from "./tools.js";
+import { attention, count, dayOf, decisionOf, duration, editOf, evidence, history, listed, metres, moment, sensorOf, stateOf } from "./words.js";
+
+const LISTED = 200; // rows of the table of evidence
+const NEAR_M = 5; // pairs with both ends so near each other show the same place
+const COLOURS = ["#0072b2", "#e66100", "#009e73", "#7b4fb5", "#b58900", "#56b4e9", "#8c564b", "#607d3b"]; // of curves
+
+export function element(tag, text = "", more = {}) {
+  const made = Object.assign(document.createElement(tag), more);
+  made.append(text);
+  return made;
+}
+export function button(text, act, more = {}) {
+  const made = element("button", text, more);
+  made.addEventListener("click", act);
+  return made;
+}
+function row(...cells) {
+  const made = document.createElement("tr"), [first, ...others] = cells;
+  made.append(element("th", first, { scope: "row" }), ...others.map((text) => element("td", text)));
+  return made;
+}
+// Fills a list only if it changes, so that it stays open, scrolled and focused.
+const filled = new WeakMap();
+export function fill(list, content, children) {
+  const text = JSON.stringify(content);
+  if (filled.get(list) === text) return;
+  filled.set(list, text);
+  list.replaceChildren(...children());
+}
+export function swatch(colour) {
+  const made = element("span", "", { className: "swatch" });
+  made.style.background = colour;
+  return made;
+}
+
+export function show(view) {
+  document.body.dataset.view = view;
+  for (const tab of document.querySelectorAll("nav button")) {
+    tab.ariaCurrent = tab.dataset.view === view ? "page" : "false";
+    if (tab.dataset.view === view) tab.scrollIntoView({ block: "nearest", inline: "nearest" });
+  }
+  if (view === "history") showHistory();
+  if (view === "evidence") showEvidence().catch((error) => tell(error.message));
+  redraw();
+}
+export function select(session) {
+  fleet.selected = fleet.selected === session ? null : session;
+  fleet.scan = null;
+  if (!fleet.selected) chart.followed = false;
+  showFleet(); showControls(); redraw();
+}
+// Opens the map of a robot where it is.
+export function showRobot(session) {
+  const robot = robotNamed(session);
+  fleet.selected = session;
+  if (robot?.T_map_base) { openMap(robot.map); showMaps(); goTo(robot.T_map_base); }
+  showFleet(); showControls();
+}
+export function showControls() {
+  at("follow").disabled = !robotNamed(fleet.selected)?.T_map_base;
+  at("follow").ariaPressed = String(chart.followed);
+  at("level").ariaPressed = String(Boolean(chart.view?.turn));
+}
+
+// ---- Maps and their state ----
+
+export function showMaps() {
+  const title = (m) => `${listed(m.robots)}${m.floor && `, floor ${m.floor}`}`;
+  at("tabs").hidden = fleet.maps.length < 2;
+  fill(at("tabs"), [chart.index, fleet.maps.map(title)], () => fleet.maps.map((m) => {
+    const tab = button(title(m), () => { choose(m.map); showMaps(); }, { ariaPressed: String(m.map === chart.index) });
+    tab.dataset.map = m.map;
+    return tab;
+  }));
+  at("empty").hidden = !link.connected || fleet.robots.length > 0;
+  if (!at("empty").hidden) at("first-robot").textContent = `fcslam robot RECORDING --server ${location.origin} --state FOLDER`;
+}
+export function showAge() {
+  const { counts, readOnly } = fleet;
+  if (!counts) return;
+  const missing = counts.packets - counts.applied, age = counts.map_age_s === null ? null : counts.map_age_s + (Date.now() - fleet.readAt) / 1000;
+  at("age").textContent = readOnly || age === null ? "" : `Map drawn ${duration(age)} ago${missing > 0 ? `; ${count(missing, "message")} not in it yet` : ""}. `;
+  at("status").textContent = readOnly ? "Finished run" : counts.worker_ready ? "Live" : "The map catches up after a start";
+  at("status").dataset.kind = readOnly || counts.worker_ready ? "ok" : "wait";
+}
+
+// ---- Fleet: one card for each robot. Its elements stay, or a slow click would find another one below it. ----
+
+const cards = new Map();
+function cardOf(name) {
+  const card = element("li"), state = element("p", "", { className: "state" }), seen = element("p"), more = element("details"), facts = element("p"), earlier = element("ul");
+  const choice = button("", () => { const isNew = fleet.selected !== name; if (isNew) showRobot(name); else select(name); }, { className: "name" });
+  more.append(element("summary", "Details"), facts, earlier);
+  card.append(choice, state, seen, more);
+  cards.set(name, { card, choice, state, seen, facts, earlier });
+  return cards.get(name);
+}
+export function forgetCards() { cards.clear(); }
+
+let evidenceNow = {};
+export function showFleet() {
+  const newest = fleet.robots.filter((r) => !fleet.robots.some((o) => o.robot === r.robot && o.epoch > r.epoch)), list = at("robots");
+  if (evidenceNow.accepted !== fleet.accepted) evidenceNow = { accepted: fleet.accepted, words: evidence(fleet.robots, fleet.accepted) };
+  const shown = newest.map((robot) => {
+    const { card, choice, state, seen, facts, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
+    fill(choice, [robot.robot, robot.color], () => [swatch(robot.color), robot.robot]);
+    choice.ariaPressed = String(robot.session === fleet.selected);
+    card.dataset.kind = kind;
+    state.textContent = text;
+    seen.textContent = newest.length > 1 && robot.map !== null ? evidenceNow.words.get(robot.session) : "";
+    const heard = fleet.readOnly || robot.last_heard_s === null ? [] : [`heard ${duration(robot.last_heard_s)} ago`], sent = fleet.counts.metrics[`uplink_bytes_${robot.robot}`];
+    const parts = [`drove ${metres(robot.path_length_m)}`, `${count(robot.keyscans, "scan")} on the map`, ...(robot.floor ? [`floor ${robot.floor}`] : []), ...(sent ? [`${(sent / 1000).toLocaleString("en", { maximumFractionDigits: 0 })} kB sent`] : []), ...heard];
+    facts.textContent = `${parts.join("; ")}. ${Object.entries(robot.detectors).map(([channel, made]) => `Detector (${channel}): ${made}.`).join(" ")}`;
+    const before = fleet.robots.filter((r) => r.robot === robot.robot && r.epoch < robot.epoch);
+    fill(earlier, before.map((r) => [r.session, r.path_length_m]), () => before.map((r) => element("li", `Drive ${r.epoch + 1}, ${r.first_s === null ? "not on the map" : `from ${moment(r.first_s, firstStamp(), true)}`}: ${metres(r.path_length_m)}`)));
+    return card;
+  });
+  if (shown.length !== list.children.length || shown.some((card, k) => card !== list.children[k])) list.replaceChildren(...shown);
+  const { maps } = fleet, extent = maps.length === 1 && maps[0].extent, size = extent ? `, ${(extent[2] - extent[0]).toFixed(0)} × ${(extent[3] - extent[1]).toFixed(0)} m` : "";
+  at("summary").textContent = newest.length ? `${count(newest.length, "robot")} on ${maps.length === 1 ? `one map${size}` : count(maps.length, "map")}` : "No robot yet";
+}
+
+export function showAttention() {
+  const found = fleet.counts ? attention(fleet) : [];
+  at("needs").hidden = !found.length;
+  at("needs").textContent = found.length;
+  fill(at("attention"), found.map((one) => [one.text, one.help, one.why]), () => found.length ? found.map((one) => {
+    const card = element("li", element("p", one.text, { className: "state" })), act = one.do;
+    card.dataset.kind = one.kind;
+    card.append(element("p", one.help), button(one.action, () => {
+      if (act.robot && !act.view) showRobot(act.robot);
+      if (act.map !== undefined) besideEachOther(act);
+      if (act.view) { if (act.robot) at("of-robot").value = act.robot; if (act.view === "evidence") { at("decision").value = "rejected"; at("two-robots").checked = false; } show(act.view); }
+    }));
+    if (one.why) { const why = element("details", element("summary", "Why")); why.append(element("p", one.why)); card.append(why); }
+    return card;
+  }) : [element("li", "All well. Nothing needs you.", { className: "well" })]);
+}
+// Two maps that are apart, side by side: the distance between them means nothing.
+function besideEachOther({ map, beside }) {
+  choose(beside);
+  const [first, second] = [beside, map].map((k) => fleet.maps.find((m) => m.map === k)?.extent);
+  if (first && second) chart.beside = { map, pose: [first[2] - second[0] + 2, first[1] - second[1], 0] };
+  showMaps();
+  if (first && second) {
+    chart.view = { x: (first[0] + first[2] + second[2] - second[0] + 2) / 2, y: (first[1] + Math.max(first[3], first[1] + second[3] - second[1])) / 2, turn: 0, scale: Math.min(canvas.clientWidth / (first[2] - first[0] + second[2] - second[0] + 4), canvas.clientHeight / (Math.max(first[3] - first[1], second[3] - second[1]) + 2)) };
+    chart.moved = true;
+    redraw();
+  }
+}
+
+// ---- Evidence ----
+
+const residual = (c) => { if (c.map === null) return null; const [dx, dy, angle] = between(c.T_i_j, between(...c.ends)); return [Math.hypot(dx, dy), Math.abs(angle)]; };
+const time = (stamp) => moment(stamp, firstStamp());
+const COLUMNS = [
+  ["Robot", (c) => c.robot_i], ["and robot", (c) => c.robot_j], ["First seen", (c) => Math.min(c.stamp_i, c.stamp_j), time], ["Again", (c) => Math.max(c.stamp_i, c.stamp_j), time],
+  ["Seen by", sensorOf], ["Off by", (c) => residual(c)?.[0] ?? Infinity, (value) => (value === Infinity ? "two maps" : value < 0.001 ? "under 1 mm" : value < 0.1 ? `${(1000 * value).toFixed(0)} mm` : metres(value))],
+];
+let sorting = { column: 3, down: true }, listedNow = [];
+export async function showEvidence() {
+  const decision = at("decision").value, all = decision === "accepted" ? fleet.accepted : await closures(decision), names = fleet.robots.map((r) => r.session), kept = at("of-robot").value;
+  fill(at("of-robot"), names, () => [new Option("all", ""), ...names.map((name) => new Option(name, name))]);
+  at("of-robot").value = names.includes(kept) ? kept : "";
+  const robot = at("of-robot").value, value = COLUMNS[sorting.column][1];
+  const chosen = all.filter((c) => (!robot || c.robot_i === robot || c.robot_j === robot) && (!at("two-robots").checked || robotNamed(c.robot_i)?.robot !== robotNamed(c.robot_j)?.robot));
+  listedNow = chosen.sort((a, b) => { const [x, y] = [value(a), value(b)]; return (sorting.down ? -1 : 1) * (x < y ? -1 : x > y ? 1 : 0); }).slice(0, LISTED);
+  at("closures").textContent = `${count(chosen.length, "pair")} ${decisionOf({ status: decision })}${chosen.length > LISTED ? `; the table has the first ${LISTED}` : ""}`;
+  fill(document.querySelector("#pairs thead tr"), sorting, () => COLUMNS.map(([title], k) => {
+    const head = element("th", button(title, () => { sorting = { column: k, down: sorting.column === k && !sorting.down }; showEvidence(); }), { scope: "col" });
+    head.ariaSort = sorting.column === k ? (sorting.down ? "descending" : "ascending") : "none";
+    return head;
+  }));
+  fill(at("list"), listedNow.map((c) => [keyOf(c), c.ends]), () => listedNow.map((c) => {
+    const line = element("tr");
+    line.append(...COLUMNS.map(([, of, words = String], k) => element("td", k ? words(of(c)) : button(words(of(c)), () => pick(c)))));
+    line.dataset.key = keyOf(c);
+    return line;
+  }));
+  mark();
+  await checkChosen();
+}
+const mark = () => { for (const line of at("list").children) line.ariaCurrent = String(chart.closure && line.dataset.key === keyOf(chart.closure)); };
+// The chosen pair as it is now.
+async function checkChosen() {
+  const asked = chart.closure;
+  if (!asked) return;
+  const now = report ? asked : await json(`closures/${keyOf(asked)}`).catch((error) => { if (error.status !== 404) throw error; });
+  if (chart.closure !== asked) return; // another one by now
+  chart.closure = now ? placed(now) : null;
+  if (chart.closure) showClosure();
+  else { at("closure").hidden = true; tell("The chosen pair is no longer there: one of its robots was removed."); }
+}
+export const refreshEvidence = () => (document.body.dataset.view === "evidence" ? showEvidence() : checkChosen());
+
+function supporting(c) {
+  const close = (a, b) => a.every((end, k) => distance(end, b[k]) < NEAR_M);
+  return fleet.accepted.filter((o) => o.map === c.map && keyOf(o) !== keyOf(c) &&
+    ((o.robot_i === c.robot_i && o.robot_j === c.robot_j && close(o.ends, c.ends)) || (o.robot_i === c.robot_j && o.robot_j === c.robot_i && close([o.ends[1], o.ends[0]], c.ends)))).length;
+}
+function showClosure() {
+  const c = chart.closure, rows = [["Decision", decisionOf(c)], ["Why", c.explanation], ["When", `${time(c.stamp_i)} and ${time(c.stamp_j)}`], ["Stamps", `${c.stamp_i.toFixed(2)} s and ${c.stamp_j.toFixed(2)} s`]], off = residual(c);
+  if (!off) rows.push(["Off by", "its ends are on two maps"]);
+  else rows.push(["Off by", `${(1000 * off[0]).toFixed(0)} mm and ${(Math.abs(turned(off[1])) * 180 / Math.PI).toFixed(1)}° from the map`], ["Supported", `by ${count(supporting(c), "pair")} within ${NEAR_M} m`]);
+  if (c.similarity > 0.0005) rows.push(["Looks alike", `${(100 * c.similarity).toFixed(0)} % of the features`]);
+  fill(at("sides"), [c.robot_i, c.robot_j, colourOf(c.robot_i), colourOf(c.robot_j)], () => c.robot_i === c.robot_j ? [swatch(colourOf(c.robot_i)), `${c.robot_i}, earlier and later`] : [swatch(colourOf(c.robot_i)), c.robot_i, " laid on ", swatch(colourOf(c.robot_j)), c.robot_j]);
+  at("facts-of-closure").replaceChildren(...rows.map((cells) => row(...cells)));
+  at("closure").hidden = false;
+  mark();
+}
+export async function pick(closure) {
+  chart.closure = closure;
+  showClosure(); redraw();
+  at("closure").focus(); // its buttons are next for the keyboard
+  const overlay = at("overlay"), key = keyOf(closure);
+  overlay.hidden = true;
+  const picture = await ask(`closures/${key}.png`).then((a) => a.blob()).then(createImageBitmap).catch(() => null);
+  if (!picture || !chart.closure || keyOf(chart.closure) !== key) return; // a run without scans has no picture
+  overlay.getContext("2d").drawImage(picture, 0, 0);
+  overlay.ariaLabel = `Walls that ${closure.robot_i} and ${closure.robot_j} saw, laid on each other`;
+  overlay.hidden = false;
+}
+export function pickOnMap(key) {
+  const found = fleet.accepted.find((c) => keyOf(c) === key);
+  show("evidence");
+  pick(found);
+}
+export function locate() {
+  const { map, ends, robot_i } = chart.closure;
+  openMap(map ?? robotNamed(robot_i)?.map ?? chart.index); showMaps();
+  show("map");
+  at("layer-closures").checked = true;
+  goTo(middle(map === null ? [ends[0] ?? [0, 0]] : ends));
+}
+export const decide = (kind) => { const { robot_i, robot_j, stamp_i, stamp_j } = chart.closure; return change("edits", { kind, content: { robot_i, robot_j, stamps: [stamp_i, stamp_j] } }); };
+
+// ---- History and edits ----
+
+// Each step of the slider passes equally many scans: robots may drive days apart.
+let stamps = [];
+export function setMoment(until) {
+  stamps = [...fleet.trails.values()].flatMap((path) => path.map((p) => p[0])).sort((a, b) => a - b);
+  const seen = stamps.filter((stamp) => stamp <= until).length;
+  fleet.until = seen === stamps.length ? Infinity : until;
+  at("moment").value = fleet.until === Infinity ? 1000 : Math.floor((1000 * seen) / stamps.length);
+  showMoment(seen);
+}
+export function slide() {
+  stamps = [...fleet.trails.values()].flatMap((path) => path.map((p) => p[0])).sort((a, b) => a - b);
+  const share = at("moment").value / at("moment").max, seen = Math.ceil(share * stamps.length);
+  fleet.until = share === 1 || !stamps.length ? Infinity : stamps[Math.max(0, seen - 1)];
+  showMoment(seen);
+}
+function showMoment(seen) {
+  const words = fleet.until === Infinity ? "now" : moment(fleet.until, firstStamp(), true);
+  at("until").textContent = at("moment").ariaValueText = words;
+  at("share").textContent = fleet.until === Infinity ? "" : `${seen.toLocaleString("en")} of ${count(stamps.length, "scan")}; the map itself is today's.`;
+  redraw();
+}
+export function showHistory() {
+  if (document.body.dataset.view !== "history") return;
+  const events = history(fleet), first = firstStamp();
+  fill(at("events"), events, () => events.map((e, k) => {
+    const day = e.time === Infinity ? "Edits" : dayOf(e.time), item = element("li"), isNew = day && day !== (events[k - 1]?.time === Infinity ? "Edits" : dayOf(events[k - 1]?.time ?? 0));
+    if (isNew) item.append(element("h3", day));
+    item.append(e.time === Infinity ? element("span", `${new Date(1000 * e.at).toLocaleString()}: ${e.text}`) : button(`${moment(e.time, first)}: ${e.text}`, () => setMoment(e.time)));
+    return item;
+  }));
+}
+export function showEdits() {
+  const { edits, mayEdit, readOnly } = fleet;
+  for (const one of document.querySelectorAll(".admin")) one.hidden = !mayEdit;
+  document.querySelector('[data-tool="join"]').hidden = fleet.maps.length < 2;
+  at("locked").textContent = mayEdit ? "" : readOnly ? "This run is finished. Change it with “fcslam edit”, and map it again." : "Your token may look, and change nothing. Ask for the token of an administrator.";
+  fill(at("edits"), [mayEdit, edits], () => edits.length ? edits.toReversed().map((e) => {
+    const item = element("li", `${editOf(e)}`, { className: e.undone_by ? "undone" : "" });
+    item.append(element("small", `Edit ${e.number}, ${e.author}, ${new Date(1000 * e.time_s).toLocaleString()}${e.undone_by ? `; taken back by edit ${e.undone_by}` : ""}`));
+    if (mayEdit && !e.undone_by && e.kind !== "undo") item.append(button("Undo", () => change(`edits/${e.number}/undo`), { ariaLabel: `Undo edit ${e.number}` }));
+    return item;
+  }) : [element("li", "No edits.")]);
+}
+
+// ---- Numbers and training ----
+
+export async function showFacts() {
+  const [metrics, config] = await Promise.all([json("metrics.json"), ask("config.yaml").then((a) => a.text())]);
+  at("config").textContent = config;
+  at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) => row(name.replaceAll("_", " "), value === null ? "–" : Number(value.toPrecision(4)).toLocaleString("en", { maximumFractionDigits: 6 }), unit === "1" ? "" : unit)));
+}
+function shape(tag, attributes) {
+  const made = document.createElementNS(at("curves").namespaceURI, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  return made;
+}
+// Curves of losses, each over its largest value, and of measures; a dot is a round whose detector was released.
+export async function showLearning() {
+  const rounds = await json("learning").catch(() => []);
+  at("learned").textContent = rounds.length ? `${count(rounds.length, "round")}, ${rounds.filter((r) => r.released).length} released` : "No training is connected: fcslam serve --learning FOLDER";
+  const names = [...new Set(rounds.flatMap((r) => [...Object.keys(r.losses), ...Object.keys(r.measures)]))], across = (k) => 5 + (290 * k) / Math.max(1, rounds.length - 1), drawn = [];
+  names.forEach((name, n) => {
+    const values = rounds.map((r) => r.losses[name] ?? r.measures[name]), top = rounds[0].losses[name] === undefined ? 1 : Math.max(...values.filter((v) => v !== undefined)) || 1, stroke = COLOURS[n % COLOURS.length];
+    const curve = values.flatMap((v, k) => (v === undefined ? [] : [[across(k), 145 - (140 * v) / top, rounds[k].released]]));
+    drawn.push(shape("polyline", { points: curve.map(([x, y]) => `${x},${y}`).join(" "), fill: "none", stroke }));
+    for (const [cx, cy, released] of curve) if (released) drawn.push(shape("circle", { cx, cy, r: 3, fill: stroke }));
+  });
+  at("curves").replaceChildren(...drawn);
+  at("legend").replaceChildren(...names.map((name, n) => { const item = element("li", swatch(COLOURS[n % COLOURS.length])); item.append(rounds[0].losses[name] === undefined ? name.replaceAll("_", " ") : `${name}: loss, over its largest value`); return item; }));
+  at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, (r.measures.mma_3px ?? r.measures.revisit_recall)?.toFixed(3) ?? "–", r.robots.join(", "), [r.reason, r.left_out].filter(Boolean).join("; "))));
+}

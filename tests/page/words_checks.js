@@ -1,0 +1,25 @@
+// Follows words.js in one script; test_words.py has the right answers.
+const robot = (more) => ({ session: "a", robot: "a", epoch: 0, map: 0, removed: false, last_heard_s: 1, first_s: 0, last_s: 60, path_length_m: 9, ...more });
+const a = robot({}), b = robot({ session: "b", robot: "b" }), alone = { ...b, map: 1 };
+const state = (one, all, readOnly = false) => stateOf(one, all, readOnly);
+const counts = { packets: 5, applied: 5, map_age_s: 1, free_bytes: 9e10 };
+const need = (more) => attention({ robots: [a], maps: [{ map: 0, robots: ["a"] }], separations: [], counts, contradicted: [], readOnly: false, ...more });
+const apart = { maps: [0, 1], candidates: 2, verified: 0, explanation: "few points" };
+const closure = { robot_i: "a", stamp_i: 5, robot_j: "b", stamp_j: 8, reason: "found_by_robot" };
+console.log(JSON.stringify({
+  states: [
+    state(a, [a]), state(a, [a, b]), state(alone, [a, alone]), state(robot({ map: null }), [a, b]), state(robot({ last_heard_s: 90 }), [a]),
+    state(robot({ last_heard_s: 7200 }), [a]), state(robot({ last_heard_s: null }), [a]), state(robot({ removed: true }), [a]),
+    state(a, [a, robot({ session: "a+1", epoch: 1 })]), state(a, [a, b], true), state(alone, [a, alone], true),
+  ].map(({ kind, text }) => [kind, text]),
+  evidence: [evidence([a, b], []).get("a"), evidence([a, b], [closure, { ...closure, stamp_i: 6 }]).get("a")],
+  well: need({}),
+  silent: need({ robots: [robot({ last_heard_s: 90 }), robot({ robot: "c", session: "c", last_heard_s: 60 })] }).map((n) => [n.text, n.action]),
+  apart: need({ robots: [a, alone], maps: [{ map: 0, robots: ["a"] }, { map: 1, robots: ["b"] }], separations: [apart] }).map((n) => [n.text, n.help, n.why, n.do]),
+  vetoed: need({ robots: [a, alone], maps: [{ map: 0, robots: ["a"] }, { map: 1, robots: ["b"] }], separations: [{ ...apart, reason: "vetoed" }] }).map((n) => n.do),
+  disk: need({ counts: { ...counts, free_bytes: 4e8 } }).map((n) => n.text),
+  late: need({ counts: { ...counts, applied: 2, map_age_s: 100 } }).map((n) => n.text),
+  contradiction: need({ contradicted: [{ ...closure, reason: "robot_contradicted", explanation: "why" }] }).map((n) => [n.text, n.do]),
+  times: [duration(8), duration(59.6), duration(119), duration(7200), duration(90000), duration(260000), moment(1077.5, 1000), moment(1077.5, 1000, true)],
+  history: history({ robots: [a, b], accepted: [closure], edits: [{ author: "anna", time_s: 1e9, kind: "region", content: { use: "free", name: "" } }] }).map((e) => [e.time, e.text]),
+}));

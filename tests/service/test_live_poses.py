@@ -1,0 +1,45 @@
+"""A robot's newest pose and scan come from its packets, whatever the map shows."""
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.mission_file import as_stored
+from fcslam.runs import RobotTrajectory
+from fcslam.service.live_poses import live_pose, live_scan
+from fcslam.service.mission_store import MissionStore
+from fcslam.wire.packets import decode, measure
+from fcslam.wire.quantisation import dequantise
+from tests.scripted import LASER
+from tests.service.http.desk import POSES, A
+
+POSES_M = np.array(POSES)
+T_new_map = np.array((3.0, -2.0, 0.7))
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = MissionStore(tmp_path / "mission.sqlite")
+    store.put([as_stored(measure(decode(data))) for data in A], 0.0)
+    yield store
+    store.close()
+
+
+@pytest.mark.parametrize("drawn", [1, len(POSES) // 2, len(POSES)])
+def test_a_pose_is_the_drawn_one_moved_by_what_the_robot_drove_since(store, drawn):
+    in_map = np.array([se2.compose(T_new_map, pose) for pose in POSES_M])
+    trajectory = RobotTrajectory("a", 0, np.arange(float(drawn)), in_map[:drawn])
+    assert live_pose(store, "a", 0, trajectory) == pytest.approx(in_map[-1], abs=0.02)
+
+
+def test_a_session_without_packets_stays_where_it_was_drawn_and_sees_nothing(store):
+    trajectory = RobotTrajectory("z", 0, np.arange(2.0), POSES_M[:2])
+    assert live_pose(store, "z", 0, trajectory) == pytest.approx(POSES_M[1])
+    assert len(live_scan(store, "z", 0)) == 0
+
+
+def test_the_scan_is_the_newest_one(store):
+    (newest,) = {*dequantise(np.full(1, 1000 + len(POSES) - 1, np.uint16)).tolist()}  # as ``tests.scripted`` draws it
+    points = live_scan(store, "a", 0)
+    assert len(points) == LASER.beam_count
+    assert np.hypot(*points.T) == pytest.approx(newest)
