@@ -1,7 +1,7 @@
 """A fleet's result as a run: trajectories, closures, maps and metrics."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,15 +150,11 @@ def _map_files(
     result: FleetResult, trajectories: Mapping[str, RobotTrajectory], grid: OccupancyConfig
 ) -> dict[str, bytes]:
     """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
-    maps: dict[int, list[MappedRobot]] = {}
-    for robot in result.robots:
-        maps.setdefault(robot.map_index, []).append(robot)
     drawn = _drawn_closures(result)
     files: dict[str, bytes] = {}
-    for k, members in sorted(maps.items()):
-        stem = map_stem(k)
+    for k, fused in fused_maps(result, grid):
+        stem, members = map_stem(k), [robot for robot in result.robots if robot.map_index == k]
         regions = [region for region in result.regions if region.map_index == k]
-        fused = erased(fuse_members(members, grid), regions)
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
         files |= region_files(fused, stem, regions)
@@ -169,11 +165,19 @@ def _map_files(
     return files
 
 
+def fused_maps(result: FleetResult, grid: OccupancyConfig) -> Iterator[tuple[int, OccupancyMap]]:
+    """Number and grid of each map of a result, without the regions that users erased."""
+    for k in sorted({robot.map_index for robot in result.robots}):
+        fused = fuse_members([robot for robot in result.robots if robot.map_index == k], grid)
+        yield k, erased(fused, [region for region in result.regions if region.map_index == k])
+
+
 def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> OccupancyMap:
     """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])
-    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid)
+    senders = {robot.robot: robot_of(robot.robot) for robot in members}
+    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid, senders)
     own = [(robot.own_map, robot.T_map_local) for robot in members if robot.own_map is not None]
     return laid_together([(fused, np.zeros(3)), *own], grid.maximum_cells) if own else fused
 
