@@ -240,7 +240,7 @@ class RobotNode:
         joint = self._robot.joint_map()
         if joint is None or self._pose is None:
             return False
-        self._outputs.map(nanoseconds(self._pose.stamp), joint, small_cells=0)
+        self._outputs.map(nanoseconds(self._pose.stamp), joint, only_changes=True)
         return True
 
     def _publish_fleet(self) -> None:

@@ -167,11 +167,11 @@ class Outputs:
         )
         self._send(self._closures, MARKERS, make(MARKERS, markers=[marker]))
 
-    def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, small_cells: int = SMALL_MAP_CELLS) -> bool:
+    def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
         """Publish a map if it changed; returns whether it did.
 
-        A map of at most ``small_cells`` cells goes out whole. Of a larger map, only the cells go out that differ from
-        the last whole one or from the last update. So a late subscriber, who gets the whole one, is complete after any
+        A small map goes out whole, unless ``only_changes``. Of a large map, only the cells go out that differ from the
+        last whole one or from the last update. So a late subscriber, who gets the whole one, is complete after any
         update, and one who got all updates keeps no cell that changed back.
         """
         grid = grid_of(occupancy)
@@ -181,7 +181,7 @@ class Outputs:
                 return False
             before, shown.newest = (shown.whole, shown.newest), grid
             of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
-            if of_whole is None or of_newest is None or grid.values.size <= small_cells:
+            if of_whole is None or of_newest is None or (grid.values.size <= SMALL_MAP_CELLS and not only_changes):
                 shown.whole = grid
                 self._send(shown.publish, GRID, self._grid_message(stamp_ns, grid))
             else:
