@@ -48,7 +48,7 @@ class FleetView:
         self, clients: Sequence[FleetClient], robot: str, own_pose: Callable[[], tuple[int, FloatArray] | None],
         limit_kbps: float | None = None, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        """Begin to follow.
+        """Follow nothing before ``start``.
 
         Args:
             clients: of the cloud's instances; if one does not answer, the next one is asked. ``close`` closes them.
@@ -72,13 +72,18 @@ class FleetView:
         """Why the cloud cannot be followed; None if it can."""
         self._current = self._failures = 0
         self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin to follow, in a thread."""
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop following."""
         self._stop.set()
-        self._thread.join(STOP_TIMEOUT_S)
+        if self._thread is not None:
+            self._thread.join(STOP_TIMEOUT_S)
         for client in self._clients:
             client.close()
 

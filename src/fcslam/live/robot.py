@@ -225,6 +225,7 @@ class Robot(LiveTracker):
                 if own_map:
                     followed = [FleetClient(url, token, ca_file, own) for url in addresses(server)]
                     self.fleet = stack.enter_context(closing(FleetView(followed, name, self._place, budget_kbps)))
+                    self.fleet.start()
             known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
             keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)

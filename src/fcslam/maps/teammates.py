@@ -134,7 +134,11 @@ def _distance(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatAr
 
 def _drop(scans: list[Casting], suspects: _Suspects, chosen: NDArray[np.bool_]) -> None:
     """Make the chosen points invalid."""
-    for k in np.unique(suspects.scans[chosen]).tolist():
+    numbers, beams = suspects.scans[chosen], suspects.beams[chosen]  # scan by scan
+    kinds, first = np.unique(numbers, return_index=True)
+    if not len(numbers):
+        return
+    for k, hit in zip(kinds.tolist(), np.split(beams, first[1:]), strict=True):
         ranges_m = np.array(scans[k].ranges_m)
-        ranges_m[suspects.beams[chosen & (suspects.scans == k)]] = 0.0
+        ranges_m[hit] = 0.0
         scans[k] = scans[k]._replace(ranges_m=frozen(ranges_m, np.float32))
