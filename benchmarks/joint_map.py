@@ -7,7 +7,8 @@ of 0.25 m. Each robot is a `fcslam.Robot` with its own worker; all send to one `
 second, as the bridge to ROS does, each robot's map is read.
 
 Age: from the moment at which the scan of another robot looked through a cell until the cell is known on this robot;
-only cells that this robot did not see itself before. The end: the maps on the robots 5 s after the service was asked
+only cells that this robot did not see itself before, and that were
+seen after the maps of all robots had joined. The end: the maps on the robots 5 s after the service was asked
 for its result, against `map.pgm` of that result, which is that of `fcslam map` on the recordings
 (`tests/service/test_worker.py`). Ghosts: occupied cells of that map within 0.25 m of where a robot drove.
 """
@@ -57,6 +58,7 @@ def main() -> None:
             for robot in robots
         ]
         samples: list[list[tuple[float, OccupancyMap]]] = [[] for _ in robots]
+        joined_s, joins = 0.0, 0
         costs: list[list[float]] = [[] for _ in robots]
         began_s = time.monotonic()
         threads = [
@@ -66,6 +68,8 @@ def main() -> None:
             thread.start()
         while any(thread.is_alive() for thread in threads):
             time.sleep(1.0)
+            if (count := sum(len(robot.fleet.news) for robot in live)) > joins:
+                joined_s, joins = time.monotonic() - began_s, count
             for k, robot in enumerate(live):
                 if (joint := robot.joint_map()) is not None:
                     samples[k].append((time.monotonic() - began_s, joint))
@@ -79,7 +83,8 @@ def main() -> None:
         ends = [robot.joint_map() or final for robot in live]
         same = [_difference(end, final) for end in ends]
         news = [robot.fleet.news for robot in live]
-    ages = [_ages(samples, [run.trajectories[robot.name] for robot in robots], scans, k) for k in range(len(robots))]
+    paths = [run.trajectories[robot.name] for robot in robots]
+    ages = [_ages(samples[k], paths, scans, k, joined_s) for k in range(len(robots))]
     report.table(
         "Each robot",
         {"": "s", "cells, n": ",d", "age 50 %, s": ".1f", "age 95 %, s": ".1f", "kB/s down": ".1f",
@@ -137,8 +142,8 @@ def _difference(first: OccupancyMap, second: OccupancyMap) -> int:
     return int((wide[0] != wide[1]).sum())
 
 
-def _ages(samples, paths, scans, number):
-    """Ages of the cells that a robot has from others, s."""
+def _ages(samples, paths, scans, number, joined_s):
+    """Ages of the cells that a robot has from others, s; of those that they saw once all maps were joined."""
     first: dict[int, dict[tuple[int, int], float]] = {}
     for k, (path, own) in enumerate(zip(paths, scans, strict=True)):
         seen: dict[tuple[int, int], float] = {}
@@ -156,17 +161,15 @@ def _ages(samples, paths, scans, number):
             for cell, at_s in seen.items():
                 others[cell] = min(others.get(cell, np.inf), at_s)
     ages, known = [], set()
-    for at_s, joint in samples[number]:
+    for at_s, joint in samples:
         column, row = np.round(np.array(joint.origin_xy) / joint.resolution_m).astype(int)
         for y, x in zip(*np.nonzero(joint.cells), strict=True):
             cell = (row + int(y), column + int(x))
             if cell in known:
                 continue
             known.add(cell)
-            seen_s = others.get(cell)
-            if at_s > samples[number][0][0] + 10.0 and seen_s and seen_s > samples[number][0][0] and (
-                first[number].get(cell, np.inf) > at_s
-            ):
+            seen_s = others.get(cell, -np.inf)
+            if seen_s > joined_s and first[number].get(cell, np.inf) > at_s:
                 ages.append(at_s - seen_s)
     return ages or [np.nan]
 

@@ -64,6 +64,8 @@ class FleetView:
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
         self._map: OccupancyMap | None = None
+        self.drawn_s = -np.inf
+        """Stamp of the robot's newest keyscan that is in ``joint_map``; minus infinity without one."""
         self.news: list[str] = []
         """What changed in the robot's map, one line each, the oldest first."""
         self.version = 0
@@ -103,13 +105,6 @@ class FleetView:
         own = self._own()
         return None if own is None else own.map_index
 
-    @property
-    def drawn_s(self) -> float:
-        """Stamp of the robot's newest keyscan that the cloud has in a map; minus infinity without one."""
-        if self._reply is None:
-            return -np.inf
-        return next((one.stamp for one in self._reply[0].robots if one.robot == self._robot), -np.inf)
-
     def robots(self) -> list[Teammate]:
         """All robots that the cloud knows, with the ages of their poses now."""
         if self._reply is None:
@@ -139,16 +134,22 @@ class FleetView:
         self._tell(before, self._members())
         if not with_tiles:
             return
+        stamp = next((one.stamp for one in self._reply[0].robots if one.robot == self._robot), -np.inf)
         found = client.tiles(self._robot, self._etag, self._limit_bytes)
+        is_complete = True
         if found is not None:
             try:
-                self._tiled.add(decode_batch(found[0]))
+                batch = decode_batch(found[0])
+                self._tiled.add(batch)
+                is_complete = batch.is_complete
             except ValueError as error:
                 self._etag = ""
                 raise UnavailableError(f"the cloud's reply is broken: {error}") from error
             self._etag = found[1]
             self._map = self._tiled.occupancy()
             self.version += 1
+        if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
+            self.drawn_s = stamp
 
     def _run(self) -> None:
         asked = 0

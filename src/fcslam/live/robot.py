@@ -77,8 +77,6 @@ LARGEST_BACKLOG = 200
 time never has as many."""
 
 
-OVERLAP_S = 5.0
-"""Keyscans that are older by this than those which the cloud has drawn are no longer drawn here."""
 MOST_DRAWN = 20_000
 """Most keyscans that wait to be drawn by the cloud: hours of an outage."""
 
@@ -322,7 +320,7 @@ class Robot(LiveTracker):
             localizer = self._localizer(self._part)
             if fleet.map_index is None or fleet.map_index != localizer.map_index:
                 return None  # the server is about to draw the map that the robot's poses are in
-            while self._drawn and self._drawn[0].stamp <= fleet.drawn_s - OVERLAP_S:
+            while self._drawn and self._drawn[0].stamp <= fleet.drawn_s:
                 self._drawn.popleft()
             lately = [
                 Casting(one.ranges_m, one.laser, moved, one.sweep)
