@@ -134,7 +134,9 @@ def _difference(first: OccupancyMap, second: OccupancyMap) -> int:
     side = first.resolution_m
     corners = [np.round(np.array(one.origin_xy) / side).astype(int) for one in (first, second)]
     low = np.min(corners, axis=0)
-    high = np.max([corner + one.cells.shape[::-1] for corner, one in zip(corners, (first, second), strict=True)], axis=0)
+    high = np.max(
+        [corner + one.cells.shape[::-1] for corner, one in zip(corners, (first, second), strict=True)], axis=0
+    )
     wide = np.zeros((2, *(high - low)[::-1]), np.uint8)
     for k, (corner, one) in enumerate(zip(corners, (first, second), strict=True)):
         x, y = corner - low

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,11 @@ from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.maps.certificate import MappedPath, certificate_json, certificate_png, certify
 from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
-from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs import QUALITY, ClosureRow, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
@@ -68,14 +70,18 @@ def run_of(
         )
         for name, track in tracks.items()
     }
+    fused = dict(fused_maps(result, grid))
+    certificates = _certificates(result, fused) if with_local_maps else {}
+    metrics = [*metrics, *([Metric("map_error_95", certificates[0]["error_95"], "m")] if 0 in certificates else [])]
     return Run(
         trajectories=trajectories,
         closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
-        map_files=_map_files(result, trajectories, grid),
+        map_files=_map_files(result, trajectories, fused),
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
+        quality=_quality_files(certificates, fused),
     )
 
 
@@ -147,12 +153,12 @@ def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> Closur
 
 
 def _map_files(
-    result: FleetResult, trajectories: Mapping[str, RobotTrajectory], grid: OccupancyConfig
+    result: FleetResult, trajectories: Mapping[str, RobotTrajectory], maps: Mapping[int, OccupancyMap]
 ) -> dict[str, bytes]:
     """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
     drawn = _drawn_closures(result)
     files: dict[str, bytes] = {}
-    for k, fused in fused_maps(result, grid):
+    for k, fused in maps.items():
         stem, members = map_stem(k), [robot for robot in result.robots if robot.map_index == k]
         regions = [region for region in result.regions if region.map_index == k]
         files[f"{stem}.pgm"] = pgm_bytes(fused)
@@ -163,6 +169,27 @@ def _map_files(
             ways = {name: robot.T_map_base for name, robot in trajectories.items() if name in names}
             files[f"{stem}.png"] = map_png(fused, ways, drawn.get(k, ()))
     return files
+
+
+def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict[int, dict[str, Any]]:
+    """How good each map is where; of the maps that get a picture."""
+    certificates = {}
+    for k, fused in maps.items():
+        members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
+        if members and fused.cells.any() and (k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN):
+            paths = [MappedPath(robot.robot, robot.stamps, robot.T_map_base, robot.variables) for robot in members]
+            certificates[k] = certify(result.graph, paths, fused)
+    return certificates
+
+
+def _quality_files(
+    certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]
+) -> dict[str, bytes]:  # fmt: skip
+    if not certificates:
+        return {}
+    pictures = {f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
+                for k, one in certificates.items()}  # fmt: skip
+    return {f"{QUALITY}.json": certificate_json(certificates), **pictures}
 
 
 def fused_maps(result: FleetResult, grid: OccupancyConfig) -> Iterator[tuple[int, OccupancyMap]]:
