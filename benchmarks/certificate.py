@@ -3,9 +3,9 @@
     python benchmarks/certificate.py [--seeds 10] [--first 100] [--robots 2] [--path 60]
 
 Two robots drive through each building; it is mapped with the default configuration. A cell of 1 m2 is good to 5 cm if
-the positions within 10 m, as seen from the nearest keyscan, have a smaller root mean square error. `SCALE` and `QUANTILE`
-of `fcslam.maps.certificate` were chosen on the seeds 0 to 5 (`--first 0 --seeds 6`). Fit: the ratio of true to expected errors,
-median and 95 %.
+the positions within 10 m, as seen from the nearest keyscan, have a smaller root mean square error. `SCALE` and
+`QUANTILE` of `fcslam.maps.certificate` were chosen on the seeds 0 to 5 (`--first 0 --seeds 6`). Fit: the ratio of true
+to expected errors, median and 95 %.
 """
 
 import json

@@ -171,7 +171,7 @@ def _ages(samples, paths, scans, number, joined_s):
                 continue
             known.add(cell)
             seen_s = others.get(cell, -np.inf)
-            if seen_s > joined_s and first[number].get(cell, np.inf) > at_s:
+            if joined_s < seen_s < at_s and first[number].get(cell, np.inf) > at_s:
                 ages.append(at_s - seen_s)
     return ages or [np.nan]
 

@@ -8,8 +8,14 @@ import pytest
 from fcslam.errors import CloudError, UnavailableError
 from fcslam.live.fleet_view import FleetView
 from fcslam.wire.fleet_client import FleetClient
-from tests.service.http.conftest import desk  # noqa: F401
-from tests.service.http.desk import A, B
+from tests.service.http.desk import SCRIPT, A, B, Desk
+
+
+@pytest.fixture
+def desk(tmp_path, scripted):
+    scripted(SCRIPT)
+    with Desk(tmp_path / "data") as desk:
+        yield desk
 
 
 def client(desk, robot):
@@ -34,7 +40,7 @@ def known(occupancy):
     return {(row + y, column + x): occupancy.cells[y, x] for y, x in zip(*np.nonzero(occupancy.cells), strict=True)}
 
 
-def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service(desk):  # noqa: F811
+def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service(desk):
     desk.send("a", A)
     with closing(view(desk, "a")) as first:
         follow(first)
@@ -51,7 +57,7 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
             assert first.received_bytes - before < 1000, "nothing changed, so no tile travels"
 
 
-def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):  # noqa: F811
+def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):
     desk.send("a", A)
     desk.send("b", B)
     with closing(view(desk, "a")) as fleet:
@@ -63,13 +69,13 @@ def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):  # noqa:
         assert fleet.news[1:] == ["map 0 holds a; taken out: b"]
 
 
-def test_a_robot_says_where_it_is_and_others_believe_what_it_can_have_driven(desk):  # noqa: F811
+def test_a_robot_says_where_it_is_and_others_believe_what_it_can_have_driven(desk):
     desk.send("a", A)
     desk.send("b", B)
     with closing(view(desk, "b")) as fleet:
         follow(fleet)
         there = next(mate for mate in fleet.robots() if mate.robot == "a").T_map_base
-        near, far = there + (0.5, 0.0, 0.1), there + (0.0, 1e6, 0.0)
+        near, far = there + np.array((0.5, 0.0, 0.1)), there + np.array((0.0, 1e6, 0.0))
         for said, seen in ((near, near), (far, there)):
             with closing(view(desk, "a", (0, said))) as other:
                 other.step()
@@ -79,7 +85,7 @@ def test_a_robot_says_where_it_is_and_others_believe_what_it_can_have_driven(des
             assert 0.0 <= mate.age_s < 1e9
 
 
-def test_after_an_outage_the_last_map_is_there(desk):  # noqa: F811
+def test_after_an_outage_the_last_map_is_there(desk):
     desk.send("a", A)
     with closing(view(desk, "a")) as fleet:
         follow(fleet)
@@ -91,7 +97,7 @@ def test_after_an_outage_the_last_map_is_there(desk):  # noqa: F811
         assert known(fleet.joint_map) == before
 
 
-def test_a_robot_reads_no_other_robots_map_and_says_nothing_for_it(desk):  # noqa: F811
+def test_a_robot_reads_no_other_robots_map_and_says_nothing_for_it(desk):
     desk.send("a", A)
     with closing(client(desk, "b")) as other:
         with pytest.raises(CloudError, match="does not speak for robot 'a'"):
@@ -104,5 +110,5 @@ def test_a_robot_reads_no_other_robots_map_and_says_nothing_for_it(desk):  # noq
 
 
 @pytest.mark.parametrize("body", [{"map": 0, "pose": [0, 0]}, {"map": -1}, {"pose": ["x", 0, 0]}, {"who": 1}])
-def test_a_pose_that_is_none_is_refused(desk, body):  # noqa: F811
+def test_a_pose_that_is_none_is_refused(desk, body):
     assert desk.ask("POST", "/api/v1/robots/a/fleet", "a", json=body).status_code == 400

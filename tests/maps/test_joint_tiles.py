@@ -72,7 +72,7 @@ def test_in_another_frame_earlier_tiles_count_no_longer():
     b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[[0,0,-1]]}\n',
 ])  # fmt: skip
 def test_what_is_no_batch_is_refused(data):
-    with pytest.raises(ValueError, match="no tiles|not tiles"):
+    with pytest.raises(ValueError, match="not tiles of a map"):
         decode_batch(data)
 
 
@@ -83,7 +83,7 @@ def test_a_broken_tile_and_a_map_without_end_are_refused_and_nothing_changes():
     before = known_cells(tiled.occupancy())
     tile = next(iter(history.since("", 0, 10**6).tiles.values()))
     for tiles in ({(0, 0): b"no zstd"}, {(10**6, 10**6): tile}):
-        with pytest.raises(ValueError, match="a broken tile|a map of more than"):
+        with pytest.raises(ValueError, match=r"a (broken tile|map of more than)"):
             tiled.add(TileBatch("frame", 9, 0.05, True, tiles))
         assert known_cells(tiled.occupancy()) == before
 

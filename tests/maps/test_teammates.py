@@ -52,8 +52,8 @@ MEETING = {"a": line((2.0, 3.0), (6.0, 3.0)), "b": line((6.0, 3.8), (2.0, 3.8)),
 
 def drawn(keyscans, poses, config=CONFIG, senders=None):
     robots = {keyscan.id.robot for keyscan in keyscans}
-    senders = {robot: robot for robot in robots} if senders is None else senders
-    return fuse(keyscans, poses, {robot: (LASER,) for robot in robots}, config, senders)
+    senders = senders or dict(zip(robots, robots, strict=True))
+    return fuse(keyscans, poses, dict.fromkeys(robots, (LASER,)), config, senders)
 
 
 def occupied_near(occupancy, ways, radius_m=RADIUS_M + 0.05):

@@ -5,7 +5,8 @@ A thread follows the cloud. No scan waits for it, and while the cloud is away ev
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,7 +20,7 @@ from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.fleet_client import FleetClient, FleetReply
 
 POLL_S: Final = 0.5
-"""Time between two requests; every other one also asks for changed tiles."""
+"""Time between two looks at the fleet."""
 DOWNLINK_KBPS: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
 STOP_TIMEOUT_S: Final = 2.0
@@ -59,7 +60,7 @@ class FleetView:
         """
         self._clients, self._robot, self._own_pose, self._clock = clients, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments
-        self._limit_bytes = max(1, int(2e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS)))
+        self._limit_bytes = max(1, int(1e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS)))
         self._tiled, self._etag = TiledMap(), ""
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
@@ -120,7 +121,7 @@ class FleetView:
         """For every two maps that are apart: their indices and the reason."""
         return () if self._reply is None else self._reply[0].separations
 
-    def step(self, with_tiles: bool = True) -> None:
+    def step(self) -> None:
         """Ask once.
 
         Raises:
@@ -132,8 +133,6 @@ class FleetView:
         before = self._members()
         self._reply = client.exchange(self._robot, None if own is None else own[0], pose), self._clock()
         self._tell(before, self._members())
-        if not with_tiles:
-            return
         stamp = next((one.stamp for one in self._reply[0].robots if one.robot == self._robot), -np.inf)
         found = client.tiles(self._robot, self._etag, self._limit_bytes)
         is_complete = True
@@ -152,12 +151,10 @@ class FleetView:
             self.drawn_s = stamp
 
     def _run(self) -> None:
-        asked = 0
         wait_s = 0.0
         while not self._stop.wait(wait_s):
-            asked += 1
             try:
-                self.step(with_tiles=asked % 2 == 1)
+                self.step()
                 self.trouble, self._failures, wait_s = None, 0, POLL_S
             except CloudError as error:  # also one that cannot be reached, or that is older than this program
                 self._current = (self._current + 1) % len(self._clients)
@@ -195,3 +192,14 @@ class FleetView:
             line = f"map {now[0]} holds {everybody}" + "".join(f"; {part}" for part in parts)
         if len(self.news) < MOST_NEWS:
             self.news.append(line)
+
+
+@contextmanager
+def following(
+    clients: Sequence[FleetClient], robot: str, own_pose: Callable[[], tuple[int, FloatArray] | None],
+    limit_kbps: float | None,
+) -> Iterator[FleetView]:  # fmt: skip
+    """A view that follows its fleet in this block; arguments as for ``FleetView``."""
+    with closing(FleetView(clients, robot, own_pose, limit_kbps)) as view:
+        view.start()
+        yield view

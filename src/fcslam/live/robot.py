@@ -27,7 +27,7 @@ from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.occupancy import Casting, draw_over
-from fcslam.live.fleet_view import FleetView
+from fcslam.live.fleet_view import FleetView, following
 from fcslam.live.inputs import (
     Lasers,
     checked_camera,
@@ -90,6 +90,18 @@ class _DrawnKeyscan(NamedTuple):
     laser: LaserModel
     T_odom_base: FloatArray
     sweep: Sweep | None
+
+
+class _Ahead:
+    """What this robot knows before its fleet does, and what it told of its fleet."""
+
+    def __init__(self) -> None:
+        self.drawn: deque[_DrawnKeyscan] = deque()
+        """Keyscans that the joint map of the cloud may not show yet."""
+        self.lasers: tuple[LaserModel, ...] = ()
+        """As the robot announced them last."""
+        self.news = 0
+        """Changes of the fleet that were told."""
 
 
 class Playback(NamedTuple):
@@ -199,11 +211,7 @@ class Robot(LiveTracker):
         self._sleep = sleep
         self.fleet: FleetView | None = None
         """What the robot knows of its fleet; None without a server or without a map of its own."""
-        self._news = 0
-        """Changes of the fleet that were told."""
-        self._drawn: deque[_DrawnKeyscan] = deque()
-        """Keyscans that the joint map of the cloud may not show yet."""
-        self._announced: tuple[LaserModel, ...] = ()
+        self._ahead = _Ahead()
         with ExitStack() as stack:
             if executor is None:
                 executor = worker_process()
@@ -222,8 +230,7 @@ class Robot(LiveTracker):
                 transport = InstancesTransport(instances)
                 if own_map:
                     followed = [FleetClient(url, token, ca_file, own) for url in addresses(server)]
-                    self.fleet = stack.enter_context(closing(FleetView(followed, name, self._place, budget_kbps)))
-                    self.fleet.start()
+                    self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
             known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
             keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)
@@ -320,11 +327,11 @@ class Robot(LiveTracker):
             localizer = self._localizer(self._part)
             if fleet.map_index is None or fleet.map_index != localizer.map_index:
                 return None  # the server is about to draw the map that the robot's poses are in
-            while self._drawn and self._drawn[0].stamp <= fleet.drawn_s:
-                self._drawn.popleft()
+            while self._ahead.drawn and self._ahead.drawn[0].stamp <= fleet.drawn_s:
+                self._ahead.drawn.popleft()
             lately = [
                 Casting(one.ranges_m, one.laser, moved, one.sweep)
-                for one in self._drawn
+                for one in self._ahead.drawn
                 if one.part == self._part and (moved := localizer.T_map_base(one.T_odom_base)) is not None
             ]
         return padded(draw_over(joint, lately, self._config.map))
@@ -561,16 +568,16 @@ class Robot(LiveTracker):
         """Keep the next keyscans until the cloud has drawn them."""
         for packet in packets:
             if isinstance(packet.body, Hello):
-                self._announced = packet.body.lasers
+                self._ahead.lasers = packet.body.lasers
             elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
                 keyscan, track = packet.body, self._frontend.tracks[packet.epoch]
                 T_odom_base = track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
-                laser = keyscan.laser_model(self._announced)
-                self._drawn.append(
+                laser = keyscan.laser_model(self._ahead.lasers)
+                self._ahead.drawn.append(
                     _DrawnKeyscan(packet.epoch, keyscan.stamp, keyscan.ranges_m, laser, T_odom_base, keyscan.sweep)
                 )
-                if len(self._drawn) > MOST_DRAWN:
-                    self._drawn.popleft()
+                if len(self._ahead.drawn) > MOST_DRAWN:
+                    self._ahead.drawn.popleft()
 
     def _place(self) -> tuple[int, FloatArray] | None:
         """Index of the robot's map and its pose there, in any thread."""
@@ -640,8 +647,8 @@ class Robot(LiveTracker):
             self._applied = correction
         self._tell_connection()
         if self.fleet is not None:
-            for line in self.fleet.news[self._news :]:
-                self._news += 1
+            for line in self.fleet.news[self._ahead.news :]:
+                self._ahead.news += 1
                 self._event(EventKind.FLEET, line)
         broken = self._frontend.backend_failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):

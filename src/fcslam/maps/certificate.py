@@ -1,13 +1,15 @@
 """How good a map is where: the expected error of each square metre, by the marginal covariances of the pose graph.
 
 Two errors count for a cell: that of its position in the frame of the map's first robot, and that of its position
-relative to its surroundings. The covariances of the graph are too small, because errors of scan matching are correlated;
-``SCALE`` and ``FLOOR_M`` are calibrated on simulated buildings (``benchmarks/certificate.py``).
+relative to its surroundings. The covariances of the graph are larger than the errors, because no measurement counts as
+more precise than scan matching at its worst. ``SCALE`` is calibrated on simulated buildings
+(``benchmarks/certificate.py``).
 """
 
 import json
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -22,12 +24,12 @@ from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray
 from fcslam.runs.map_files import Occupancy, OccupancyMap, pixels_of
 
-SCALE: Final = 2.0
+SCALE: Final = 0.25
 """Ratio of true errors to the standard deviations of the graph."""
 FLOOR_M: Final = 0.008
 """Error that every cell has: noise of the ranges and of matching, metres."""
 QUANTILE: Final = 2.0
-"""Ratio of the error that 95 % of cells stay below to its root mean square; 1.73 for a normal error in the plane."""
+"""Ratio of the error that 95 % of cells stay below to its root mean square; of a normal error in the plane, 1.73."""
 BAR_M: Final = 0.05
 WITHIN_M: Final = 10.0
 CELL_M: Final = 1.0
@@ -41,9 +43,9 @@ OPEN_M: Final = 0.03
 """A motion is open if its weakest direction has a larger standard deviation."""
 OPEN_LENGTH_M: Final = 3.0
 """Shorter open stretches are not named."""
-AGAIN_M: Final = 0.02
-AGAIN_PER_M: Final = 0.003
-"""Standard deviation of the motion that another drive between two places measures: a constant part, and one by metre."""
+AGAIN_M: Final = 0.01
+AGAIN_PER_M: Final = 0.001
+"""Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 
 
@@ -113,7 +115,7 @@ def certify(
     good = [cell for cell in cells if cell["good"]]
     return {
         "bar": bar_m, "within": within_m, "cell": CELL_M, "scale": SCALE, "floor": FLOOR_M,
-        "error_95": round(float(np.percentile(bound[nearest], 95)), 4) if len(cells) else None,
+        "error_95": round(float(np.percentile(bound[nearest], 95)), 4) if cells else None,
         "good_share": round(len(good) / len(cells), 4) if cells else None,
         "verdict": f"{len(good)} of {len(cells)} m2 are good to {bar_m:g} m within {within_m:g} m",
         "open_stretches": _open_stretches(graph, paths),
@@ -262,7 +264,7 @@ def _open_stretches(graph: PoseGraph, paths: Sequence[MappedPath]) -> list[dict[
     for path in paths:
         variables, begin = path.variables.tolist(), 0
         is_open = [motion.get(pair, 0.0) > OPEN_M and pair[1] not in closed
-                   for pair in zip(variables[:-1], variables[1:], strict=True)]  # fmt: skip
+                   for pair in pairwise(variables)]  # fmt: skip
         for k, now in enumerate([*is_open, False]):
             if now:
                 continue
