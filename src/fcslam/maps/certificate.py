@@ -164,8 +164,10 @@ def relative_error(poses: FloatArray, covariance: FloatArray, within_m: float) -
     """Root mean square error of the positions within a distance of each place as seen from it, shape (P,), metres."""
     result = np.full(len(poses), FLOOR_M)
     blocks = covariance.reshape(len(poses), 3, len(poses), 3).transpose(0, 2, 1, 3)
-    for k, others in enumerate(cKDTree(poses[:, :2]).query_ball_point(poses[:, :2], within_m)):
-        near = np.array(sorted(set(others) - {k}), np.int64)
+    tree = cKDTree(poses[:, :2])
+    for k in range(len(poses)):
+        others = np.array(tree.query_ball_point(poses[k, :2], within_m), np.int64)
+        near = np.sort(others[others != k])
         if len(near):
             apart = poses[near, :2] - poses[k, :2]
             swing = apart @ _S.T  # change of the other's position by a turn of this place
@@ -285,7 +287,7 @@ def _drives(
     weight = np.bincount(nearest, minlength=len(places.poses))
     bad = np.flatnonzero(~is_good & (weight > 0))
     known = np.flatnonzero(is_good) if is_good.any() else np.array([0])
-    found = []
+    found: list[dict[str, Any]] = []
     error = places.relative_m(within_m)
     for b in bad[np.argsort(-error[bad])][:: max(1, len(bad) // 8)].tolist()[:8]:
         apart = np.hypot(*(places.poses[known, :2] - places.poses[b, :2]).T)
@@ -302,7 +304,7 @@ def _drives(
                 "text": f"drive from ({ends[0][0]}, {ends[0][1]}) to ({ends[1][0]}, {ends[1][1]}) again: about {gain} "
                 "m2 more are good then",
             })  # fmt: skip
-    return sorted(found, key=lambda drive: -drive["gain_m2"])[:3]
+    return sorted(found, key=lambda drive: -int(drive["gain_m2"]))[:3]
 
 
 def _with_motion(places: Places, a: int, b: int, sigma_m: float) -> FloatArray:

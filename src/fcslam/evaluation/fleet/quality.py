@@ -58,8 +58,8 @@ def evaluate_quality(folder: Path, truth: Path, bar_m: float | None = None) -> J
     ]
     if not found:
         raise EvaluationError(f"{folder}: the truth knows no pose of a map with a certificate")
-    return Judged(*(np.concatenate(parts) for parts in zip(*((one[0], one[1]) for one in found), strict=True)),
-                  found[0].bar_m)  # fmt: skip
+    bounds, errors = (np.concatenate([one[part] for one in found]) for part in (0, 1))
+    return Judged(bounds, errors, found[0].bar_m)
 
 
 def certificates_of(run: Run, folder: Path) -> dict[int, dict[str, Any]]:
