@@ -98,7 +98,9 @@ def certify(
     absolute, relative = places.absolute_m(), places.relative_m(within_m)
     local = places.relative_m(SEEN_FROM_M)
     centres = _known_squares(occupancy)
-    nearest = cKDTree(places.poses[:, :2]).query(centres)[1] if len(centres) else np.zeros(0, np.int64)
+    nearest = np.zeros(0, np.int64)
+    if len(centres):
+        nearest = np.asarray(cKDTree(places.poses[:, :2]).query(centres)[1], np.int64)
     turn = np.sqrt(np.diag(places.covariance)[2::3])
     lever = np.hypot(*(centres - places.poses[nearest, :2]).T) * turn[nearest]
     passes, seen_s = _passes(centres, paths)
