@@ -1,5 +1,6 @@
 """What a robot knows of its fleet: over real HTTP, from a service whose worker applies packets at once."""
 
+import time
 from contextlib import closing
 
 import numpy as np
@@ -95,6 +96,17 @@ def test_after_an_outage_the_last_map_is_there(desk):
         with pytest.raises(UnavailableError):
             fleet.step()
         assert known(fleet.joint_map) == before
+
+
+def test_following_goes_on_through_an_outage(desk):
+    desk.send("a", A)
+    clients = [FleetClient("http://127.0.0.1:9"), client(desk, "a")]
+    with closing(FleetView(clients, "a", lambda: None)) as fleet:
+        fleet.start()
+        until = time.monotonic() + 20.0
+        while fleet.joint_map is None and time.monotonic() < until:
+            time.sleep(0.02)
+        assert fleet.joint_map is not None
 
 
 def test_a_robot_reads_no_other_robots_map_and_says_nothing_for_it(desk):

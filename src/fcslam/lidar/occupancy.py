@@ -221,14 +221,17 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
         ValueError: as ``cast``.
     """
     side = base.resolution_m
-    groups = _by_laser(scans)
+    column, row = (round(value / side) for value in base.origin_xy)
+    # Cell edges of other programs' maps need not lie on multiples of the resolution.
+    off_x, off_y = base.origin_xy[0] - column * side, base.origin_xy[1] - row * side
+    shift = np.array((off_x, off_y, 0.0))
+    groups = _by_laser([scan._replace(T_map_base=scan.T_map_base - shift) for scan in scans])
     if not groups:
         return base
     drawn = _layout(groups, config.model_copy(update={"resolution_m": side}))
     if drawn.resolution_m != side:  # over the limit on cells
         return base
     height, width = base.cells.shape
-    column, row = (round(value / side) for value in base.origin_xy)
     left, bottom = min(column, drawn.column), min(row, drawn.row)
     right, top = max(column + width, drawn.column + drawn.width), max(row + height, drawn.row + drawn.height)
     layout = _Layout(side, left, bottom, right - left, top - bottom)
@@ -243,7 +246,7 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
         hits, passes, counts, config.contradicting_scans, CLEAR_RATIO, config.occupied_ratio, config.minimum_passes
     )
     cells = _classify(hits, passes, config.minimum_passes, config.occupied_ratio)
-    return OccupancyMap(cells, side, (left * side, bottom * side), base.floor)
+    return OccupancyMap(cells, side, (left * side + off_x, bottom * side + off_y), base.floor)
 
 
 def _by_laser(keyscans: Sequence[Casting]) -> list[_Beams]:

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.errors import CloudError, UnavailableError
+from fcslam.errors import FcslamError, UnavailableError
 from fcslam.maps.joint_tiles import TiledMap, decode_batch
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
@@ -156,7 +156,7 @@ class FleetView:
             try:
                 self.step()
                 self.trouble, self._failures, wait_s = None, 0, POLL_S
-            except CloudError as error:  # also one that cannot be reached, or that is older than this program
+            except FcslamError as error:  # the cloud is away, or older than this program
                 self._current = (self._current + 1) % len(self._clients)
                 self.trouble, self._failures = str(error), self._failures + 1
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)

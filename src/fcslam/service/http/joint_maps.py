@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, HTTPException, Query
 from fastapi.responses import Response
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from fcslam.config import Settings
 from fcslam.lidar.occupancy import FARTHEST_M
@@ -20,13 +20,22 @@ from fcslam.service.summaries import run_of
 
 LARGEST_ANSWER = 1_000_000
 """Bytes of the tiles of one answer."""
-Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
+
+
+def _number(value: object) -> object:
+    """JSON knows 1.0 as an integer, and true as none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError("is no number")
+    return value
 
 
 class OwnPose(Settings):
     """Where a robot says it is."""
 
-    map: int | None = Field(None, ge=0, description="index of its map, as in its newest correction; null: not known")
+    map: Annotated[int, BeforeValidator(_number), Field(ge=0)] | None = Field(
+        None, description="index of its map, as in its newest correction; null: not known"
+    )
     pose: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="x and y in metres, theta in radians, in that map"
     )
