@@ -33,7 +33,7 @@ def _number(value: object) -> object:
 class OwnPose(Settings):
     """Where a robot says it is."""
 
-    map: Annotated[int, BeforeValidator(_number), Field(ge=0)] | None = Field(
+    map: Annotated[int, Field(ge=0), BeforeValidator(_number)] | None = Field(
         None, description="index of its map, as in its newest correction; null: not known"
     )
     pose: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
