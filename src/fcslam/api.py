@@ -109,8 +109,9 @@ def localize(
     progress: "Callable[[LocalizationProgress], None]" = lambda _: None,
     force: bool = False,
     floor: str = "",
+    update: bool = False,
 ) -> Run:
-    """Localise the robot of a recording in a finished map, which does not change.
+    """Localise the robot of a recording in a finished map, which does not change meanwhile.
 
     The robot's starting pose need not be known. A robot that does not know where it is has no pose, never a guess.
 
@@ -124,6 +125,8 @@ def localize(
         progress: called every 50 scans.
         force: replace a run that is at ``output``.
         floor: floor of the recording, whose first map is used; it must be named if the run has maps of several floors.
+        update: draw what changed since into the map of the run, where at least ``map.contradicting_scans`` scans show
+            it. The map before is beside it, as ``map_before``; poses and unchanged cells stay.
 
     Returns:
         A run whose trajectory holds the poses that the robot believed; ``localized`` has every scan with standard
@@ -141,7 +144,7 @@ def localize(
     if isinstance(recording, str | os.PathLike):
         recording = _checked(sources.open_source(Path(recording), bag_options))
     initial: FloatArray | None = None if initial_pose is None else frozen(initial_pose)
-    run = run_localization(recording, occupancy, settings, initial, progress)
+    run = run_localization(recording, occupancy, settings, initial, progress, update)
     if output is not None:
         run.save(output, force)
     return run

@@ -16,10 +16,11 @@ from fcslam.config import dump, one_line, parse_yaml
 from fcslam.errors import EvaluationError, SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
+from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.maps.drawing import map_png
 from fcslam.mission import MissionConfig, continued_config, run_mission
 from fcslam.mission_file import read_mission
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
@@ -34,6 +35,8 @@ MAP_YAML: Final = "map.yaml"
 """The first map of a run folder."""
 REPORTED_SCANS: Final = 50
 """Scans between two reports of progress."""
+UPDATE_STEP_M: Final = 0.1
+"""Least distance between two scans that are drawn into a finished map."""
 LARGEST_FILE: Final = 1 << 30
 """Larger map files are refused, bytes."""
 _ROW: Final = 8
@@ -121,8 +124,9 @@ def run_localization(
     config: MissionConfig,
     initial: FloatArray | None = None,
     progress: Callable[[LocalizationProgress], None] = lambda _: None,
+    update: bool = False,
 ) -> Run:
-    """Localise a robot in a map, which does not change.
+    """Localise a robot in a map, which does not change meanwhile.
 
     Args:
         source: the robot's recording.
@@ -130,6 +134,8 @@ def run_localization(
         config: the settings of the robot.
         initial: about where the recording starts in the map, (x, y, theta), shape (3,); None: anywhere.
         progress: called every ``REPORTED_SCANS`` scans.
+        update: draw what the scans saw afterwards into the map of the run, where ``contradicting_scans`` of them
+            contradict it. The map before is beside it, as ``map_before``.
 
     Returns:
         The believed poses as trajectory, and every pose with standard deviations and quality.
@@ -140,7 +146,10 @@ def run_localization(
     localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
     robot = RobotFrontend(source.name, config.robot, localizer)
     drive = LocalizedDrive()
+    scans: dict[float, LaserScan] = {}
     for record in source.records():
+        if update and isinstance(record, LaserScan):
+            scans[record.stamp] = record
         # 1. Track the scan; the localizer follows with the keyscans.
         robot.process(record)
         # 2. Place the new scans in the map.
@@ -151,7 +160,30 @@ def run_localization(
     losses = localizer.losses  # without the end of the recording
     robot.finish()
     _place(robot, localizer.estimate, drive)
-    return drive.run(source.name, occupancy, config, localizer.fixes, losses)
+    run = drive.run(source.name, occupancy, config, localizer.fixes, losses)
+    return _updated(run, occupancy, scans, drive.poses(source.name), config) if update else run
+
+
+def _updated(
+    run: Run, occupancy: OccupancyMap, scans: Mapping[float, LaserScan], poses: LocalizedPoses, config: MissionConfig
+) -> Run:
+    """The run with the scans drawn into its map; a scan counts if the robot moved since the one before it."""
+    seen: list[Casting] = []
+    for stamp, pose, is_localized in zip(poses.stamps.tolist(), poses.T_map_base, poses.is_localized, strict=True):
+        if not is_localized or stamp not in scans:
+            continue
+        if seen and np.hypot(*(pose - seen[-1].T_map_base)[:2]) < UPDATE_STEP_M:
+            continue
+        seen.append(Casting(scans[stamp].ranges_m, scans[stamp].laser, pose, scans[stamp].sweep))
+    updated = draw_over(occupancy, seen, config.map)
+    files = {
+        "map.pgm": pgm_bytes(updated),
+        MAP_YAML: map_yaml(updated, "map.pgm").encode(),
+        "map.png": map_png(updated, {poses.robot: poses.believed().T_map_base}, ()),
+        "map_before.pgm": pgm_bytes(occupancy),
+        "map_before.yaml": map_yaml(occupancy, "map_before.pgm").encode(),
+    }
+    return replace(run, map_files=files)
 
 
 class LocalizedDrive:

@@ -17,7 +17,8 @@ from fcslam.bridges.parameters import NodeParameters
 from fcslam.bridges.sensors import STEPS_BACK_FOR_RESTART
 from fcslam.errors import NetworkError
 from fcslam.geometry import se2
-from fcslam.runs.map_files import parse_map
+from fcslam.live.fleet_view import Teammate
+from fcslam.runs.map_files import Occupancy, OccupancyMap, parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
@@ -357,3 +358,77 @@ def test_messages_that_come_too_fast_are_counted(network, robot, scans, monkeypa
     start(network, robot, said.append)
     plays(network, scans[:10])
     assert said == ["messages come faster than this computer can map; some are lost"]
+
+
+class FollowedFleet:
+    """A fleet as the service tells of it, without the service."""
+
+    def __init__(self):
+        self.map_index, self.news = 0, ["map 0 holds robot1, r-2; joined: r-2"]
+
+    def robots(self):
+        return [
+            Teammate("robot1", 0, "", np.zeros(3), 0.2),
+            Teammate("r-2", 0, "", np.array([1.0, 2.0, 0.5]), 1.5),
+            Teammate("3", 1, "up", np.zeros(3), 0.0),
+        ]
+
+    def separations(self):
+        return (((0, 1), "no two of their places look alike"),)
+
+
+class FleetRobot:
+    """A robot whose joint map is more than its own."""
+
+    name = "robot1"
+
+    def __init__(self, robot, joint):
+        self._robot, self.joint, self.fleet = robot, joint, FollowedFleet()
+
+    def joint_map(self):
+        return self.joint
+
+    def __getattr__(self, name):
+        return getattr(self._robot, name)
+
+
+def test_with_a_fleet_map_is_the_joint_map_and_own_map_what_the_robot_saw(network, robot, scans):
+    cells = np.zeros((128, 192), np.uint8)
+    cells[5:120, 7:150] = Occupancy.FREE
+    followed = FleetRobot(robot, OccupancyMap(cells, 0.05, (-3.2, -6.4)))
+    node = start(network, followed)
+    plays(network, scans[:10])
+    run_until(node, 10)
+    node.publish_map()
+    (grid,), (own,) = network.sent["/robot1/map"], network.sent["/robot1/own_map"]
+    assert (grid.info.height, grid.info.width) == cells.shape
+    assert (own.info.height, own.info.width) == robot.map().cells.shape
+    changed = cells.copy()
+    changed[20, 30] = Occupancy.OCCUPIED
+    followed.joint = OccupancyMap(changed, 0.05, (-3.2, -6.4))
+    node.publish_map()
+    assert len(network.sent["/robot1/map"]) == 1
+    (update,) = network.sent["/robot1/map_updates"]
+    assert (update.x, update.y, update.width, update.height, list(update.data)) == (30, 20, 1, 1, [100])
+    followed.joint = None  # the robot was taken out: its own map goes on
+    node.publish_map()
+    assert network.sent["/robot1/map"][-1].info.width == own.info.width
+
+
+def test_poses_and_state_of_the_fleet_are_published_and_each_change_once(network, robot):
+    followed = FleetRobot(robot, None)
+    node = start(network, followed)
+    with running(node):
+        wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 3)
+    poses = network.sent["/robot1/fleet/poses"][0]
+    assert poses.header.frame_id == "map"
+    assert [(pose.position.x, pose.position.y) for pose in poses.poses] == [(0.0, 0.0), (1.0, 2.0)]
+    mate = network.sent["/robot1/fleet/r_2/pose"][0]
+    now, then = (one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in (poses, mate))
+    assert now - then == pytest.approx(1.5, abs=1e-5)
+    status = {one.name: one for one in network.sent["/robot1/fleet/status"][0].status}
+    values = {pair.key: pair.value for pair in status["robot r-2"].values}
+    assert (values["map"], values["age_s"], values["x"]) == ("0", "1.50", "1.0000")
+    assert status["maps 0 and 1"].message == "no two of their places look alike"
+    events = [one.status[0] for one in network.sent["/diagnostics"] if one.status[0].name.endswith("fleet")]
+    assert [event.message for event in events] == followed.fleet.news

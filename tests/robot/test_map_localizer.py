@@ -18,6 +18,7 @@ from fcslam.mission import MissionConfig
 from fcslam.records import Keyscan, KeyscanId
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapLocalizer
+from fcslam.runs.map_files import Occupancy, parse_map
 from tests import small_fleet
 from tests.robot.kidnapping import put_down
 
@@ -103,6 +104,28 @@ def test_an_initial_pose_is_used_if_the_walls_confirm_it(fleet, building):
     far = localized(robot.scans(), building, initial=start + np.array((3.0, 2.0, 1.5)))
     distance_m, _ = errors(far.localized["robot"], robot)
     assert distance_m.max() < RIGHT_M
+
+
+def test_with_update_the_map_shows_what_changed_since_and_the_map_before_stays(fleet, building):
+    robot = fleet.robots[2]
+    scans = list(robot.scans())
+    start = robot.T_building_base[0]
+    rows, columns = np.nonzero(building.cells == Occupancy.OCCUPIED)
+    with_box = building.cells.copy()  # a box that is gone, on the way of the robot
+    x, y = np.floor((robot.T_building_base[len(scans) // 2, :2] - building.origin_xy) / building.resolution_m).astype(
+        int
+    )
+    with_box[y - 2 : y + 3, x - 2 : x + 3] = Occupancy.OCCUPIED
+    old = replace(building, cells=with_box)
+    run = localized(scans, old, initial=start, update=True)
+    before, after = (parse_map(name, run.map_files[f"{name}.pgm"], run.map_files[f"{name}.yaml"].decode())
+                     for name in ("map_before", "map"))  # fmt: skip
+    assert np.array_equal(before.cells, with_box)
+    cell = np.round((np.array(after.origin_xy) - old.origin_xy) / old.resolution_m).astype(int)
+    grown = after.cells[-cell[1] :, -cell[0] :][: with_box.shape[0], : with_box.shape[1]]
+    assert (grown[y - 2 : y + 3, x - 2 : x + 3] == Occupancy.FREE).all()
+    kept = (grown[rows, columns] == Occupancy.OCCUPIED).mean()
+    assert kept > 0.95, "what did not change stays"
 
 
 def test_a_robot_that_is_carried_away_is_found_again_and_never_wrong(fleet, building):

@@ -18,7 +18,7 @@ import numpy as np
 
 from fcslam.bridges.clock import CLOCK, CLOCK_TOPIC, RosClock
 from fcslam.bridges.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
-from fcslam.bridges.outputs import MAP, POSE, OutputNames, Outputs, nanoseconds
+from fcslam.bridges.outputs import MAP, OWN_MAP, POSE, OutputNames, Outputs, nanoseconds
 from fcslam.bridges.parameters import NodeParameters
 from fcslam.bridges.sensors import LiveSensors, Notify
 from fcslam.bridges.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
@@ -34,6 +34,7 @@ from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.storage.files import write_file
 
 if TYPE_CHECKING:
+    from fcslam.live.fleet_view import FleetView
     from fcslam.live.records import RobotPose
 
 STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
@@ -45,6 +46,8 @@ _COMMANDS_WAITING = 8
 _LINES_TOLD = 1000
 """Largest number of different lines that are printed; the names in some come from the network."""
 _POLL_S = 0.1
+_FLEET_PERIOD_S = 0.2
+"""Time between two messages with the poses of the fleet."""
 _SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
 """A longer pause of the scans is reported."""
@@ -61,8 +64,18 @@ class LiveRobot(Protocol):
     def add(self, record: SensorRecord) -> "RobotPose | None":
         """The next record; returns the pose of a scan."""
 
+    @property
+    def fleet(self) -> "FleetView | None":
+        """What the robot knows of its fleet; None without a server."""
+
     def map(self) -> OccupancyMap:
-        """The map now."""
+        """The map now: with a fleet, that of all its robots."""
+
+    def joint_map(self) -> OccupancyMap | None:
+        """The map of the fleet; None before there is one, and without a fleet."""
+
+    def own_map(self) -> OccupancyMap:
+        """The map of what this robot saw."""
 
     def trajectory(self) -> RobotTrajectory:
         """The poses of all scans now."""
@@ -156,6 +169,7 @@ class RobotNode:
         threads = [
             threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
             threading.Thread(target=self._publish_maps, name="maps", daemon=True),
+            threading.Thread(target=self._publish_fleet, name="fleet topics", daemon=True),
             threading.Thread(target=self._obey, name="commands", daemon=True),
         ]
         for thread in threads:
@@ -208,10 +222,39 @@ class RobotNode:
         if self._pose is None and not is_finished_map:
             return
         stamp_ns = self._clock.now_ns() if self._pose is None else nanoseconds(self._pose.stamp)
-        if self._outputs.map(stamp_ns, self._robot.map()) or is_finished_map:
+        own = self._robot.own_map()
+        if self._robot.fleet is None:
+            is_new = self._outputs.map(stamp_ns, own)
+        else:
+            is_new = self._outputs.map(stamp_ns, own, OWN_MAP)
+            if not self._publish_joint_map():
+                self._outputs.map(stamp_ns, own)
+        if is_new or is_finished_map:
             trajectory = self._robot.trajectory()
             self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
             self._outputs.closures(stamp_ns, self._robot.closures())
+
+    def _publish_joint_map(self) -> bool:
+        """Publish the joint map as it is now: whole if its extent changed, else the area that did. False: there is none
+        yet."""
+        joint = self._robot.joint_map()
+        if joint is None or self._pose is None:
+            return False
+        self._outputs.map(nanoseconds(self._pose.stamp), joint, only_changes=True)
+        return True
+
+    def _publish_fleet(self) -> None:
+        """Publish where the robots of the fleet are, at a fixed rate, and what changed in the robot's map, once."""
+        news = 0
+        while not self._stop.wait(_FLEET_PERIOD_S):
+            fleet = self._robot.fleet
+            if fleet is None:
+                return
+            now_ns = self._clock.now_ns()
+            self._outputs.fleet(now_ns, fleet.robots(), fleet.separations(), fleet.map_index)
+            for line in fleet.news[news:]:
+                news += 1
+                self._outputs.event(now_ns, self._robot.name, line)
 
     def _next(self) -> _Message | None:
         try:
@@ -256,10 +299,13 @@ class RobotNode:
         while not self._stop.wait(1.0):
             self.watch_network()
             self._diagnose()
-            if time.monotonic() < due_s or self.scans == drawn:
-                continue
-            drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
+            is_due = time.monotonic() >= due_s and self.scans != drawn
             try:
+                if not is_due:
+                    if self._robot.fleet is not None:  # what the others see comes in between
+                        self._publish_joint_map()
+                    continue
+                drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
                 self.publish_map()
             except Exception as error:  # this thread also tells the state of the robot, so it must not end
                 self._tell_once(f"a map cannot be published: {error or type(error).__name__}")

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,21 @@ from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
 from fcslam.sources.bags.codec import GRID_UPDATE, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
+if TYPE_CHECKING:
+    from fcslam.live.fleet_view import Teammate
+
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
 
+POSES, POSE_STAMPED = "geometry_msgs/PoseArray", "geometry_msgs/PoseStamped"
+
 MAP: Final = "map"
 """Topic of the map in the robot's namespace."""
+OWN_MAP: Final = "own_map"
+"""Topic of what a robot of a fleet saw itself."""
+FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
+MOST_TEAMMATES: Final = 64
+"""Robots with a topic of their own; the others are in ``fleet/poses`` only."""
 LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
 STREAMED: Final = Quality(reliable=True, depth=10)
 TRANSFORMED: Final = Quality(reliable=True, depth=100)
@@ -67,6 +77,18 @@ class Region(NamedTuple):
     height: int
 
 
+@dataclass(slots=True)
+class _GridTopic:
+    """A map and the updates of it."""
+
+    publish: Publish
+    update: Publish
+    whole: Grid | None = None
+    """The newest map that was published whole."""
+    newest: Grid | None = None
+    """The newest map that subscribers have."""
+
+
 class Outputs:
     """The publishers of one robot. Any thread may call."""
 
@@ -77,17 +99,16 @@ class Outputs:
         self._codec = MessageCodec(network.ros1)
         self._names = names
         self._lock = threading.Lock()
-        self._map = publisher(MAP, GRID, LATCHED)
-        self._updates = publisher(f"{MAP}_updates", GRID_UPDATE, LATCHED)
+        self._publisher = publisher
+        self._grids: dict[str, _GridTopic] = {}
+        self._teammates: dict[str, Publish] = {}
+        self._fleet: tuple[Publish, Publish] | None = None
+        self._grid_topic(MAP)
         self._pose = publisher("pose", POSE, STREAMED)
         self._path = publisher("path", PATH, LATCHED)
         self._closures = publisher("closures", MARKERS, LATCHED)
         self._tf = publisher(names.tf, TRANSFORMS, TRANSFORMED)
         self._diagnostics = publisher(names.diagnostics, DIAGNOSTICS, STREAMED)
-        self._whole: Grid | None = None
-        """The newest map that was published whole."""
-        self._shown: Grid | None = None
-        """The newest map that subscribers have."""
 
     def transform(self, stamp_ns: int, odom_frame: str, T_map_odom: FloatArray) -> None:
         """Publish ``map -> odom`` for this stamp."""
@@ -146,43 +167,100 @@ class Outputs:
         )
         self._send(self._closures, MARKERS, make(MARKERS, markers=[marker]))
 
-    def map(self, stamp_ns: int, occupancy: OccupancyMap) -> bool:
-        """Publish the map if it changed; returns whether it did.
+    def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
+        """Publish a map if it changed; returns whether it did.
 
-        A small map goes out whole. Of a large map, only the cells go out that differ from the last whole one or from
-        the last update. So a late subscriber, who gets the whole one, is complete after any update, and one who got all
-        updates keeps no cell that changed back.
+        A small map goes out whole, unless ``only_changes``. Of a large map, only the cells go out that differ from the
+        last whole one or from the last update. So a late subscriber, who gets the whole one, is complete after any
+        update, and one who got all updates keeps no cell that changed back.
         """
         grid = grid_of(occupancy)
         with self._lock:
-            if self._shown is not None and _is_same(self._shown, grid):
+            shown = self._grid_topic(topic)
+            if shown.newest is not None and _is_same(shown.newest, grid):
                 return False
-            before, self._shown = (self._whole, self._shown), grid
-            of_whole, of_shown = (None if each is None else changed_region(each, grid) for each in before)
-            if of_whole is None or of_shown is None or grid.values.size <= SMALL_MAP_CELLS:
-                self._whole = grid
-                self._send(self._map, GRID, self._grid_message(stamp_ns, grid))
+            before, shown.newest = (shown.whole, shown.newest), grid
+            of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
+            if of_whole is None or of_newest is None or (grid.values.size <= SMALL_MAP_CELLS and not only_changes):
+                shown.whole = grid
+                self._send(shown.publish, GRID, self._grid_message(stamp_ns, grid))
             else:
-                region = _bounding(of_whole, of_shown)
-                self._send(self._updates, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
+                region = _bounding(of_whole, of_newest)
+                self._send(shown.update, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
             return True
+
+    def fleet(
+        self, now_ns: int, teammates: "Sequence[Teammate]", separations: Sequence[tuple[tuple[int, int], str]],
+        own: int | None,
+    ) -> None:  # fmt: skip
+        """Publish where the robots of the own map are, and which robots are in which map.
+
+        Args:
+            now_ns: the time now.
+            teammates: all robots of the fleet, this one as well.
+            separations: for every two maps that are apart: their indices and the reason.
+            own: index of the robot's own map; None: it is in none, so no pose is in its frame.
+        """
+        make, frame = self._codec.make, self._names.map_frame
+        with self._lock:
+            if self._fleet is None:
+                self._fleet = (
+                    self._publisher(FLEET_POSES, POSES, STREAMED), self._publisher(FLEET_STATUS, DIAGNOSTICS, STREAMED)
+                )  # fmt: skip
+            near = [mate for mate in teammates if mate.map_index == own]
+            poses = [self._codec.pose(in_space(mate.T_map_base)) for mate in near]
+            self._send(self._fleet[0], POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
+            for mate, pose in zip(near, poses, strict=True):
+                name = _topic_name(mate.robot)
+                if name not in self._teammates:
+                    if len(self._teammates) >= MOST_TEAMMATES:
+                        continue
+                    self._teammates[name] = self._publisher(f"fleet/{name}/pose", POSE_STAMPED, STREAMED)
+                header = self._codec.header(max(0, now_ns - nanoseconds(mate.age_s)), frame)
+                self._send(self._teammates[name], POSE_STAMPED, make(POSE_STAMPED, header=header, pose=pose))
+            statuses = [
+                self._status(f"robot {mate.robot}", mate.robot, _OK, f"map {mate.map_index}", {
+                    "map": mate.map_index, "floor": mate.floor, "age_s": f"{mate.age_s:.2f}",
+                    **{axis: f"{value:.4f}" for axis, value in zip(("x", "y", "theta"), mate.T_map_base.tolist(),
+                                                                  strict=True)},
+                })
+                for mate in teammates
+            ]  # fmt: skip
+            statuses += [
+                self._status(f"maps {a} and {b}", "", _WARN, why, {"map_a": a, "map_b": b})
+                for (a, b), why in separations
+            ]
+            message = make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
+            self._send(self._fleet[1], DIAGNOSTICS, message)
+
+    def event(self, stamp_ns: int, robot: str, text: str) -> None:
+        """Publish one event of the fleet's map on the topic of diagnostics."""
+        status = self._status(f"fcslam: {robot}: fleet", robot, _OK, text, {"event": "fleet"})
+        message = self._codec.make(DIAGNOSTICS, header=self._codec.header(stamp_ns, ""), status=[status])
+        self._send(self._diagnostics, DIAGNOSTICS, message)
 
     def diagnostics(
         self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
     ) -> None:
         """Publish the state of the robot: ``trouble``, or ``well`` if that is empty."""
+        status = self._status(f"fcslam: {robot}", robot, _WARN if trouble else _OK, trouble or well, values)
+        header = self._codec.header(stamp_ns, "")
+        self._send(self._diagnostics, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=[status]))
+
+    def _status(self, name: str, hardware: str, level: int, message: str, values: Mapping[str, object]) -> Any:
         make = self._codec.make
         pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
-        status = make(
-            "diagnostic_msgs/DiagnosticStatus",
-            level=_WARN if trouble else _OK,
-            name=f"fcslam: {robot}",
-            message=trouble or well,
-            hardware_id=robot,
+        return make(
+            "diagnostic_msgs/DiagnosticStatus", level=level, name=name, message=message, hardware_id=hardware,
             values=pairs,
-        )
-        header = self._codec.header(stamp_ns, "")
-        self._send(self._diagnostics, DIAGNOSTICS, make(DIAGNOSTICS, header=header, status=[status]))
+        )  # fmt: skip
+
+    def _grid_topic(self, topic: str) -> "_GridTopic":
+        if topic not in self._grids:
+            self._grids[topic] = _GridTopic(
+                self._publisher(topic, GRID, LATCHED), self._publisher(f"{topic}_updates", GRID_UPDATE, LATCHED)
+            )
+        return self._grids[topic]
 
     def _send(self, publish: Publish, kind: str, message: Any) -> None:
         publish(self._codec.encode(message, kind))
@@ -241,6 +319,12 @@ def _bounding(first: Region, second: Region) -> Region:
     x, y = min(first.x, second.x), min(first.y, second.y)
     right, top = (max(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
     return Region(x, y, right - x, top - y)
+
+
+def _topic_name(robot: str) -> str:
+    """A robot's name as part of a topic; ROS allows letters, digits and underscores there, and no digit first."""
+    name = "".join(one if one.isascii() and one.isalnum() else "_" for one in robot)
+    return f"_{name}" if name[:1].isdigit() else name
 
 
 def nanoseconds(stamp: float) -> int:

@@ -54,6 +54,14 @@ def localize(
     floor: Annotated[
         str, typer.Option(help="Floor that the robot is on.", show_default="that of the map, if it has one only")
     ] = "",
+    update: Annotated[
+        bool,
+        typer.Option(
+            "--update",
+            help="Draw what changed since into the map of the run folder, where at least three scans show it. The "
+            "map before stays beside it as map_before.",
+        ),
+    ] = False,
     config: ConfigFile = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
@@ -65,7 +73,7 @@ def localize(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find a robot in a finished map and follow it; the map does not change.
+    """Find a robot in a finished map and follow it; the map that is given does not change.
 
     The run folder holds the poses that the robot believed, and for every scan its standard deviations and quality.
     """
@@ -86,7 +94,7 @@ def localize(
     with compiled(console), ProgressDisplay(console) as display:
         run = localize_recording(
             source, map_path, initial_pose=initial, config=settings, progress=_watch(display, survey.scan_count),
-            floor=floor,
+            floor=floor, update=update,
         )  # fmt: skip
         run.save(output, force)
     print_faults(console, {source.name: source.faults})

@@ -1,8 +1,9 @@
 """A fleet's result as a run: trajectories, closures, maps and metrics."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,11 @@ from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.maps.certificate import MappedPath, certificate_json, certificate_png, certify
 from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
-from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs import QUALITY, ClosureRow, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
@@ -68,14 +70,18 @@ def run_of(
         )
         for name, track in tracks.items()
     }
+    fused = dict(fused_maps(result, grid))
+    certificates = _certificates(result, fused) if with_local_maps else {}
+    metrics = [*metrics, *([Metric("map_error_95", certificates[0]["error_95"], "m")] if 0 in certificates else [])]
     return Run(
         trajectories=trajectories,
         closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
-        map_files=_map_files(result, trajectories, grid),
+        map_files=_map_files(result, trajectories, fused),
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
+        quality=_quality_files(certificates, fused),
     )
 
 
@@ -147,18 +153,14 @@ def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> Closur
 
 
 def _map_files(
-    result: FleetResult, trajectories: Mapping[str, RobotTrajectory], grid: OccupancyConfig
+    result: FleetResult, trajectories: Mapping[str, RobotTrajectory], maps: Mapping[int, OccupancyMap]
 ) -> dict[str, bytes]:
     """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
-    maps: dict[int, list[MappedRobot]] = {}
-    for robot in result.robots:
-        maps.setdefault(robot.map_index, []).append(robot)
     drawn = _drawn_closures(result)
     files: dict[str, bytes] = {}
-    for k, members in sorted(maps.items()):
-        stem = map_stem(k)
+    for k, fused in maps.items():
+        stem, members = map_stem(k), [robot for robot in result.robots if robot.map_index == k]
         regions = [region for region in result.regions if region.map_index == k]
-        fused = with_regions(fuse_members(members, grid), regions)
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
         files |= region_files(fused, stem, regions)
@@ -169,11 +171,40 @@ def _map_files(
     return files
 
 
+def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict[int, dict[str, Any]]:
+    """How good each map is where; of the maps that get a picture."""
+    certificates = {}
+    for k, fused in maps.items():
+        members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
+        if members and fused.cells.any() and (k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN):
+            paths = [MappedPath(robot.robot, robot.stamps, robot.T_map_base, robot.variables) for robot in members]
+            certificates[k] = certify(result.graph, paths, fused)
+    return certificates
+
+
+def _quality_files(
+    certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]
+) -> dict[str, bytes]:  # fmt: skip
+    if not certificates:
+        return {}
+    pictures = {f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
+                for k, one in certificates.items()}  # fmt: skip
+    return {f"{QUALITY}.json": certificate_json(certificates), **pictures}
+
+
+def fused_maps(result: FleetResult, grid: OccupancyConfig) -> Iterator[tuple[int, OccupancyMap]]:
+    """Number and grid of each map of a result, without the regions that users erased."""
+    for k in sorted({robot.map_index for robot in result.robots}):
+        fused = fuse_members([robot for robot in result.robots if robot.map_index == k], grid)
+        yield k, with_regions(fused, [region for region in result.regions if region.map_index == k])
+
+
 def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> OccupancyMap:
     """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])
-    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid)
+    senders = {robot.robot: robot_of(robot.robot) for robot in members}
+    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid, senders)
     own = [(robot.own_map, robot.T_map_local) for robot in members if robot.own_map is not None]
     return laid_together([(fused, np.zeros(3)), *own], grid.maximum_cells) if own else fused
 

@@ -18,7 +18,7 @@ from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.lidar.scan import beam_times, ray_at, rays_of
 from fcslam.records import FloatArray, LaserModel, Ranges, Sweep
-from fcslam.runs.map_files import Cells
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
 
 Counts = NDArray[np.uint32]
 
@@ -28,6 +28,8 @@ beams that graze a wall hit its cells seldom, too."""
 SEEN_FARTHER = 1.25
 """A beam without return says nothing about a surface that is farther than this many times the largest range at which
 others measured it."""
+SETTLED_PASSES = 1_000_000
+"""Beams that each known cell of a finished map counts for: newer scans change it only if they contradict it."""
 FARTHEST_M = 1e7
 """Poses farther from the origin are refused: floats no longer resolve cells there."""
 
@@ -54,6 +56,13 @@ class OccupancyConfig(Settings):
         default=3,
         ge=1,
         description="least number of scans of a later period that change a cell from occupied to free or back",
+    )
+    robot_radius_m: float = Field(
+        default=0.35,
+        ge=0,
+        le=5,
+        description="radius of a robot of the fleet: points on it, where other robots look through, are not drawn [m]; "
+        "0: all are drawn",
     )
     maximum_cells: int = Field(
         default=64_000_000,
@@ -195,6 +204,49 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
         for view in shown:
             view.setflags(write=False)
         yield OccupancyGrid(*shown, side, (layout.column * side, layout.row * side))
+
+
+def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyConfig) -> OccupancyMap:
+    """A finished map with newer scans drawn into it, as ``cast_periods`` draws a period after another one.
+
+    Scans decide the cells that the map does not know. They change a known cell only if at least ``contradicting_scans``
+    of them contradict it.
+
+    Args:
+        base: the map; its cells keep their side.
+        scans: newer scans, with poses in ``map``.
+        config: usable range and thresholds.
+
+    Raises:
+        ValueError: as ``cast``.
+    """
+    side = base.resolution_m
+    column, row = (round(value / side) for value in base.origin_xy)
+    # Cell edges of other programs' maps need not lie on multiples of the resolution.
+    off_x, off_y = base.origin_xy[0] - column * side, base.origin_xy[1] - row * side
+    shift = np.array((off_x, off_y, 0.0))
+    groups = _by_laser([scan._replace(T_map_base=scan.T_map_base - shift) for scan in scans])
+    if not groups:
+        return base
+    drawn = _layout(groups, config.model_copy(update={"resolution_m": side}))
+    if drawn.resolution_m != side:  # over the limit on cells
+        return base
+    height, width = base.cells.shape
+    left, bottom = min(column, drawn.column), min(row, drawn.row)
+    right, top = max(column + width, drawn.column + drawn.width), max(row + height, drawn.row + drawn.height)
+    layout = _Layout(side, left, bottom, right - left, top - bottom)
+    is_open = config.no_return_range_m > 0.0 and any(np.isposinf(beams.ranges_m).any() for beams in groups)
+    counts = _counts(layout, is_open, by_scan=True)
+    hits, passes = np.zeros((2, layout.height, layout.width), np.uint32)
+    inside = slice(row - bottom, row - bottom + height), slice(column - left, column - left + width)
+    passes[inside] = np.where(base.cells != Occupancy.UNKNOWN, SETTLED_PASSES, 0)
+    hits[inside] = np.where(base.cells == Occupancy.OCCUPIED, SETTLED_PASSES, 0)
+    _cast_all(groups, layout, config, counts)
+    _supersede(
+        hits, passes, counts, config.contradicting_scans, CLEAR_RATIO, config.occupied_ratio, config.minimum_passes
+    )
+    cells = _classify(hits, passes, config.minimum_passes, config.occupied_ratio)
+    return OccupancyMap(cells, side, (left * side + off_x, bottom * side + off_y), base.floor)
 
 
 def _by_laser(keyscans: Sequence[Casting]) -> list[_Beams]:

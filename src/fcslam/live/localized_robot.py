@@ -49,6 +49,9 @@ class LocalizedRobot(LiveTracker):
     Threads and processes are as for ``fcslam.Robot``. It needs no network, and it sends and keeps nothing.
     """
 
+    fleet = None
+    """The robot follows no fleet."""
+
     def __init__(
         self,
         name: str,
@@ -133,6 +136,13 @@ class LocalizedRobot(LiveTracker):
 
     def map(self) -> OccupancyMap:
         """The map, which never changes."""
+        return self._map
+
+    def joint_map(self) -> None:
+        """None: the robot makes no map with others."""
+
+    def own_map(self) -> OccupancyMap:
+        """As ``map``."""
         return self._map
 
     def closures(self) -> FloatArray:

@@ -163,6 +163,8 @@ class EventKind(StrEnum):
     UNDETERMINED = "undetermined"
     """The robot has no odometry, and for a second its scans have not fixed its position in every direction: along a
     bare corridor, or among few walls, it may move unseen."""
+    FLEET = "fleet"
+    """Robots came into the robot's map, or left it: maps joined or split, or a robot was taken out."""
     OFFLINE = "offline"
     """The server cannot be reached; packets wait in the state folder."""
     ONLINE = "online"

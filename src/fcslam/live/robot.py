@@ -8,6 +8,7 @@ import math
 import shutil
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
 from contextlib import ExitStack, closing
@@ -24,6 +25,9 @@ from fcslam.cloud.sessions import session_name
 from fcslam.driving import track_of
 from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
+from fcslam.lidar.frontend import ScanPose
+from fcslam.lidar.occupancy import Casting, draw_over
+from fcslam.live.fleet_view import FleetView, following
 from fcslam.live.inputs import (
     Lasers,
     checked_camera,
@@ -34,8 +38,19 @@ from fcslam.live.inputs import (
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
 from fcslam.live.tracker import LiveTracker
+from fcslam.maps.joint_tiles import padded
 from fcslam.mission import MissionConfig
-from fcslam.records import CameraModel, Correction, FloatArray, Keyscan, SensorRecord, frozen
+from fcslam.records import (
+    CameraModel,
+    Correction,
+    FloatArray,
+    Keyscan,
+    LaserModel,
+    Ranges,
+    SensorRecord,
+    Sweep,
+    frozen,
+)
 from fcslam.robot.beside import Beside, worker_process
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
@@ -48,6 +63,7 @@ from fcslam.robot.warmup import warm_up_tracking
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
+from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesTransport, addresses
 from fcslam.wire.messages import Hello, Packet
 
@@ -59,6 +75,33 @@ POLL_INTERVAL_S = 0.1
 LARGEST_BACKLOG = 200
 """Largest number of inputs that wait for the back end, the map or the disk while a recording is played; a robot in real
 time never has as many."""
+
+
+MOST_DRAWN = 20_000
+"""Most keyscans that wait to be drawn by the cloud: hours of an outage."""
+
+
+class _DrawnKeyscan(NamedTuple):
+    """A keyscan that the cloud may not have drawn yet."""
+
+    part: int
+    stamp: float
+    ranges_m: Ranges
+    laser: LaserModel
+    T_odom_base: FloatArray
+    sweep: Sweep | None
+
+
+class _Ahead:
+    """What this robot knows before its fleet does, and what it told of its fleet."""
+
+    def __init__(self) -> None:
+        self.drawn: deque[_DrawnKeyscan] = deque()
+        """Keyscans that the joint map of the cloud may not show yet."""
+        self.lasers: tuple[LaserModel, ...] = ()
+        """As the robot announced them last."""
+        self.news = 0
+        """Changes of the fleet that were told."""
 
 
 class Playback(NamedTuple):
@@ -166,6 +209,9 @@ class Robot(LiveTracker):
         self._is_online: bool | None = None
         """Whether the server can be reached; None before the first reply."""
         self._sleep = sleep
+        self.fleet: FleetView | None = None
+        """What the robot knows of its fleet; None without a server or without a map of its own."""
+        self._ahead = _Ahead()
         with ExitStack() as stack:
             if executor is None:
                 executor = worker_process()
@@ -182,6 +228,9 @@ class Robot(LiveTracker):
                     for url in addresses(server)
                 ]
                 transport = InstancesTransport(instances)
+                if own_map:
+                    followed = [FleetClient(url, token, ca_file, own) for url in addresses(server)]
+                    self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
             known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
             keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)
@@ -252,13 +301,49 @@ class Robot(LiveTracker):
         )  # fmt: skip
 
     def map(self) -> OccupancyMap:
-        """The map that the robot is in, of all its scans so far, corrected by all loop closures.
+        """The map that the robot is in: with a server the joint map of its fleet, with what the robot saw lately drawn
+        into it.
 
-        It takes tens of milliseconds to seconds, in the worker; other threads may add scans meanwhile. With a server it
-        shows what this robot saw, in the frame of the fleet's map.
+        Without a server, and before it has drawn the map that the robot is in, it is ``own_map``. While the server is
+        away, it is the newest joint map with all that the robot has seen since.
 
         Returns:
             The occupancy of each cell, shape (H, W), the side of a cell and the lower left corner in ``map``.
+
+        Raises:
+            InputError: the robot has no map of its own.
+            FcslamError: the worker has ended.
+        """
+        joint = self.joint_map()
+        return self.own_map() if joint is None else joint
+
+    def joint_map(self) -> OccupancyMap | None:
+        """As ``map``; None instead of ``own_map``."""
+        fleet = self.fleet
+        joint = None if fleet is None else fleet.joint_map
+        if fleet is None or joint is None:
+            return None
+        with self._lock:
+            localizer = self._localizer(self._part)
+            if fleet.map_index is None or fleet.map_index != localizer.map_index:
+                return None  # the server is about to draw the map that the robot's poses are in
+            while self._ahead.drawn and self._ahead.drawn[0].stamp <= fleet.drawn_s:
+                self._ahead.drawn.popleft()
+            lately = [
+                Casting(one.ranges_m, one.laser, moved, one.sweep)
+                for one in self._ahead.drawn
+                if one.part == self._part and (moved := localizer.T_map_base(one.T_odom_base)) is not None
+            ]
+        return padded(draw_over(joint, lately, self._config.map))
+
+    def own_map(self) -> OccupancyMap:
+        """The map of all that this robot has seen so far, corrected by all loop closures.
+
+        It takes tens of milliseconds to seconds, in the worker; other threads may add scans meanwhile. With a server it
+        is in the frame of the fleet's map.
+
+        Returns:
+            As ``map``.
 
         Raises:
             InputError: the robot has no map of its own.
@@ -472,10 +557,32 @@ class Robot(LiveTracker):
             return
         packets = [packet.on_floor(self._floor(packet.epoch)) for packet in packets]
         self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
+        if self.fleet is not None:
+            self._draw_later(packets)
         if self._uplink is not None:
             self._uplink.put(packets)
         if self._own is not None:
             self._own.put([_in_epoch(packet, self._part_base + packet.epoch) for packet in packets])
+
+    def _draw_later(self, packets: list[Packet]) -> None:
+        """Keep the next keyscans until the cloud has drawn them."""
+        for packet in packets:
+            if isinstance(packet.body, Hello):
+                self._ahead.lasers = packet.body.lasers
+            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
+                keyscan, track = packet.body, self._frontend.tracks[packet.epoch]
+                T_odom_base = track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
+                laser = keyscan.laser_model(self._ahead.lasers)
+                self._ahead.drawn.append(
+                    _DrawnKeyscan(packet.epoch, keyscan.stamp, keyscan.ranges_m, laser, T_odom_base, keyscan.sweep)
+                )
+                if len(self._ahead.drawn) > MOST_DRAWN:
+                    self._ahead.drawn.popleft()
+
+    def _place(self) -> tuple[int, FloatArray] | None:
+        """Index of the robot's map and its pose there, in any thread."""
+        pose = self._pose
+        return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
     def _correct(self, epoch: int, correction: Correction) -> None:
         """Take a correction of the robot's own map, in any thread. While the server is away, it counts for the pose."""
@@ -539,6 +646,10 @@ class Robot(LiveTracker):
             self._tell_correction(self._applied, correction)
             self._applied = correction
         self._tell_connection()
+        if self.fleet is not None:
+            for line in self.fleet.news[self._ahead.news :]:
+                self._ahead.news += 1
+                self._event(EventKind.FLEET, line)
         broken = self._frontend.backend_failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")

@@ -12,6 +12,7 @@ import numpy as np
 from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast_periods, classify
+from fcslam.maps.teammates import RobotPath, without_teammates
 from fcslam.records import FloatArray, Keyscan, LaserModel, MapTile
 from fcslam.runs.map_files import OccupancyMap
 
@@ -49,6 +50,7 @@ def fuse(
     T_map_base: FloatArray,
     lasers: Mapping[str, Sequence[LaserModel]],
     config: OccupancyConfig,
+    senders: Mapping[str, str] | None = None,
 ) -> OccupancyMap:
     """Compute the occupancy map of keyscans; their order does not matter, their stamps do.
 
@@ -57,12 +59,13 @@ def fuse(
         T_map_base: their poses in ``map``, shape (N, 3), metres and radians.
         lasers: the lasers that each robot announced.
         config: the occupancy grid.
+        senders: the robot of each session, if points on other robots are not drawn. None: all are.
 
     Raises:
         ValueError: the numbers of poses and keyscans or of ranges and beams differ, or a pose is not finite.
         KeyError: a keyscan's robot has no lasers.
     """
-    *_, newest = fuse_periods(keyscans, T_map_base, lasers, config, periods_of(keyscans))
+    *_, newest = fuse_periods(keyscans, T_map_base, lasers, config, periods_of(keyscans), senders)
     return newest
 
 
@@ -72,15 +75,36 @@ def fuse_periods(
     lasers: Mapping[str, Sequence[LaserModel]],
     config: OccupancyConfig,
     periods: Sequence[Period],
+    senders: Mapping[str, str] | None = None,
 ) -> Iterator[OccupancyMap]:
     """The map as it was after each of ``periods``, which hold every keyscan; else as ``fuse``. All have one size."""
     number = {session: k for k, period in enumerate(periods) for session in period.sessions}
     castings: list[list[Casting]] = [[] for _ in periods] or [[]]
-    for keyscan, pose in zip(keyscans, np.asarray(T_map_base), strict=True):
-        casting = Casting(keyscan.ranges_m, keyscan.laser_model(lasers[keyscan.id.robot]), pose, keyscan.sweep)
+    scans = [
+        Casting(keyscan.ranges_m, keyscan.laser_model(lasers[keyscan.id.robot]), pose, keyscan.sweep)
+        for keyscan, pose in zip(keyscans, np.asarray(T_map_base), strict=True)
+    ]
+    if senders is not None and len(set(senders.values())) > 1:
+        scans = _without_teammates(keyscans, scans, senders, config)
+    for keyscan, casting in zip(keyscans, scans, strict=True):
         castings[number[keyscan.id.robot]].append(casting)
     for grid in cast_periods(castings, config):
         yield OccupancyMap(classify(grid, config), grid.resolution_m, grid.origin_xy)
+
+
+def _without_teammates(
+    keyscans: Sequence[Keyscan], scans: list[Casting], senders: Mapping[str, str], config: OccupancyConfig
+) -> list[Casting]:
+    """The scans without the points that lie on robots of other senders; the paths are those of the keyscans."""
+    stamps = np.array([keyscan.stamp for keyscan in keyscans])
+    sessions = np.array([keyscan.id.robot for keyscan in keyscans])
+    poses = np.array([scan.T_map_base for scan in scans]).reshape(-1, 3)
+    paths: dict[str, list[RobotPath]] = {}
+    for session in dict.fromkeys(sessions.tolist()):
+        rows = np.flatnonzero(sessions == session)
+        rows = rows[np.argsort(stamps[rows], kind="stable")]
+        paths.setdefault(senders[session], []).append(RobotPath(stamps[rows], poses[rows]))
+    return without_teammates(scans, stamps, [senders[session] for session in sessions.tolist()], paths, config)
 
 
 def joined_tiles(tiles: Iterable[MapTile]) -> OccupancyMap:

@@ -6,6 +6,7 @@
     pose_graph.g2o             the optimised pose graph
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
+    quality.json, .png         the certificate: expected error of each square metre, open stretches, what to drive again
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
     mission.state              what this program made of them, so that its user's next run need not apply them again
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
@@ -47,6 +48,8 @@ from fcslam.untrusted import read_bytes, read_text
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
 LOCALIZATION, MISSION, STATE = "localization", "mission.fcslam", "mission.state"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
+QUALITY = "quality"
+"""Beginning of the names of the certificate's files: ``quality.json``, and a picture of each map."""
 
 _SAFE_NAME = re.compile(r"\w[\w.+-]*")
 _MAP_FILE = re.compile(r"map(?:_([1-9]\d{0,8}))?\.pgm")
@@ -76,6 +79,9 @@ class Run:
     """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
+    quality: Mapping[str, bytes] = field(default_factory=dict)
+    """File name to content: quality.json and a picture of each map. How good the maps are where; live results of the
+    service have none."""
     mission: bytes = b""
     """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
     state: bytes = b""
@@ -191,6 +197,7 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
             pose_graph_g2o=read_text(path / POSE_GRAPH, path),
             map_files={file.name: read_bytes(file, path) for file in sorted(path.glob("map*.*")) if maps},
             local_maps=_read_local_maps(path, robots) if maps else {},
+            quality={file.name: read_bytes(file, path) for file in sorted(path.glob(f"{QUALITY}*.*")) if maps},
             mission=read_bytes(path / MISSION, path) if maps and (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
@@ -228,7 +235,7 @@ def _write(run: Run, folder: Path) -> None:
     (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")
     (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
     (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")
-    for name, content in run.map_files.items():
+    for name, content in (*run.map_files.items(), *run.quality.items()):
         (folder / name).write_bytes(content)
 
 

@@ -3,6 +3,7 @@
 detectors/<channel>/<version>.onnx   networks that robots may fetch
 missions/<name>/mission.sqlite       what was received: all that must not be lost
                 live/                the run folder of what is believed now
+                joint.maps           the grids and poses that robots get, drawn more often than the run folder
                 runs/<number>/       the run folders that were asked for
                 worker.state         the worker's state some packets ago, for a quick restart; may be deleted
                 worker.task          what the worker is doing, to refuse a packet that ends worker after worker
@@ -39,6 +40,11 @@ class MissionFolder:
     def live(self) -> Path:
         """The run folder of the current estimate: a link that is replaced atomically."""
         return self.path / "live"
+
+    @property
+    def joint_maps(self) -> Path:
+        """The joint maps of the current estimate, for robots."""
+        return self.path / "joint.maps"
 
     @property
     def snapshot(self) -> Path:

@@ -58,6 +58,11 @@ class OpenMission:
         """The live run folder as it is now; None: the worker has written none yet."""
         return self.folder.live.resolve() if self.folder.live.exists() else None
 
+    @property
+    def joint_maps(self) -> Path:
+        """The file of the joint maps, which may not be there yet."""
+        return self.folder.joint_maps
+
     def result(self, name: str) -> Path | None:
         """The run folder of a requested result; None if there is none."""
         return existing_result(self.folder, name)

@@ -49,9 +49,10 @@ from fcslam.processes import Background, Start, start_copy
 from fcslam.records import Edit
 from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
+from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.service.shared.files import LIVE, RESULT, SNAPSHOT, SharedFiles
+from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, SharedFiles
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
 from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS
 from fcslam.service.warmup import warm_up_fleet
@@ -67,6 +68,10 @@ AT_ONCE_S = 0.25
 does not wait for its own while there is a queue."""
 LIVE_SHARE = 0.1
 """Share of the time for writing the live run folder beside the worker."""
+JOINT_SHARE = 0.5
+"""Share of the time for drawing the joint maps beside the worker."""
+JOINT_EVERY_S = 0.5
+"""The joint maps are not drawn more often than this."""
 LIVE_LOOK_S = 0.05
 """Between two looks whether the live run folder is written."""
 REPORT_EVERY_S = 0.1
@@ -120,6 +125,12 @@ class Worker:
         self._published = -1
         self._publish_at = clock()
         self._publishing: _Publishing | None = None
+        self._joint_drawn, self._joint_at = -1, -math.inf
+        self._joint_drawing: _Publishing | None = None
+        self._heard: dict[tuple[str, int], float] = {}
+        """When the newest packet of each session took effect, seconds since 1970."""
+        self._concluded: tuple[tuple[int, int], FleetResult] | None = None
+        """The last result, and how many packets and edits it is of."""
         self._resume()
         self._reported, self._report_at = self._resumed_at, -math.inf
         self._finalize_at = -math.inf
@@ -134,15 +145,18 @@ class Worker:
             or self._take_packets()
             or self._report()
             or self._finalize()
+            or self._draw_joint_maps()
             or self._publish()
         )
 
     def wait_s(self) -> float:
         """How long there is nothing to do unless something comes in."""
-        if self._publishing is not None:
+        if self._publishing is not None or self._joint_drawing is not None:
             due_s = LIVE_LOOK_S
         else:
             due_s = self._publish_at - self._clock() if self._published < self._applied else LIVE_EVERY_S
+        if self._joint_drawn < self._applied:
+            due_s = min(due_s, self._joint_at - self._clock())
         if self._reported < self._applied:
             due_s = min(due_s, self._report_at - self._clock())
         return max(due_s, 0.0)
@@ -156,6 +170,7 @@ class Worker:
         if needs_new_fleet(before, now):
             self._start_over()
         self._fleet.edit(now)
+        self._joint_drawn = -1
         self._published, self._reported = -1, min(self._reported, max(self._applied, self._resumed_at) - 1)
         self._publish_at = self._clock()  # who edits the map waits for it
         return True
@@ -303,6 +318,7 @@ class Worker:
             raise
         else:
             self._times[packet.robot, packet.epoch] = packet.time
+            self._heard[packet.robot, packet.epoch] = time.time()
 
     def _refuse(self, packet: StoredPacket, reason: str) -> None:
         self._store.refuse(packet.robot, packet.epoch, packet.sequence, reason)
@@ -339,7 +355,9 @@ class Worker:
             return
         self._crashes.begin(task)
         try:
-            self._run(self._result(), self._store.traffic()).save(self._folder.run(name), force=True)
+            result = self._result()
+            self._run(result, self._store.traffic()).save(self._folder.run(name), force=True)
+            self._concluded = (self._applied, self._newest_edit), result
         except (
             Exception
         ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
@@ -349,7 +367,7 @@ class Worker:
             self._share(RESULT + name, self._folder.run(name))
             self._store.answer(asked.number, name)
         self._crashes.end()
-        self._published = -1
+        self._published = self._joint_drawn = -1
         self._tell("finalized", asked.number)
 
     def _result(self) -> FleetResult:
@@ -364,6 +382,51 @@ class Worker:
 
     def _read(self, number: PacketNumber) -> Packet:
         return decode(self._store.packet(*robot_and_epoch(number.session), number.sequence).data)
+
+    def _draw_joint_maps(self) -> bool:
+        """Draw the joint maps beside the worker, if something is new and the last time is long enough ago."""
+        now = self._clock()
+        if self._joint_drawing is not None:
+            self._end_drawing(self._joint_drawing, now)
+            return False
+        if self._joint_drawn == self._applied or self._applied < self._resumed_at or now < self._joint_at:
+            return False
+        try:
+            if self._fleet.read_ahead(AT_ONCE):
+                return True
+            known = self._concluded
+            is_final = known is not None and known[0] == (self._applied, self._newest_edit)
+            result = known[1] if known is not None and is_final else self._fleet.estimate()
+            task = self._start(lambda: self._write_joint_maps(result, dict(self._heard)))
+        except Exception as error:  # packets matter more, and there may be memory later
+            return self._draw_later(f"{type(error).__name__}: {error}")
+        self._joint_drawing, self._joint_drawn = _Publishing(task, self._applied, now), self._applied
+        return True
+
+    def _end_drawing(self, drawing: "_Publishing", now: float) -> None:
+        if drawing.task.exitcode is None:
+            return
+        self._joint_drawing = None
+        if drawing.task.exitcode:
+            self._draw_later(f"their writer ended with code {drawing.task.exitcode}")
+            return
+        self._joint_at = now + max((now - drawing.began_s) * (1.0 / JOINT_SHARE - 1.0), JOINT_EVERY_S)
+        try:
+            self._share(JOINT, self._folder.joint_maps)
+        except StoreError as error:
+            self._draw_later(str(error))
+
+    def _draw_later(self, reason: str) -> bool:
+        _log.error("the joint maps stay as they were: %s", reason)
+        self._joint_drawn, self._joint_at = -1, self._clock() + PAUSE_S
+        return False
+
+    def _write_joint_maps(self, result: FleetResult, heard_s: dict[tuple[str, int], float]) -> None:
+        try:
+            write_joint_maps(self._folder.joint_maps, joint_maps_of(result, heard_s, self._config.map))
+        except Exception as error:
+            _log.error("the joint maps cannot be written: %s: %s", type(error).__name__, error)
+            sys.exit(1)
 
     def _publish(self) -> bool:
         """Write the live run folder beside the worker, if something is new and the last time is long enough ago."""
@@ -421,7 +484,7 @@ class Worker:
 
 
 class _Publishing(NamedTuple):
-    """The live run folder that is being written."""
+    """A live run folder, or joint maps, that are being written."""
 
     task: Background
     applied: int

@@ -7,6 +7,7 @@ from fcslam.cli.evaluate.federated import federated
 from fcslam.cli.evaluate.fleet import fleet
 from fcslam.cli.evaluate.homography import homography
 from fcslam.cli.evaluate.places import places
+from fcslam.cli.evaluate.quality import quality
 from fcslam.cli.evaluate.relations import relations
 from fcslam.cli.evaluate.vocabulary import vocabulary
 from fcslam.cli.examples import examples
@@ -26,6 +27,7 @@ app.command(epilog=examples(_FLEET, "fcslam evaluate fleet demo/run --csv fleet.
 app.command(epilog=examples(_RELATIONS, "fcslam evaluate relations runs/intel-3 intel.relations.gz --across-robots"))(
     relations
 )
+app.command(epilog=examples("fcslam evaluate quality fleet/run --truth fleet"))(quality)
 app.command(epilog=examples("fcslam evaluate closures runs/intel-3 intel.relations.gz"))(closures)
 app.command(
     epilog=examples(

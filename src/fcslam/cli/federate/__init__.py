@@ -9,7 +9,7 @@ from fcslam.cli.federate.serve import serve
 
 _LOCAL = "fcslam federate local robot1 robot2 robot3 --public photos -o fleet"
 _SERVE = "fcslam federate serve server.lab:8000 --insecure --public photos -o fleet"
-_JOIN = "fcslam federate join server.lab:8000 images --insecure --name robot1 -o home"
+_JOIN = "fcslam federate join http://server.lab:8000 images --name robot1 -o home"
 
 app = typer.Typer(no_args_is_help=True)
 

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 import fcslam
 from fcslam.service.http.decisions import decision_router
 from fcslam.service.http.event_stream import event_router
+from fcslam.service.http.joint_maps import joint_map_router
 from fcslam.service.http.limits import CONTENT
 from fcslam.service.http.local_names import LocalNames
 from fcslam.service.http.missions import file_router, mission_router
@@ -29,7 +30,7 @@ from fcslam.service.http.viewers import fleet_router, map_router
 PREFIX = "/api/v1"
 VIEWER_ROUTERS = (fleet_router, map_router, event_router)
 """Routes of the page; they read."""
-ROUTERS = (robot_router, detector_router, mission_router, file_router, decision_router)
+ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, file_router, decision_router)
 
 
 class Service(FastAPI):

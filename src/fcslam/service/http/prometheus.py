@@ -29,7 +29,10 @@ class ServiceMetrics:
         self._clock = clock
         self._registry = CollectorRegistry()
         self._answered = Counter(
-            "fcslam_answer_bytes", "Bytes of packets sent to a robot", ("robot", "kind"), registry=self._registry
+            "fcslam_answer_bytes",
+            "Bytes of packets and maps sent to a robot",
+            ("robot", "kind"),
+            registry=self._registry,
         )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
         self._packets = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
@@ -52,6 +55,10 @@ class ServiceMetrics:
         """Count the bytes of a reply."""
         for data in read_batch(batch):
             self._answered.labels(robot, read_label(data).kind).inc(len(data))
+
+    def answer_map(self, robot: str, size: int) -> None:
+        """Count the bytes of tiles of the joint map."""
+        self._answered.labels(robot, "joint_map").inc(size)
 
     def arrived(self, mission: OpenMission) -> None:
         """Note when packets of a mission arrived."""

@@ -15,6 +15,7 @@ from fcslam.storage.postgres import Postgres, PostgresTransaction
 
 SNAPSHOT: Final = "snapshot"
 LIVE: Final = "live"
+JOINT: Final = "joint"
 RESULT: Final = "result "
 """Names of what is shared; that of a result ends with its number."""
 

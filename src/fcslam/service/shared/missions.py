@@ -1,8 +1,10 @@
 """The missions of a store, as each of its instances serves all of them."""
 
 import logging
+import math
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -17,13 +19,14 @@ from fcslam.service.mission_store import MissionStore
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, check_words, locked, sweep
 from fcslam.service.shared.agents import RobotLimit, SharedAgents
 from fcslam.service.shared.detectors import SharedDetectors
-from fcslam.service.shared.files import LIVE, RESULT, fetch_folder
+from fcslam.service.shared.files import JOINT, LIVE, RESULT, fetch_folder, fetched
 from fcslam.service.shared.instance import Elsewhere, Instance, Launch, Listen
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors
+from fcslam.storage.files import write_file
 from fcslam.storage.postgres import Postgres
 from fcslam.wire.checks import check_name
 
@@ -31,6 +34,9 @@ NAMED: Final[ContextVar[str | None]] = ContextVar("named mission", default=None)
 """The mission that the present request names; None: the open one."""
 _SEEN: Final = "seen"
 """Folder of a mission's run folders that its workers, here or elsewhere, shared."""
+
+_JOINT_LOOK_S: Final = 1.0
+"""Between two looks for joint maps that a worker elsewhere shared."""
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +60,7 @@ class SharedMission(OpenMission):
     ) -> None:  # fmt: skip
         self._number, self._server, self._instance = number, server, instance
         self._fetching = threading.Lock()
+        self._joint_at_s = -math.inf
         super().__init__(folder, store, intake, self._find_worker, wall_clock)
 
     def _find_worker(self) -> RunningWorker:
@@ -69,6 +76,21 @@ class SharedMission(OpenMission):
         """The newest live run folder that a worker shared; None: there is none yet."""
         known = self._instance.known.get(self.name)
         return None if known is None or not known.live else self._fetched(LIVE, str(known.live))
+
+    @property
+    def joint_maps(self) -> Path:
+        """The file of the joint maps: that of the worker here, or a copy of what the worker elsewhere shared."""
+        if self._instance.worker(self._number) is not None:
+            return super().joint_maps
+        copy = self.folder.path / _SEEN / JOINT
+        with self._fetching:
+            now_s = time.monotonic()
+            if now_s > self._joint_at_s and (content := fetched(self._server, self._number, JOINT)) is not None:
+                with translate_errors(copy):
+                    copy.parent.mkdir(parents=True, exist_ok=True)
+                    write_file(copy, content)
+                self._joint_at_s = now_s + _JOINT_LOOK_S
+        return copy
 
     def result(self, name: str) -> Path | None:
         """The run folder of a requested result; None if there is none."""

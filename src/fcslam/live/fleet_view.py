@@ -1,0 +1,205 @@
+"""What a live robot knows of its fleet: the joint map, where the others are, and why maps are apart.
+
+A thread follows the cloud. No scan waits for it, and while the cloud is away everything stays as it was last.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fcslam.errors import FcslamError, UnavailableError
+from fcslam.maps.joint_tiles import TiledMap, decode_batch
+from fcslam.records import FloatArray, frozen
+from fcslam.robot.sender import retry_delay_s
+from fcslam.runs.map_files import OccupancyMap
+from fcslam.wire.fleet_client import FleetClient, FleetReply
+
+POLL_S: Final = 0.5
+"""Time between two looks at the fleet."""
+DOWNLINK_KBPS: Final = 15.0
+"""Limit of the tiles, kB per second, without a budget."""
+STOP_TIMEOUT_S: Final = 2.0
+MOST_NEWS: Final = 1000
+"""Changes of the fleet that are kept."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Teammate:
+    """A robot of the fleet, possibly this one."""
+
+    robot: str
+    map_index: int
+    """Robots with the same index share a map."""
+    floor: str
+    T_map_base: FloatArray
+    """Shape (3,), in its map, metres and radians."""
+    age_s: float
+    """Time since it was there."""
+
+
+class FleetView:
+    """Follows the fleet of one robot. Any thread may call."""
+
+    def __init__(
+        self, clients: Sequence[FleetClient], robot: str, own_pose: Callable[[], tuple[int, FloatArray] | None],
+        limit_kbps: float | None = None, clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        """Follow nothing before ``start``.
+
+        Args:
+            clients: of the cloud's instances; if one does not answer, the next one is asked. ``close`` closes them.
+            robot: its name.
+            own_pose: index of its map and its pose there, if both are known.
+            limit_kbps: limit of the tiles, kB per second; None: ``DOWNLINK_KBPS``.
+            clock: seconds.
+        """
+        self._clients, self._robot, self._own_pose, self._clock = clients, robot, own_pose, clock
+        self._rng = np.random.default_rng()  # robots must not retry at the same moments
+        self._limit_bytes = max(1, int(1e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS)))
+        self._tiled, self._etag = TiledMap(), ""
+        self._reply: tuple[FleetReply, float] | None = None
+        """The newest one and when it came."""
+        self._map: OccupancyMap | None = None
+        self.drawn_s = -np.inf
+        """Stamp of the robot's newest keyscan that is in ``joint_map``; minus infinity without one."""
+        self.news: list[str] = []
+        """What changed in the robot's map, one line each, the oldest first."""
+        self.version = 0
+        """Grows with every change of the joint map."""
+        self.trouble: str | None = None
+        """Why the cloud cannot be followed; None if it can."""
+        self._current = self._failures = 0
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin to follow, in a thread."""
+        self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop following."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(STOP_TIMEOUT_S)
+        for client in self._clients:
+            client.close()
+
+    @property
+    def received_bytes(self) -> int:
+        """Bytes of the cloud's replies so far."""
+        return sum(client.received_bytes for client in self._clients)
+
+    @property
+    def joint_map(self) -> OccupancyMap | None:
+        """The joint map of the newest tiles, in its own frame; None before the first."""
+        return self._map
+
+    @property
+    def map_index(self) -> int | None:
+        """Index of the map that the robot is in, as the cloud draws it; None if it is in none."""
+        own = self._own()
+        return None if own is None else own.map_index
+
+    def robots(self) -> list[Teammate]:
+        """All robots that the cloud knows, with the ages of their poses now."""
+        if self._reply is None:
+            return []
+        reply, came_s = self._reply
+        since_s = self._clock() - came_s
+        return [
+            Teammate(one.robot, one.map_index, one.floor, frozen(np.array(one.T_map_base)), one.age_s + since_s)
+            for one in reply.robots
+        ]
+
+    def separations(self) -> tuple[tuple[tuple[int, int], str], ...]:
+        """For every two maps that are apart: their indices and the reason."""
+        return () if self._reply is None else self._reply[0].separations
+
+    def step(self) -> None:
+        """Ask once.
+
+        Raises:
+            UnavailableError: the cloud cannot be reached now.
+            CloudError: the cloud rejects the robot.
+        """
+        client, own = self._clients[self._current], self._own_pose()
+        pose = None if own is None or not np.isfinite(own[1]).all() else tuple(own[1].tolist())
+        before = self._members()
+        self._reply = client.exchange(self._robot, None if own is None else own[0], pose), self._clock()
+        self._tell(before, self._members())
+        stamp = next((one.stamp for one in self._reply[0].robots if one.robot == self._robot), -np.inf)
+        found = client.tiles(self._robot, self._etag, self._limit_bytes)
+        is_complete = True
+        if found is not None:
+            try:
+                batch = decode_batch(found[0])
+                self._tiled.add(batch)
+                is_complete = batch.is_complete
+            except ValueError as error:
+                self._etag = ""
+                raise UnavailableError(f"the cloud's reply is broken: {error}") from error
+            self._etag = found[1]
+            self._map = self._tiled.occupancy()
+            self.version += 1
+        if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
+            self.drawn_s = stamp
+
+    def _run(self) -> None:
+        wait_s = 0.0
+        while not self._stop.wait(wait_s):
+            try:
+                self.step()
+                self.trouble, self._failures, wait_s = None, 0, POLL_S
+            except FcslamError as error:  # the cloud is away, or older than this program
+                self._current = (self._current + 1) % len(self._clients)
+                self.trouble, self._failures = str(error), self._failures + 1
+                wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
+
+    def _own(self) -> Teammate | None:
+        return next((one for one in self.robots() if one.robot == self._robot), None)
+
+    def _members(self) -> tuple[int, frozenset[str]] | None:
+        """The robot's map and the others in it; None if it is in none."""
+        own = self._own()
+        if own is None:
+            return None
+        mates = (one.robot for one in self.robots() if one.map_index == own.map_index and one.robot != self._robot)
+        return own.map_index, frozenset(mates)
+
+    def _tell(self, before: tuple[int, frozenset[str]] | None, now: tuple[int, frozenset[str]] | None) -> None:
+        """Note one line if the robots of the map changed."""
+        known = {one.robot for one in self.robots()}
+        earlier, others = (frozenset() if one is None else one[1] for one in (before, now))
+        if earlier == others and (before is None) == (now is None):
+            return
+        if now is None:
+            line = "this robot is in no joint map any more"
+        else:
+            parts = []
+            if others - earlier:
+                parts.append(f"joined: {', '.join(sorted(others - earlier))}")
+            if split := (earlier - others) & known:
+                parts.append(f"split off: {', '.join(sorted(split))}")
+            if gone := earlier - others - known:
+                parts.append(f"taken out: {', '.join(sorted(gone))}")
+            everybody = ", ".join(sorted(others | {self._robot}))
+            line = f"map {now[0]} holds {everybody}" + "".join(f"; {part}" for part in parts)
+        if len(self.news) < MOST_NEWS:
+            self.news.append(line)
+
+
+@contextmanager
+def following(
+    clients: Sequence[FleetClient], robot: str, own_pose: Callable[[], tuple[int, FloatArray] | None],
+    limit_kbps: float | None,
+) -> Iterator[FleetView]:  # fmt: skip
+    """A view that follows its fleet in this block; arguments as for ``FleetView``."""
+    with closing(FleetView(clients, robot, own_pose, limit_kbps)) as view:
+        view.start()
+        yield view

@@ -1,0 +1,321 @@
+"""How good a map is where: the expected error of each square metre, by the marginal covariances of the pose graph.
+
+Two errors count for a cell: that of its position in the frame of the map's first robot, and that of its position
+relative to its surroundings. The covariances of the graph are larger than the errors, because no measurement counts as
+more precise than scan matching at its worst. ``SCALE`` is calibrated on simulated buildings
+(``benchmarks/certificate.py``).
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from fcslam.graph.pose_graph import PoseGraph
+from fcslam.records import FloatArray
+from fcslam.runs.map_files import Occupancy, OccupancyMap, pixels_of
+
+SCALE: Final = 0.25
+"""Ratio of true errors to the standard deviations of the graph."""
+FLOOR_M: Final = 0.008
+"""Error that every cell has: noise of the ranges and of matching, metres."""
+QUANTILE: Final = 2.0
+"""Ratio of the error that 95 % of cells stay below to its root mean square; of a normal error in the plane, 1.73."""
+BAR_M: Final = 0.05
+WITHIN_M: Final = 10.0
+CELL_M: Final = 1.0
+MOST_PLACES: Final = 600
+"""Places whose covariances are computed; of a larger map they lie farther apart."""
+SEEN_FROM_M: Final = 5.0
+"""A pass counts for the cells up to this distance."""
+PASS_GAP_S: Final = 20.0
+"""Two scans of one robot with a longer gap between them are two passes."""
+OPEN_M: Final = 0.03
+"""A motion is open if its weakest direction has a larger standard deviation."""
+OPEN_LENGTH_M: Final = 3.0
+"""Shorter open stretches are not named."""
+AGAIN_M: Final = 0.01
+AGAIN_PER_M: Final = 0.001
+"""Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
+_S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
+
+
+class MappedPath(NamedTuple):
+    """The keyscans of one session."""
+
+    session: str
+    stamps: FloatArray
+    """Shape (N,), seconds."""
+    T_map_base: FloatArray
+    """Shape (N, 3)."""
+    variables: NDArray[np.int64]
+    """Variable of each keyscan in the graph, shape (N,)."""
+
+
+class Places(NamedTuple):
+    """A sample of the keyscans of one map."""
+
+    variables: NDArray[np.int64]
+    """Shape (P,)."""
+    poses: FloatArray
+    """Shape (P, 3)."""
+    covariance: FloatArray
+    """Of their errors (x, y, theta) along the axes of ``map``, shape (3 P, 3 P), calibrated, without the floor."""
+
+    def absolute_m(self) -> FloatArray:
+        """Expected error of each place in the frame of the map, root mean square, shape (P,)."""
+        variance = np.diag(self.covariance).reshape(-1, 3)
+        return np.sqrt(variance[:, 0] + variance[:, 1] + FLOOR_M**2)
+
+    def relative_m(self, within_m: float) -> FloatArray:
+        """Expected error of the places within a distance as seen from each place, root mean square, shape (P,)."""
+        return relative_error(self.poses, self.covariance, within_m)
+
+
+def certify(
+    graph: PoseGraph, paths: Sequence[MappedPath], occupancy: OccupancyMap, bar_m: float = BAR_M,
+    within_m: float = WITHIN_M,
+) -> dict[str, Any]:  # fmt: skip
+    """The certificate of one map, as ``quality.json`` has it; lengths in metres.
+
+    Args:
+        graph: the pose graph of all maps, at its optimised poses.
+        paths: the sessions of the map, at least one keyscan in all; the first one begins its frame.
+        occupancy: the map.
+        bar_m: a cell is good if 95 % of such cells have a smaller error relative to their surroundings.
+        within_m: radius of the surroundings.
+    """
+    places = covariances(graph, paths)
+    absolute, relative = places.absolute_m(), places.relative_m(within_m)
+    local = places.relative_m(SEEN_FROM_M)
+    centres = _known_squares(occupancy)
+    nearest = np.zeros(0, np.int64)
+    if len(centres):
+        nearest = np.asarray(cKDTree(places.poses[:, :2]).query(centres)[1], np.int64)
+    turn = np.sqrt(np.diag(places.covariance)[2::3])
+    lever = np.hypot(*(centres - places.poses[nearest, :2]).T) * turn[nearest]
+    passes, seen_s = _passes(centres, paths)
+    bound = QUANTILE * relative
+    is_good = bound <= bar_m
+    cells = [
+        {
+            "x": round(float(x), 3), "y": round(float(y), 3), "error": round(float(math.hypot(absolute[k], along)), 4),
+            "neighbours": round(float(local[k]), 4), "bound_95": round(float(bound[k]), 4), "good": bool(is_good[k]),
+            "passes": int(count), "last_seen": round(float(seen), 3),
+        }
+        for (x, y), k, along, count, seen in zip(centres, nearest, lever, passes, seen_s, strict=True)
+    ]  # fmt: skip
+    good = [cell for cell in cells if cell["good"]]
+    return {
+        "bar": bar_m, "within": within_m, "cell": CELL_M, "scale": SCALE, "floor": FLOOR_M,
+        "error_95": round(float(np.percentile(bound[nearest], 95)), 4) if cells else None,
+        "good_share": round(len(good) / len(cells), 4) if cells else None,
+        "verdict": f"{len(good)} of {len(cells)} m2 are good to {bar_m:g} m within {within_m:g} m",
+        "open_stretches": _open_stretches(graph, paths),
+        "drives": _drives(places, nearest, is_good, bar_m, within_m),
+        "cells": cells,
+    }  # fmt: skip
+
+
+def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
+    """A sample of the keyscans of one map with the covariance of their errors; the first keyscan has none."""
+    poses = np.concatenate([path.T_map_base for path in paths])
+    variables = np.concatenate([path.variables for path in paths])
+    first = int(variables[0])
+    member = np.zeros(len(graph), bool)
+    member[variables] = True
+    rows = np.full(len(graph), -1)
+    rows[variables] = np.arange(len(variables))
+    information = _information(graph, poses, rows)
+    # What no edge connects with the first keyscan is held weakly, so that it counts as unknown.
+    connected = (
+        connected_components(information, directed=False)[1][::3]
+        == connected_components(information, directed=False)[1][3 * rows[first]]
+    )
+    kept = np.flatnonzero(np.arange(len(variables)) != rows[first])
+    kept = kept[connected[kept]]
+    chosen = _sampled(poses, connected)
+    at = np.full(len(variables), -1)
+    at[kept] = np.arange(len(kept))
+    covariance = np.zeros((3 * len(chosen), 3 * len(chosen)))
+    if len(kept):
+        columns = (3 * kept[:, None] + np.arange(3)).ravel()
+        solver = splu(csc_array(information[columns][:, columns]))
+        inside = chosen[at[chosen] >= 0]
+        wanted = (3 * at[inside][:, None] + np.arange(3)).ravel()
+        target = (3 * np.flatnonzero(at[chosen] >= 0)[:, None] + np.arange(3)).ravel()
+        for begin in range(0, len(wanted), 192):
+            part = wanted[begin : begin + 192]
+            unit = np.zeros((3 * len(kept), len(part)))
+            unit[part, np.arange(len(part))] = 1.0
+            covariance[np.ix_(target, target[begin : begin + 192])] = solver.solve(unit)[wanted]
+    covariance = SCALE**2 * (covariance + covariance.T) / 2.0
+    return Places(variables[chosen], poses[chosen], covariance)
+
+
+def relative_error(poses: FloatArray, covariance: FloatArray, within_m: float) -> FloatArray:
+    """Root mean square error of the positions within a distance of each place as seen from it, shape (P,), metres."""
+    result = np.full(len(poses), FLOOR_M)
+    blocks = covariance.reshape(len(poses), 3, len(poses), 3).transpose(0, 2, 1, 3)
+    tree = cKDTree(poses[:, :2])
+    for k in range(len(poses)):
+        others = np.array(tree.query_ball_point(poses[k, :2], within_m), np.int64)
+        near = np.sort(others[others != k])
+        if len(near):
+            apart = poses[near, :2] - poses[k, :2]
+            swing = apart @ _S.T  # change of the other's position by a turn of this place
+            own, other, cross = blocks[k, k], blocks[near, near], blocks[near, k]
+            variance = (
+                other[:, 0, 0] + other[:, 1, 1] + own[0, 0] + own[1, 1] - 2.0 * (cross[:, 0, 0] + cross[:, 1, 1])
+                + own[2, 2] * (swing**2).sum(axis=1)
+                - 2.0 * (swing * (cross[:, :2, 2] - own[:2, 2])).sum(axis=1)
+            )  # fmt: skip
+            result[k] = math.sqrt(max(float(variance.mean()), 0.0) + FLOOR_M**2)
+    return result
+
+
+def certificate_json(certificates: Mapping[int, Mapping[str, Any]]) -> bytes:
+    """The content of ``quality.json``: the certificate of each map, by its number."""
+    return (json.dumps({str(k): one for k, one in certificates.items()}, separators=(",", ":")) + "\n").encode()
+
+
+def certificate_png(certificate: Mapping[str, Any], occupancy: OccupancyMap) -> bytes:
+    """The map, green where it is good and red where its error is twice the bar."""
+    picture = cv2.cvtColor(pixels_of(occupancy.cells), cv2.COLOR_GRAY2BGR)
+    side = round(certificate["cell"] / occupancy.resolution_m)
+    for cell in certificate["cells"]:
+        bad = min(max(cell["bound_95"] / certificate["bar"] - 0.5, 0.0) / 1.5, 1.0)
+        column, row = (
+            round((cell[axis] - origin - certificate["cell"] / 2.0) / occupancy.resolution_m)
+            for axis, origin in zip("xy", occupancy.origin_xy, strict=True)
+        )
+        part = picture[max(row, 0) : row + side, max(column, 0) : column + side]
+        free = occupancy.cells[max(row, 0) : row + side, max(column, 0) : column + side] == Occupancy.FREE
+        part[free] = (0.5 * part[free] + 0.5 * np.array((60.0, 220.0 * (1.0 - bad), 220.0 * bad))).astype(np.uint8)
+    return bytes(cv2.imencode(".png", picture[::-1])[1])
+
+
+def _information(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> csc_array:
+    """Information of errors along the axes of ``map``, shape (3 N, 3 N), of the edges within one map."""
+    edges = graph.arrays()
+    inside = (rows[edges.i] >= 0) & (rows[edges.j] >= 0)
+    i, j, weight = rows[edges.i[inside]], rows[edges.j[inside]], edges.information[inside]
+    cos, sin = np.cos(poses[j, 2]), np.sin(poses[j, 2])
+    turn = np.zeros((len(i), 3, 3))  # from map to the base of j
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cos, sin, -sin, cos, 1.0
+    of_i = np.tile(-np.eye(3), (len(i), 1, 1))
+    of_i[:, :2, 2] = -(poses[j, :2] - poses[i, :2]) @ _S.T
+    jacobian = np.concatenate((turn @ of_i, turn), axis=2)  # (E, 3, 6)
+    blocks = jacobian.transpose(0, 2, 1) @ weight @ jacobian  # (E, 6, 6)
+    columns = np.concatenate((3 * i[:, None] + np.arange(3), 3 * j[:, None] + np.arange(3)), axis=1)
+    at = np.broadcast_to(columns[:, :, None], blocks.shape), np.broadcast_to(columns[:, None, :], blocks.shape)
+    size = 3 * len(poses)
+    return csc_array(coo_array((blocks.ravel(), (at[0].ravel(), at[1].ravel())), shape=(size, size)))
+
+
+def _sampled(poses: FloatArray, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Keyscans about a metre apart, the first one among them; farther apart if they are too many."""
+    spacing_m = CELL_M
+    while True:
+        squares = np.floor(poses[:, :2] / spacing_m).astype(np.int64)
+        chosen = np.sort(np.unique(squares[allowed], axis=0, return_index=True)[1])
+        if len(chosen) <= MOST_PLACES:
+            return np.flatnonzero(allowed)[chosen]
+        spacing_m *= 1.5
+
+
+def _known_squares(occupancy: OccupancyMap) -> FloatArray:
+    """Centres of the squares of ``CELL_M`` with known cells, shape (C, 2)."""
+    rows, columns = np.nonzero(occupancy.cells)
+    points = np.array(occupancy.origin_xy) + occupancy.resolution_m * (np.stack((columns, rows), axis=-1) + 0.5)
+    squares: FloatArray = (np.unique(np.floor(points / CELL_M), axis=0) + 0.5) * CELL_M
+    return squares.reshape(-1, 2)
+
+
+def _passes(centres: FloatArray, paths: Sequence[MappedPath]) -> tuple[NDArray[np.int64], FloatArray]:
+    """How often robots passed each square, and the stamp of the last keyscan near it; NaN if none was."""
+    count, newest = np.zeros(len(centres), np.int64), np.full(len(centres), np.nan)
+    if not len(centres):
+        return count, newest
+    for path in paths:
+        tree = cKDTree(path.T_map_base[:, :2])
+        for k, near in enumerate(tree.query_ball_point(centres, SEEN_FROM_M)):
+            if near:
+                stamps = np.sort(path.stamps[near])
+                count[k] += 1 + int((np.diff(stamps) > PASS_GAP_S).sum())
+                newest[k] = np.nanmax((newest[k], stamps[-1]))
+    return count, newest
+
+
+def _open_stretches(graph: PoseGraph, paths: Sequence[MappedPath]) -> list[dict[str, Any]]:
+    """Stretches along which the scans did not fix the motion in every direction, and no closure ends in them."""
+    edges = graph.arrays()
+    weakest = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(edges.information)[:, 0], 1e-12))
+    motion = {(int(i), int(j)): float(sigma) for i, j, sigma in zip(edges.i, edges.j, weakest, strict=True)}
+    chain = {pair for path in paths for pair in zip(path.variables[:-1].tolist(), path.variables[1:].tolist(),
+                                                    strict=True)}  # fmt: skip
+    closed = {end for pair in motion if pair not in chain for end in pair}
+    found = []
+    for path in paths:
+        variables, begin = path.variables.tolist(), 0
+        is_open = [motion.get(pair, 0.0) > OPEN_M and pair[1] not in closed
+                   for pair in pairwise(variables)]  # fmt: skip
+        for k, now in enumerate([*is_open, False]):
+            if now:
+                continue
+            steps = np.diff(path.T_map_base[begin : k + 1, :2], axis=0)
+            length_m = float(np.hypot(*steps.T).sum()) if len(steps) else 0.0
+            if length_m >= OPEN_LENGTH_M:
+                ends = [[round(float(value), 2) for value in path.T_map_base[end, :2]] for end in (begin, k)]
+                found.append({"robot": path.session, "from": ends[0], "to": ends[1], "length": round(length_m, 2),
+                              "first": float(path.stamps[begin]), "last": float(path.stamps[k])})  # fmt: skip
+            begin = k + 1
+    return found
+
+
+def _drives(
+    places: Places, nearest: NDArray[np.int64], is_good: NDArray[np.bool_], bar_m: float, within_m: float
+) -> list[dict[str, Any]]:
+    """What to drive again, the drive with the largest gain first; none if nothing helps."""
+    weight = np.bincount(nearest, minlength=len(places.poses))
+    bad = np.flatnonzero(~is_good & (weight > 0))
+    known = np.flatnonzero(is_good) if is_good.any() else np.array([0])
+    found: list[dict[str, Any]] = []
+    error = places.relative_m(within_m)
+    for b in bad[np.argsort(-error[bad])][:: max(1, len(bad) // 8)].tolist()[:8]:
+        apart = np.hypot(*(places.poses[known, :2] - places.poses[b, :2]).T)
+        a = int(known[np.argmin(np.where(known == b, np.inf, apart))])
+        if a == b:
+            continue
+        length_m = float(np.hypot(*(places.poses[a, :2] - places.poses[b, :2])))
+        updated = _with_motion(places, a, b, AGAIN_M + AGAIN_PER_M * length_m)
+        gain = int(weight[(QUANTILE * relative_error(places.poses, updated, within_m) <= bar_m) & ~is_good].sum())
+        if gain:
+            ends = [[round(float(value), 1) for value in places.poses[k, :2]] for k in (a, b)]
+            found.append({
+                "from": ends[0], "to": ends[1], "gain_m2": gain,
+                "text": f"drive from ({ends[0][0]}, {ends[0][1]}) to ({ends[1][0]}, {ends[1][1]}) again: about {gain} "
+                "m2 more are good then",
+            })  # fmt: skip
+    return sorted(found, key=lambda drive: -int(drive["gain_m2"]))[:3]
+
+
+def _with_motion(places: Places, a: int, b: int, sigma_m: float) -> FloatArray:
+    """The covariance after the motion between two places was measured once more."""
+    jacobian = np.zeros((3, 3 * len(places.poses)))
+    jacobian[:, 3 * b : 3 * b + 3] = np.eye(3)
+    jacobian[:, 3 * a : 3 * a + 3] = -np.eye(3)
+    jacobian[:2, 3 * a + 2] = -_S @ (places.poses[b, :2] - places.poses[a, :2])
+    measured = np.diag((sigma_m**2, sigma_m**2, (sigma_m / 5.0) ** 2))
+    gained = places.covariance @ jacobian.T
+    updated: FloatArray = places.covariance - gained @ np.linalg.solve(jacobian @ gained + measured, gained.T)
+    return updated

@@ -1,0 +1,144 @@
+"""Points of a scan that lie on another robot of the fleet: they are no part of the building.
+
+A robot with a false pose must not hide a wall. So a point counts as a robot's only where the scans of the other robots
+look through.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
+from fcslam.lidar.scan import rays_of
+from fcslam.records import FloatArray, frozen
+
+
+class RobotPath(NamedTuple):
+    """Where one robot was."""
+
+    stamps: FloatArray
+    """Shape (N,), seconds, ascending, at least one."""
+    T_map_base: FloatArray
+    """Shape (N, 3)."""
+
+
+class _Suspects(NamedTuple):
+    """Points of scans that lie on one robot."""
+
+    robot: str
+    scans: NDArray[np.int64]  # (K,)
+    beams: NDArray[np.int64]  # (K,)
+    points: FloatArray  # (K, 2) in map
+
+
+def without_teammates(
+    scans: Sequence[Casting],
+    stamps: FloatArray,
+    senders: Sequence[str],
+    paths: Mapping[str, Sequence[RobotPath]],
+    config: OccupancyConfig,
+) -> list[Casting]:
+    """The scans without the points that lie on other robots.
+
+    Between two poses of its path, a robot may be anywhere on the line between them. After the last one it stands there.
+
+    Args:
+        scans: N scans with poses in ``map``.
+        stamps: of the scans, shape (N,), seconds of the same clock as the paths.
+        senders: the robot that made each scan, N names.
+        paths: the paths of each robot, one for each of its sessions.
+        config: radius of a robot, and thresholds of free cells.
+    """
+    found = [
+        suspects
+        for robot, own_paths in paths.items()
+        if config.robot_radius_m > 0.0
+        if (suspects := _suspects(scans, stamps, senders, robot, own_paths, config.robot_radius_m)) is not None
+    ]
+    kept = list(scans)
+    if not found:
+        return kept
+    for suspects in found:
+        _drop(kept, suspects, np.ones(len(suspects.scans), np.bool_))
+    certain = {
+        robot: cast([scan for scan, sender in zip(kept, senders, strict=True) if sender == robot], config)
+        for robot in dict.fromkeys(senders)
+    }
+    kept = list(scans)
+    for suspects in found:
+        hits, passes = np.zeros((2, len(suspects.points)))
+        for robot, grid in certain.items():
+            if robot == suspects.robot:  # it does not decide what is hidden behind its own pose
+                continue
+            cells = np.floor((suspects.points - grid.origin_xy) / grid.resolution_m).astype(np.int64)
+            inside = ((cells >= 0) & (cells < grid.hits.shape[::-1])).all(axis=1)
+            columns, rows = cells[inside].T
+            hits[inside] += grid.hits[rows, columns]
+            passes[inside] += grid.passes[rows, columns]
+        _drop(kept, suspects, (passes >= config.minimum_passes) & (hits <= config.occupied_ratio * passes))
+    return kept
+
+
+def _suspects(
+    scans: Sequence[Casting], stamps: FloatArray, senders: Sequence[str], robot: str, paths: Sequence[RobotPath],
+    radius_m: float,
+) -> _Suspects | None:  # fmt: skip
+    """Points of other robots' scans that lie on ``robot``; None if there are none."""
+    numbers, beams, points = [], [], []
+    begin, end = _whereabouts(paths, stamps)
+    at = np.array([scan.T_map_base[:2] for scan in scans]).reshape(-1, 2)
+    apart_m = _distance(at, begin, end)  # NaN before its first pose
+    for k in np.flatnonzero(apart_m - radius_m < [scan.laser.max_range_m for scan in scans]).tolist():
+        if senders[k] == robot:
+            continue
+        scan = scans[k]
+        ranges_m = np.asarray(scan.ranges_m, np.float64)
+        reached = (ranges_m > 0.0) & (ranges_m < scan.laser.max_range_m) & (ranges_m > apart_m[k] - radius_m - 1.0)
+        if not reached.any():
+            continue
+        origins, directions = rays_of(scan.laser, scan.sweep)
+        returns = origins[reached] + ranges_m[reached, None] * directions[reached]
+        in_map = se2.transform(scan.T_map_base, returns)
+        on_robot = _distance(in_map, begin[k], end[k]) <= radius_m
+        hit = np.flatnonzero(reached)[on_robot]
+        numbers.append(np.full(len(hit), k))
+        beams.append(hit)
+        points.append(in_map[on_robot])
+    if not sum(map(len, beams)):
+        return None
+    return _Suspects(robot, np.concatenate(numbers), np.concatenate(beams), np.concatenate(points))
+
+
+def _whereabouts(paths: Sequence[RobotPath], stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Both ends of the line on which a robot was at each stamp, shape (N, 2) each; NaN before its first pose."""
+    begin, end = np.full((2, len(stamps), 2), np.nan)
+    for path in sorted(paths, key=lambda one: float(one.stamps[0])):
+        rows = np.searchsorted(path.stamps, stamps, side="right") - 1
+        known = rows >= 0
+        begin[known] = path.T_map_base[rows[known], :2]
+        end[known] = path.T_map_base[np.minimum(rows[known] + 1, len(path.stamps) - 1), :2]
+    return begin, end
+
+
+def _distance(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Distance of points (..., 2) to lines between two ends (..., 2)."""
+    along = end - begin
+    length = np.maximum((along**2).sum(axis=-1), 1e-12)
+    share = np.clip(((points - begin) * along).sum(axis=-1) / length, 0.0, 1.0)
+    distance: FloatArray = np.hypot(*np.moveaxis(points - begin - share[..., None] * along, -1, 0))
+    return distance
+
+
+def _drop(scans: list[Casting], suspects: _Suspects, chosen: NDArray[np.bool_]) -> None:
+    """Make the chosen points invalid."""
+    numbers, beams = suspects.scans[chosen], suspects.beams[chosen]  # scan by scan
+    kinds, first = np.unique(numbers, return_index=True)
+    if not len(numbers):
+        return
+    for k, hit in zip(kinds.tolist(), np.split(beams, first[1:]), strict=True):
+        ranges_m = np.array(scans[k].ranges_m)
+        ranges_m[hit] = 0.0
+        scans[k] = scans[k]._replace(ranges_m=frozen(ranges_m, np.float32))

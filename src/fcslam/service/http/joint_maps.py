@@ -1,0 +1,121 @@
+"""Routes for the fleet's map on every robot: tiles that changed, and the poses of all robots."""
+
+import time
+from functools import lru_cache
+from typing import Annotated
+
+from fastapi import APIRouter, Header, HTTPException, Query
+from fastapi.responses import Response
+from pydantic import BeforeValidator, Field
+
+from fcslam.config import Settings
+from fcslam.lidar.occupancy import FARTHEST_M
+from fcslam.runs import Run, separations
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.responses import Pose, content, refusals
+from fcslam.service.http.robots import NETWORK, Name
+from fcslam.service.http.state import ServiceState
+from fcslam.service.joint_maps import LivePose, ServedJointMaps
+from fcslam.service.summaries import run_of
+
+LARGEST_ANSWER = 1_000_000
+"""Bytes of the tiles of one answer."""
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
+
+
+def _number(value: object) -> object:
+    """JSON knows 1.0 as an integer, and true as none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError("is no number")
+    return value
+
+
+class OwnPose(Settings):
+    """Where a robot says it is."""
+
+    map: Annotated[int, Field(ge=0), BeforeValidator(_number)] | None = Field(
+        None, description="index of its map, as in its newest correction; null: not known"
+    )
+    pose: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="x and y in metres, theta in radians, in that map"
+    )
+
+
+class FleetRobot(Settings):
+    """A robot of the fleet."""
+
+    robot: str
+    map: int
+    floor: str = Field(description="empty: none")
+    pose: Pose
+    age_s: float = Field(description="time since the robot was there")
+    stamp: float = Field(description="of its newest keyscan in the map, seconds")
+
+
+class Apart(Settings):
+    """Two maps that no closure joins."""
+
+    maps: tuple[int, int]
+    explanation: str
+
+
+class FleetPoses(Settings):
+    """Who is where, and why maps are apart."""
+
+    robots: list[FleetRobot]
+    separations: list[Apart]
+
+
+def joint_map_router(state: ServiceState) -> APIRouter:
+    """The joint map that a robot belongs to, and the other robots."""
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+    as_reader = state.require(*Role)
+    joint = ServedJointMaps()
+
+    @router.post("/robots/{robot}/fleet", dependencies=state.require(Role.ROBOT))
+    def exchange_poses(robot: Name, own: OwnPose) -> FleetPoses:
+        """Say where a robot is, and read where all robots are."""
+        now_s = time.time()
+        if own.map is not None and own.pose is not None:
+            joint.say(robot, LivePose(own.map, own.pose, now_s))
+        robots = []
+        for session in joint.follow(state.mission.joint_maps).sessions:
+            pose, said_s = joint.pose(session)
+            robots.append(
+                FleetRobot(robot=session.robot, map=session.map, floor=session.floor, pose=list(pose),
+                           age_s=max(0.0, now_s - said_s), stamp=session.stamp)
+            )  # fmt: skip
+        return FleetPoses(robots=robots, separations=list(_apart(run_of(state.mission))))
+
+    @router.get(
+        "/robots/{robot}/map",
+        dependencies=as_reader,
+        response_class=Response,
+        responses={**refusals(404), 200: content(NETWORK), 304: {"description": "as you have it"}},
+    )
+    def get_joint_map(
+        robot: Name,
+        limit: Annotated[int, Query(ge=1, le=LARGEST_ANSWER)] = LARGEST_ANSWER,
+        known: Annotated[str, Header(alias="If-None-Match", max_length=64)] = "",
+    ) -> Response:
+        """The tiles of the map that a robot is in, changed since those whose ETag it sends; at most ``limit`` bytes."""
+        maps = joint.follow(state.mission.joint_maps)
+        number = next((session.map for session in maps.sessions if session.robot == robot), None)
+        tiles = None if number is None else joint.tiles(maps, number)
+        if tiles is None:
+            raise HTTPException(404, f"robot '{robot}' is in no map yet")
+        frame, _, version = known.strip('"').partition("-")
+        batch = tiles.since(frame, int(version) if version.isascii() and version.isdigit() else 0, limit)
+        headers = {"ETag": f'"{batch.frame}-{batch.version}"', "Cache-Control": "private, no-cache"}
+        if not batch.tiles and frame == batch.frame:
+            return Response(status_code=304, headers=headers)
+        body = batch.encode()
+        state.measures.answer_map(robot, len(body))
+        return Response(body, media_type=NETWORK, headers=headers)
+
+    return router
+
+
+@lru_cache(maxsize=2)
+def _apart(run: Run) -> tuple[Apart, ...]:
+    return tuple(Apart(maps=one.maps, explanation=str(one)) for one in separations(run))

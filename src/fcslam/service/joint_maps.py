@@ -1,0 +1,185 @@
+"""The joint maps of a mission as robots get them: their grids, and the newest pose of each robot.
+
+The worker draws them beside itself and writes them as one file. The service cuts them into tiles.
+"""
+
+import io
+import json
+import math
+import threading
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.cloud.report import fused_maps
+from fcslam.cloud.result import FleetResult
+from fcslam.cloud.sessions import robot_and_epoch
+from fcslam.errors import StoreError
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.maps.joint_tiles import TileHistory, frame_of
+from fcslam.runs.folder import identity
+from fcslam.runs.map_files import OccupancyMap
+from fcslam.storage.files import write_file
+
+LONGEST_SPEED_MPS = 3.0
+"""A robot that says it is farther from its newest keyscan than it can drive at this speed is where the keyscan was."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointSession:
+    """The newest session of a robot in the joint maps."""
+
+    robot: str
+    epoch: int
+    map: int
+    floor: str
+    pose: tuple[float, float, float]
+    """``T_map_base`` of its newest keyscan."""
+    stamp: float
+    """Of that keyscan, seconds."""
+    heard_s: float
+    """When that took effect, seconds since 1970."""
+
+
+class JointMaps:
+    """The joint maps of one moment."""
+
+    def __init__(
+        self, sessions: Sequence[JointSession], grids: Mapping[int, OccupancyMap], frames: Mapping[int, str]
+    ) -> None:
+        self.sessions = tuple(sessions)
+        """One for each robot: its newest session."""
+        self.grids, self.frames = grids, frames
+        """By number of the map."""
+
+
+def joint_maps_of(
+    result: FleetResult, heard_s: Mapping[tuple[str, int], float], config: OccupancyConfig
+) -> JointMaps:  # fmt: skip
+    """Draw the joint maps of an estimate; ``heard_s``: when the newest packet of each session took effect."""
+    newest: dict[str, JointSession] = {}
+    anchors: dict[int, str] = {}
+    grids = dict(fused_maps(result, config))
+    for mapped in result.robots:
+        robot, epoch = robot_and_epoch(mapped.robot)
+        if mapped.map_index in grids and mapped.map_index not in anchors:
+            resolution_m = grids[mapped.map_index].resolution_m
+            anchors[mapped.map_index] = frame_of(mapped.T_map_base[0].tolist(), mapped.robot, resolution_m)
+        if robot not in newest or epoch > newest[robot].epoch:
+            x, y, theta = mapped.T_map_base[-1].tolist()
+            newest[robot] = JointSession(
+                robot, epoch, mapped.map_index, mapped.floor, (x, y, theta), float(mapped.stamps[-1]),
+                heard_s.get((robot, epoch), 0.0),
+            )  # fmt: skip
+    return JointMaps(list(newest.values()), grids, anchors)
+
+
+def write_joint_maps(path: Path, maps: JointMaps) -> None:
+    """Write the joint maps as one file, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    content = io.BytesIO()
+    described = {
+        k: {"resolution": grid.resolution_m, "origin": grid.origin_xy, "frame": maps.frames[k]}
+        for k, grid in maps.grids.items()
+    }
+    head = {"sessions": [asdict(session) for session in maps.sessions], "maps": described}
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("joint.json", json.dumps(head))
+        for k, grid in maps.grids.items():
+            array = io.BytesIO()
+            np.save(array, grid.cells, allow_pickle=False)
+            archive.writestr(f"{k}.npy", array.getvalue())
+    write_file(path, content.getvalue())
+
+
+def read_joint_maps(path: Path) -> JointMaps:
+    """Read what ``write_joint_maps`` wrote.
+
+    Raises:
+        StoreError: it is broken or gone.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            head = json.loads(archive.read("joint.json"))
+            grids = {
+                int(k): OccupancyMap(
+                    np.load(io.BytesIO(archive.read(f"{k}.npy")), allow_pickle=False), about["resolution"],
+                    tuple(about["origin"]),
+                )
+                for k, about in head["maps"].items()
+            }  # fmt: skip
+        frames = {int(k): about["frame"] for k, about in head["maps"].items()}
+        sessions = [JointSession(**{**one, "pose": tuple(one["pose"])}) for one in head["sessions"]]
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise StoreError(f"{path}: no joint maps can be read ({error})") from error
+    return JointMaps(sessions, grids, frames)
+
+
+@dataclass(frozen=True, slots=True)
+class LivePose:
+    """A pose that a robot says it has."""
+
+    map: int
+    pose: tuple[float, float, float]
+    said_s: float
+    """When, seconds since 1970."""
+
+
+class ServedJointMaps:
+    """The joint maps of the open mission for robots: tiles that changed, and live poses. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._identity: tuple[Path, tuple[int, int]] | None = None
+        self._maps = JointMaps((), {}, {})
+        self._histories: dict[str, TileHistory] = {}
+        """By frame."""
+        self._live: dict[str, LivePose] = {}
+
+    def follow(self, path: Path) -> JointMaps:
+        """The joint maps in a file as they are now; those without content before there is one.
+
+        Raises:
+            StoreError: the file is broken.
+        """
+        with self._lock:
+            if not path.exists():
+                self._identity, self._maps = None, JointMaps((), {}, {})
+                return self._maps
+            known = path, identity(path)
+            if known != self._identity:
+                maps = read_joint_maps(path)
+                histories = {frame: self._histories.get(frame, TileHistory()) for frame in maps.frames.values()}
+                for k, frame in maps.frames.items():
+                    histories[frame].update(frame, maps.grids[k])
+                self._identity, self._maps, self._histories = known, maps, histories
+            return self._maps
+
+    def tiles(self, maps: JointMaps, number: int) -> TileHistory | None:
+        """The tiles of a map; None if there is none."""
+        with self._lock:
+            return self._histories.get(maps.frames.get(number, ""))
+
+    def say(self, robot: str, live: LivePose) -> None:
+        """Take the pose that a robot says it has."""
+        with self._lock:
+            self._live[robot] = live
+
+    def pose(self, session: JointSession) -> tuple[tuple[float, float, float], float]:
+        """The newest credible pose of a robot and when it was there, seconds since 1970.
+
+        What a robot says of itself counts only if it can have driven there since its newest keyscan, which the map
+        confirms.
+        """
+        live = self._live.get(session.robot)
+        if live is None or live.map != session.map or live.said_s < session.heard_s:
+            return session.pose, session.heard_s
+        apart_m = math.dist(live.pose[:2], session.pose[:2])
+        is_credible = apart_m <= 1.0 + LONGEST_SPEED_MPS * (live.said_s - session.heard_s)
+        return (live.pose, live.said_s) if is_credible else (session.pose, session.heard_s)

@@ -1,0 +1,76 @@
+"""HTTP client of a robot that follows its fleet: the joint map in tiles, and where all robots are."""
+
+import json
+from typing import NamedTuple
+
+from fcslam.errors import CloudError
+from fcslam.wire.http_transport import HttpClient
+
+
+class TeammatePose(NamedTuple):
+    """A robot of the fleet, as the cloud knows it."""
+
+    robot: str
+    map_index: int
+    floor: str
+    """Empty: none."""
+    T_map_base: tuple[float, float, float]
+    age_s: float
+    """Time since it was there, when the cloud replied."""
+    stamp: float
+    """Of its newest keyscan in the joint map, seconds."""
+
+
+class FleetReply(NamedTuple):
+    """Where all robots are, and why maps are apart."""
+
+    robots: tuple[TeammatePose, ...]
+    separations: tuple[tuple[tuple[int, int], str], ...]
+    """Two maps and the reason."""
+
+
+class FleetClient(HttpClient):
+    """Follows the fleet of one robot. Each method raises as ``BatchTransport.state``."""
+
+    received_bytes = 0
+    """Bytes of the replies' bodies so far."""
+
+    def exchange(self, robot: str, map_index: int | None, pose: tuple[float, ...] | None) -> FleetReply:
+        """Say where the robot is in its map, if it knows, and read where all robots are."""
+        content = json.dumps({"map": map_index, "pose": pose} if pose and map_index is not None else {})
+        response = self._ask(
+            "POST", f"robots/{robot}/fleet", content.encode(), {"Content-Type": "application/json"}, "application/json"
+        )
+        self._require(response, 200)
+        self.received_bytes += len(response.content)
+        try:
+            reply = response.json()
+            robots = tuple(
+                TeammatePose(str(one["robot"]), int(one["map"]), str(one["floor"]), _pose(one["pose"]),
+                             float(one["age_s"]), float(one["stamp"]))
+                for one in reply["robots"]
+            )  # fmt: skip
+            apart = tuple(
+                ((int(one["maps"][0]), int(one["maps"][1])), str(one["explanation"])) for one in reply["separations"]
+            )
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
+        return FleetReply(robots, apart)
+
+    def tiles(self, robot: str, known: str, limit_bytes: int) -> tuple[bytes, str] | None:
+        """The changed tiles of the map that a robot is in (``fcslam.maps.joint_tiles``) and their ETag.
+
+        None: nothing changed since the ETag ``known``, or the robot is in no map yet.
+        """
+        headers = {"If-None-Match": known} if known else {}
+        response = self._ask("GET", f"robots/{robot}/map?limit={limit_bytes}", headers=headers, accept="*/*")
+        if response.status_code in (304, 404):
+            return None
+        self._require(response, 200)
+        self.received_bytes += len(response.content)
+        return response.content, response.headers.get("ETag", "")
+
+
+def _pose(values: object) -> tuple[float, float, float]:
+    x, y, theta = map(float, values)  # type: ignore[call-overload]
+    return x, y, theta

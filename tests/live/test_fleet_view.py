@@ -1,0 +1,126 @@
+"""What a robot knows of its fleet: over real HTTP, from a service whose worker applies packets at once."""
+
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from fcslam.errors import CloudError, UnavailableError
+from fcslam.live.fleet_view import FleetView
+from fcslam.wire.fleet_client import FleetClient
+from tests.service.http.desk import SCRIPT, A, B, Desk
+
+
+@pytest.fixture
+def desk(tmp_path, scripted):
+    scripted(SCRIPT)
+    with Desk(tmp_path / "data") as desk:
+        yield desk
+
+
+def client(desk, robot):
+    return FleetClient(str(desk.client.base_url), f"token of {robot}")
+
+
+def view(desk, robot, pose=None, limit_kbps=None):
+    return FleetView([client(desk, robot)], robot, lambda: pose, limit_kbps, clock=lambda: 0.0)
+
+
+def follow(fleet):
+    for _ in range(100):
+        before = fleet.version
+        fleet.step()
+        if fleet.version == before:
+            return fleet
+    raise AssertionError("it never ends")
+
+
+def known(occupancy):
+    column, row = (round(edge / occupancy.resolution_m) for edge in occupancy.origin_xy)
+    return {(row + y, column + x): occupancy.cells[y, x] for y, x in zip(*np.nonzero(occupancy.cells), strict=True)}
+
+
+def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service(desk):
+    desk.send("a", A)
+    with closing(view(desk, "a")) as first:
+        follow(first)
+        alone = known(first.joint_map)
+        desk.send("b", B)
+        with closing(view(desk, "b", limit_kbps=0.5)) as second:
+            follow(first), follow(second)
+            assert known(first.joint_map) == known(second.joint_map) != alone
+            assert [mate.robot for mate in first.robots()] == ["a", "b"]
+            assert first.map_index == second.map_index == 0
+            assert first.news == ["map 0 holds a", "map 0 holds a, b; joined: b"]
+            before = first.received_bytes
+            follow(first)
+            assert first.received_bytes - before < 1000, "nothing changed, so no tile travels"
+
+
+def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):
+    desk.send("a", A)
+    desk.send("b", B)
+    with closing(view(desk, "a")) as fleet:
+        follow(fleet)
+        answer = desk.ask("POST", "/api/v1/edits", "boss", json={"kind": "removal", "content": {"robot": "b"}})
+        assert answer.status_code == 201, answer.text
+        desk.state.mission.worker.ring()
+        follow(fleet)
+        assert fleet.news[1:] == ["map 0 holds a; taken out: b"]
+
+
+def test_a_robot_says_where_it_is_and_others_believe_what_it_can_have_driven(desk):
+    desk.send("a", A)
+    desk.send("b", B)
+    with closing(view(desk, "b")) as fleet:
+        follow(fleet)
+        there = next(mate for mate in fleet.robots() if mate.robot == "a").T_map_base
+        near, far = there + np.array((0.5, 0.0, 0.1)), there + np.array((0.0, 1e6, 0.0))
+        for said, seen in ((near, near), (far, there)):
+            with closing(view(desk, "a", (0, said))) as other:
+                other.step()
+            fleet.step()
+            (mate,) = (mate for mate in fleet.robots() if mate.robot == "a")
+            assert np.allclose(mate.T_map_base, seen)
+            assert 0.0 <= mate.age_s < 1e9
+
+
+def test_after_an_outage_the_last_map_is_there(desk):
+    desk.send("a", A)
+    with closing(view(desk, "a")) as fleet:
+        follow(fleet)
+        before = known(fleet.joint_map)
+        fleet._clients.append(FleetClient("http://127.0.0.1:9"))
+        fleet._current = 1
+        with pytest.raises(UnavailableError):
+            fleet.step()
+        assert known(fleet.joint_map) == before
+
+
+def test_following_goes_on_through_an_outage(desk):
+    desk.send("a", A)
+    clients = [FleetClient("http://127.0.0.1:9"), client(desk, "a")]
+    with closing(FleetView(clients, "a", lambda: None)) as fleet:
+        fleet.start()
+        until = time.monotonic() + 20.0
+        while fleet.joint_map is None and time.monotonic() < until:
+            time.sleep(0.02)
+        assert fleet.joint_map is not None
+
+
+def test_a_robot_reads_no_other_robots_map_and_says_nothing_for_it(desk):
+    desk.send("a", A)
+    with closing(client(desk, "b")) as other:
+        with pytest.raises(CloudError, match="does not speak for robot 'a'"):
+            other.exchange("a", 0, (0.0, 0.0, 0.0))
+        with pytest.raises(CloudError, match="does not speak for robot 'a'"):
+            other.tiles("a", "", 1000)
+    assert desk.ask("GET", "/api/v1/robots/a/map").status_code == 401
+    assert desk.ask("GET", "/api/v1/robots/a/map", "eye").status_code == 200
+    assert desk.ask("GET", "/api/v1/robots/b/map", "b").status_code == 404
+
+
+@pytest.mark.parametrize("body", [{"map": 0, "pose": [0, 0]}, {"map": -1}, {"pose": ["x", 0, 0]}, {"who": 1}])
+def test_a_pose_that_is_none_is_refused(desk, body):
+    assert desk.ask("POST", "/api/v1/robots/a/fleet", "a", json=body).status_code == 400

@@ -1,0 +1,95 @@
+"""Maps as tiles: whoever follows the changes has the map, however little comes at once."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fcslam.maps.joint_tiles import TILE, TileBatch, TiledMap, TileHistory, decode_batch, padded
+from fcslam.runs.map_files import OccupancyMap
+
+
+def occupancy(seed, height, width, column, row):
+    cells = np.random.default_rng(seed).integers(0, 3, (height, width), dtype=np.uint8)
+    return OccupancyMap(cells, 0.05, (0.05 * column, 0.05 * row))
+
+
+def known_cells(one):
+    """Global row and column of every known cell, and its state."""
+    column, row = (round(edge / one.resolution_m) for edge in one.origin_xy)
+    return {(row + y, column + x): one.cells[y, x] for y, x in zip(*np.nonzero(one.cells), strict=True)}
+
+
+def fetch(history, tiled, limit=10**6):
+    """Follow until nothing is left; returns the number of answers."""
+    for count in range(1, 1000):
+        tiled.add(decode_batch(history.since(tiled.frame, tiled.version, limit).encode()))
+        if tiled.version == history.since("", 0, 10**9).version:
+            return count
+    raise AssertionError("it never ends")
+
+
+@given(st.lists(st.tuples(st.integers(1, 150), st.integers(1, 150), st.integers(-200, 200), st.integers(-200, 200)),
+                min_size=1, max_size=3), st.integers(1, 3000))  # fmt: skip
+@settings(max_examples=25, deadline=None)
+def test_who_follows_has_the_newest_map(shapes, limit):
+    history, tiled = TileHistory(), TiledMap()
+    for seed, shape in enumerate(shapes):
+        newest = occupancy(seed, *shape)
+        history.update("frame", newest)
+        fetch(history, tiled, limit)
+        got = tiled.occupancy()
+        assert (known_cells(got) if got else {}) == known_cells(newest)
+
+
+def test_only_tiles_that_changed_travel_and_no_more_than_the_limit():
+    history, tiled = TileHistory(), TiledMap()
+    first = occupancy(0, 4 * TILE, 4 * TILE, 0, 0)
+    history.update("frame", first)
+    whole = history.since("", 0, 10**6)
+    assert len(whole.tiles) == 16
+    each = len(whole.tiles[0, 0])
+    assert fetch(history, tiled, 2 * each) >= 8
+    cells = first.cells.copy()
+    cells[TILE + 3, 2 * TILE + 5] = (cells[TILE + 3, 2 * TILE + 5] + 1) % 3
+    history.update("frame", OccupancyMap(cells, 0.05, first.origin_xy))
+    assert list(history.since(tiled.frame, tiled.version, 10**6).tiles) == [(1, 2)]
+
+
+def test_in_another_frame_earlier_tiles_count_no_longer():
+    history, tiled = TileHistory(), TiledMap()
+    history.update("one", occupancy(0, 70, 70, 0, 0))
+    fetch(history, tiled)
+    newest = occupancy(1, 10, 10, 500, 500)
+    history.update("another", newest)
+    fetch(history, tiled)
+    assert known_cells(tiled.occupancy()) == known_cells(newest)
+
+
+@pytest.mark.parametrize("data", [
+    b"", b"[]\n", b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[[0,0,9]]}\nabc',
+    b'{"frame":"a","version":1,"resolution":-1,"complete":true,"tiles":[]}\n',
+    b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[[0,0,-1]]}\n',
+])  # fmt: skip
+def test_what_is_no_batch_is_refused(data):
+    with pytest.raises(ValueError, match="not tiles of a map"):
+        decode_batch(data)
+
+
+def test_a_broken_tile_and_a_map_without_end_are_refused_and_nothing_changes():
+    history, tiled = TileHistory(), TiledMap()
+    history.update("frame", occupancy(0, 10, 10, 0, 0))
+    fetch(history, tiled)
+    before = known_cells(tiled.occupancy())
+    tile = next(iter(history.since("", 0, 10**6).tiles.values()))
+    for tiles in ({(0, 0): b"no zstd"}, {(10**6, 10**6): tile}):
+        with pytest.raises(ValueError, match=r"a (broken tile|map of more than)"):
+            tiled.add(TileBatch("frame", 9, 0.05, True, tiles))
+        assert known_cells(tiled.occupancy()) == before
+
+
+def test_padding_adds_unknown_cells_only():
+    one = occupancy(0, 50, 90, -13, 77)
+    whole = padded(one)
+    assert not (np.array(whole.cells.shape) % TILE).any()
+    assert known_cells(whole) == known_cells(one)
