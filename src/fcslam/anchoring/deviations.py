@@ -1,6 +1,7 @@
 """How a building differs from its floor plan: walls that are missing, new, or somewhere else."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -25,8 +26,14 @@ SHORTEST_NEW_M: Final = 2.0
 """Shortest new wall: shorter surfaces are furniture."""
 FARTHEST_M: Final = 2.0
 """A missing wall that stands parallel within this distance has moved."""
+HIDDEN_M: Final = 1.0
+"""A new wall this close to a wall of the plan that no scan can see is that wall."""
+_STEPS: Final = 6
+"""Steps of ``SPACING_M`` to either side in which a wall is looked for."""
 JOINED_M: Final = 0.35
 """Points of one wall are at most this far apart."""
+LEAST_OFF: Final = 0.3
+"""Least share of a wall's points with a wall close by, by which its distance is known."""
 PARALLEL: Final = 0.94
 """Least cosine between the normals of one wall."""
 
@@ -56,7 +63,7 @@ class Deviation:
     @property
     def length_m(self) -> float:
         """Length of the wall that differs."""
-        return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
+        return math.dist(self.start, self.end)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +84,8 @@ class _Wall:
 
     points: FloatArray
     normals: FloatArray
-    off_m: float
-    """Median distance from the plan, for walls that the other map has close by."""
+    off_m: float | None
+    """Median distance of the other map's wall; None if there is none close by."""
 
     @property
     def normal(self) -> FloatArray:
@@ -90,6 +97,12 @@ class _Wall:
         """First and last coordinate along a direction."""
         at = self.points @ tangent
         return float(at.min()), float(at.max())
+
+    @property
+    def length_m(self) -> float:
+        """Length of the wall."""
+        start, end = self.ends()
+        return math.dist(start, end)
 
     def ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
         normal = self.normal
@@ -109,51 +122,47 @@ def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
     """
     points, normals = plan.surface.points, plan.surface.normals
     across = _across(points, normals, building.field)
-    near = np.abs(across) <= OFF_M
-    off = (np.abs(across) > OFF_M) & ~_has_close(points, normals, building)
-    missing = np.isnan(across) & _in_free(points, building) & (_distance(points, building) > AWAY_M)
+    confirmed, unseen = np.abs(across) <= OFF_M, np.isnan(across)
+    passed = unseen & _in_free(points, building) & (_distance(points, building) > AWAY_M)
     unknown = _distance(building.surface.points, plan) > AWAY_M
     new = list(_walls(building.surface.points, building.surface.normals, np.zeros(len(unknown)), unknown))
-    found: list[Deviation] = []
-    for wall in _walls(points, normals, across, off):
-        found.append(Deviation(DeviationKind.MOVED, *wall.ends(), abs(wall.off_m)))
     taken: set[int] = set()
-    for wall in _walls(points, normals, np.zeros(len(points)), missing):
-        match = _moved(wall, new)
+    found: list[Deviation] = []
+    for wall in _walls(points, normals, across, passed | (~unseen & ~confirmed)):
+        match = _moved(wall, new, FARTHEST_M)
+        if match is not None:
+            taken.add(match[0])
+        by_m = wall.off_m if wall.off_m is not None else match[1] if match is not None else None
+        kind = DeviationKind.MISSING if by_m is None else DeviationKind.MOVED
+        found.append(Deviation(kind, *wall.ends(), by_m))
+    # A wall of which scans see one side may hide its place in the plan.
+    hidden = [wall for wall in _walls(points, normals, across, unseen & ~passed) if wall.length_m >= SHORTEST_M]
+    for wall in (wall for k, wall in enumerate(new) if k not in taken and wall.length_m >= SHORTEST_NEW_M):
+        match = _moved(wall, hidden, HIDDEN_M)
         if match is None:
-            found.append(Deviation(DeviationKind.MISSING, *wall.ends()))
+            found.append(Deviation(DeviationKind.NEW, *wall.ends()))
         else:
-            number, by_m = match
-            taken.add(number)
-            found.append(Deviation(DeviationKind.MOVED, *wall.ends(), by_m))
-    found += (Deviation(DeviationKind.NEW, *wall.ends()) for k, wall in enumerate(new) if k not in taken)
-    kept = [d for d in found if d.length_m >= (SHORTEST_NEW_M if d.kind is DeviationKind.NEW else SHORTEST_M)]
+            found.append(Deviation(DeviationKind.MOVED, *hidden[match[0]].ends(), match[1]))
+    kept = [deviation for deviation in found if deviation.length_m >= SHORTEST_M]
     kept.sort(key=lambda deviation: (-deviation.length_m, deviation.start))
-    mean_off_m = float(np.abs(across[near]).mean()) if near.any() else float("nan")
-    return Comparison(tuple(kept), SPACING_M * int(near.sum()), mean_off_m)
+    mean_off_m = float(np.abs(across[confirmed]).mean()) if confirmed.any() else float("nan")
+    return Comparison(tuple(kept), SPACING_M * int(confirmed.sum()), mean_off_m)
 
 
 def _across(points: FloatArray, normals: FloatArray, field: SurfelField) -> FloatArray:
     """Distance of the other map's surface from each point (N, 2) along its normal; NaN if there is none close by."""
     across = np.full(len(points), np.nan)
-    labels = field.nearest(points)
-    known = np.flatnonzero(labels != EMPTY)
-    surfels, its = field.points[labels[known]], field.normals[labels[known]]
-    apart = surfels - points[known]
-    distance = np.einsum("na,na->n", apart, normals[known])
-    beside2 = np.einsum("na,na->n", apart, apart) - distance**2
-    same = (np.einsum("na,na->n", its, normals[known]) > PARALLEL) & (beside2 < (2.0 * SPACING_M) ** 2)
-    across[known[same]] = distance[same]
+    for shift_m in sorted(np.arange(-_STEPS, _STEPS + 1) * SPACING_M, key=abs):
+        rows = np.flatnonzero(np.isnan(across))
+        labels = field.nearest(points[rows] + shift_m * normals[rows])
+        rows, labels = rows[labels != EMPTY], labels[labels != EMPTY]
+        apart = field.points[labels] - points[rows]
+        distance = np.einsum("na,na->n", apart, normals[rows])
+        beside2 = np.einsum("na,na->n", apart, apart) - distance**2
+        same = np.einsum("na,na->n", field.normals[labels], normals[rows]) > PARALLEL
+        same &= (beside2 < (2.0 * SPACING_M) ** 2) & (np.abs(distance - shift_m) <= SPACING_M)
+        across[rows[same]] = distance[same]
     return across
-
-
-def _has_close(points: FloatArray, normals: FloatArray, building: Submap) -> NDArray[np.bool_]:
-    """Whether the map has a surface of the same side where the plan has one, hidden by a nearer one of another side."""
-    found = np.zeros(len(points), bool)
-    for step in (-0.5 * OFF_M, 0.5 * OFF_M):
-        across = _across(points + step * normals, normals, building.field)
-        found |= np.abs(across + step) <= OFF_M
-    return found
 
 
 def _distance(points: FloatArray, other: Submap) -> FloatArray:
@@ -172,40 +181,40 @@ def _in_free(points: FloatArray, building: Submap) -> NDArray[np.bool_]:
     return result
 
 
-def _walls(
-    points: FloatArray, normals: FloatArray, off: FloatArray, chosen: NDArray[np.bool_]
-) -> Iterator[_Wall]:
+def _walls(points: FloatArray, normals: FloatArray, across: FloatArray, chosen: NDArray[np.bool_]) -> Iterator[_Wall]:
     """The straight walls among the chosen points: both sides of a wall are one."""
     rows = np.flatnonzero(chosen & np.any(normals != 0.0, axis=1))
     if not len(rows):
         return
-    xy, its, distance = points[rows], normals[rows], off[rows]
+    xy, its = points[rows], normals[rows]
     i, j = cKDTree(xy).query_pairs(JOINED_M, output_type="ndarray").T
     facing = np.einsum("na,na->n", its[i], its[j])
     # Along the wall, not across it: parallel walls close by are two.
     beside = np.abs(np.einsum("na,na->n", xy[j] - xy[i], its[i]))
-    joined = (np.abs(facing) > PARALLEL) & (np.abs(distance[i] - np.sign(facing) * distance[j]) < OFF_M)
-    joined &= (beside < OFF_M) | (facing < 0.0)
+    joined = (facing < -PARALLEL) | ((facing > PARALLEL) & (beside < OFF_M))
     links = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(rows), len(rows)))
     _, label = connected_components(links, directed=False)
     order = np.argsort(label, kind="stable")
     for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
-        yield _Wall(xy[members], its[members], float(np.median(distance[members])))
+        off = np.abs(across[rows[members]])
+        off = off[off > OFF_M]  # false for NaN
+        its_off_m = float(np.median(off)) if len(off) >= LEAST_OFF * len(members) else None
+        yield _Wall(xy[members], its[members], its_off_m)
 
 
-def _moved(wall: _Wall, new: list[_Wall]) -> tuple[int, float] | None:
-    """The new wall that stands parallel to a missing one, and how far it is; None if there is none."""
+def _moved(wall: _Wall, others: Sequence[_Wall], farthest_m: float) -> tuple[int, float] | None:
+    """The nearest of other walls that stands beside a wall, parallel to it, and how far it is; None if none does."""
     normal = wall.normal
     tangent = np.array((-normal[1], normal[0]))
     first, last = wall.along(tangent)
     best: tuple[int, float] | None = None
-    for number, other in enumerate(new):
+    for number, other in enumerate(others):
         low, high = other.along(tangent)
         overlap = min(last, high) - max(first, low)
         if abs(float(other.normal @ normal)) < PARALLEL or overlap < 0.5 * min(last - first, SHORTEST_M):
             continue
         by_m = _apart(wall, other, normal)
-        if by_m <= FARTHEST_M and (best is None or by_m < best[1]):
+        if by_m <= farthest_m and (best is None or by_m < best[1]):
             best = number, by_m
     return best
 
