@@ -106,7 +106,9 @@ def in_plan(mission: SavedMission, plan: OccupancyMap | None) -> Run:
 def longer_scan(scan: LaserScan) -> LaserScan:
     laser = replace(scan.laser, max_range_m=SCALE * scan.laser.max_range_m)
     odometry = frozen(scan.T_odom_base * (SCALE, SCALE, 1.0))
-    return replace(scan, ranges_m=frozen(scan.ranges_m * np.float32(SCALE), np.float32), laser=laser, T_odom_base=odometry)
+    return replace(
+        scan, ranges_m=frozen(scan.ranges_m * np.float32(SCALE), np.float32), laser=laser, T_odom_base=odometry
+    )
 
 
 def drawn(pieces: tuple[Piece, ...], fleet: SimulatedFleet, rng: np.random.Generator) -> OccupancyMap:
@@ -166,7 +168,11 @@ def middle_of(deviation: dict) -> FloatArray:
 def true_poses(run: Run, fleet: SimulatedFleet) -> Iterator[tuple[FloatArray, FloatArray, str]]:
     for robot in fleet.robots:
         trajectory = run.trajectories[robot.name]
-        yield trajectory.T_map_base, robot.T_building_base[np.searchsorted(robot.stamps, trajectory.stamps - 1e-6)], robot.name
+        yield (
+            trajectory.T_map_base,
+            robot.T_building_base[np.searchsorted(robot.stamps, trajectory.stamps - 1e-6)],
+            robot.name,
+        )
 
 
 def size(run: Run, fleet: SimulatedFleet) -> float:

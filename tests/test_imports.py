@@ -39,6 +39,7 @@ ROOMS = [
     "learning",
     "federated",
     "simulation",
+    "anchoring",
     "driving",
     "mission_file",
     "mission",

@@ -50,9 +50,9 @@ class PlanAlignment:
         if self.surface_m < LEAST_SURFACE_M:
             return f"plan and map share {self.surface_m:.0f} m of walls, {LEAST_SURFACE_M:.0f} m needed"
         if self.explained < LEAST_EXPLAINED:
-            return f"the scans saw {self.explained:.0%} of the walls that the plan has there, {LEAST_EXPLAINED:.0%} needed"
+            return f"the scans saw {self.explained:.0%} of the plan's walls there, {LEAST_EXPLAINED:.0%} needed"
         if self.violation > MOST_VIOLATION:
-            return f"{self.violation:.0%} of the plan's walls stand where the scans saw free space, {MOST_VIOLATION:.0%} allowed"
+            return f"{self.violation:.0%} of the plan's walls stand in free space, {MOST_VIOLATION:.0%} allowed"
         if self.share < LEAST_SHARE:
             return f"the plan has {self.share:.0%} of the map's walls, {LEAST_SHARE:.0%} needed"
         if self.lead < LEAD:
@@ -99,9 +99,8 @@ def _headings(plan: Submap, building: Submap) -> FloatArray | None:
     directions = []
     for submap in (plan, building):
         normals = submap.surface.normals[np.any(submap.surface.normals != 0.0, axis=1)]
-        mean = np.mean(np.exp(4j * np.arctan2(normals[:, 1], normals[:, 0]))) if len(normals) else 0j
+        mean = complex(np.exp(4j * np.arctan2(normals[:, 1], normals[:, 0])).mean()) if len(normals) else 0j
         if abs(mean) < DIRECTED:
             return None
         directions.append(float(np.angle(mean)) / 4.0)
-    headings: FloatArray = directions[0] - directions[1] + 0.5 * np.pi * np.arange(4)
-    return headings
+    return np.asarray(directions[0] - directions[1] + 0.5 * np.pi * np.arange(4), np.float64)

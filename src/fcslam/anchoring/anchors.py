@@ -148,7 +148,8 @@ def _with_part(result: FleetResult, k: int, part: _Part) -> FleetResult:
         for e in result.graph.edges
     ]
     T_after_before = {
-        name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1])) for name, robot in after.items()
+        name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1]))
+        for name, robot in after.items()
     }
     corrections = tuple(
         replace(c, T_map_odom=frozen(se2.compose(T_after_before[c.robot], c.T_map_odom))) if c.robot in after else c
@@ -161,9 +162,7 @@ def _with_part(result: FleetResult, k: int, part: _Part) -> FleetResult:
         for region in result.regions
     )
     robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
-    return replace(
-        result, robots=robots, corrections=corrections, graph=PoseGraph(poses, edges), regions=regions
-    )
+    return replace(result, robots=robots, corrections=corrections, graph=PoseGraph(poses, edges), regions=regions)
 
 
 def _plan_report(
@@ -225,9 +224,7 @@ def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
     cells[walls] = Occupancy.OCCUPIED
     near = max(1, round(0.1 / side))
     union = OccupancyMap(cells, side, (float(low[0]), float(low[1])))
-    return highlighted_png(
-        union, walls & ~grown(lines, near), lines & ~grown(walls, near), (ONLY_SCANS, ONLY_PLAN)
-    )
+    return highlighted_png(union, walls & ~grown(lines, near), lines & ~grown(walls, near), (ONLY_SCANS, ONLY_PLAN))
 
 
 def _corners(one: OccupancyMap) -> tuple[FloatArray, FloatArray]:

@@ -78,7 +78,8 @@ class _Measured:
         at = poses[self.variables]
         cos, sin = np.cos(at[:, 2]), np.sin(at[:, 2])
         x, y = self.arms.T
-        return at[:, :2] + np.column_stack((cos * x - sin * y, sin * x + cos * y))
+        antennas: FloatArray = at[:, :2] + np.column_stack((cos * x - sin * y, sin * x + cos * y))
+        return antennas
 
     def agrees(self, antennas: FloatArray) -> NDArray[np.bool_]:
         """Which fixes agree with positions of the antenna (N, 2), shape (N,)."""

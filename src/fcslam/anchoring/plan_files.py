@@ -143,6 +143,7 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
     try:
         import ezdxf
         from ezdxf import units
+        from ezdxf.enums import InsertUnits
     except ImportError as error:
         raise SourceError(f"{path}: reading DXF needs ezdxf; install it: pip install 'fcslam[plans]'") from error
     try:
@@ -153,7 +154,9 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
         raise SourceError(
             f"{path}: the drawing does not name its unit; give metres per unit: --plan-scale 0.001 for millimetres"
         )
-    unit_m = scale if scale is not None else float(units.conversion_factor(drawing.units, units.M))
+    unit_m = (
+        scale if scale is not None else float(units.conversion_factor(InsertUnits(drawing.units), InsertUnits.Meters))
+    )
     lines = [unit_m * line for line in _dxf_lines(drawing, _FLATNESS_M / unit_m)]
     if not lines:
         raise SourceError(f"{path}: the drawing shows no lines in its model space")
@@ -182,6 +185,7 @@ def _dxf_lines(drawing: Any, flatness: float) -> list[FloatArray]:
     hidden = {layer.dxf.name.lower() for layer in drawing.layers if layer.is_off() or layer.is_frozen()}
     shown = (entity for entity in drawing.modelspace() if entity.dxftype() not in _NOT_WALLS)
     lines: list[FloatArray] = []
+    entity: Any
     for entity in recursive_decompose(shown):
         if entity.dxftype() in _NOT_WALLS or entity.dxf.get("layer", "0").lower() in hidden:
             continue

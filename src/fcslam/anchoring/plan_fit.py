@@ -62,9 +62,7 @@ def map_submap(robots: Sequence[MappedRobot]) -> Submap:
     return build_submap(scans, np.inf)
 
 
-def fit_to_plan(
-    plan: FloorPlan, robots: Sequence[MappedRobot], graph: PoseGraph, T_plan_map: FloatArray
-) -> PlanFit:
+def fit_to_plan(plan: FloorPlan, robots: Sequence[MappedRobot], graph: PoseGraph, T_plan_map: FloatArray) -> PlanFit:
     """Fit a map to the plan, from an alignment.
 
     Args:

@@ -116,7 +116,8 @@ def map_recordings(
         float | None, typer.Option(metavar="M", help="Metres per pixel of the plan, or per unit of a DXF drawing.")
     ] = None,
     align: Annotated[
-        AlignTo | None, typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y.")
+        AlignTo | None,
+        typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y."),
     ] = None,
     config: ConfigFile = None,
     preset: PresetName = None,

@@ -169,11 +169,7 @@ def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> I
     cells = fft.next_fast_len(int(np.ceil(2.0 * (one.reach_m + other.reach_m) / CELL_M)) + 2, real=True)
     smear = _smear(cells)
     surface_a, worth_a = _spectra(one, 0.0, smear)
-    if headings is None:
-        lever_m = float(np.quantile(np.hypot(*other.surface.T), 0.9))
-        count = max(36, int(np.ceil(2.0 * np.pi * lever_m / (1.5 * CELL_M))))
-        headings = np.arange(count) * (2.0 * np.pi / count)
-    for heading in headings:
+    for heading in _all_headings(other) if headings is None else headings:
         surface_b, worth_b = _spectra(other, heading, smear)
         scores = fft.irfft2(worth_a * np.conj(surface_b) + surface_a * np.conj(worth_b), (cells, cells))
         for _ in range(PEAKS):
@@ -184,6 +180,12 @@ def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> I
             yield float(scores[row, column]), se2.compose(T_middle, np.append(-other.middle, 0.0))
             near = np.arange(-4, 5)
             scores[np.ix_((row + near) % cells, (column + near) % cells)] = -np.inf
+
+
+def _all_headings(drawing: _Drawing) -> FloatArray:
+    lever_m = float(np.quantile(np.hypot(*drawing.surface.T), 0.9))
+    count = max(36, int(np.ceil(2.0 * np.pi * lever_m / (1.5 * CELL_M))))
+    return np.asarray(np.arange(count) * (2.0 * np.pi / count), np.float64)
 
 
 def _smear(cells: int) -> NDArray[np.float32]:

@@ -188,13 +188,17 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
             metrics=read_metrics(path / METRICS),
             config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
             pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
-            map_files={file.name: file.read_bytes() for file in sorted((*path.glob("map*.*"), *path.glob("plan.*"))) if maps},
+            map_files={file.name: file.read_bytes() for file in _map_files(path) if maps},
             local_maps=_read_local_maps(path / LOCAL, robots) if maps else {},
             mission=(path / MISSION).read_bytes() if maps and (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
+
+
+def _map_files(folder: Path) -> list[Path]:
+    return sorted((*folder.glob("map*.*"), *folder.glob("plan.*")))
 
 
 @contextmanager
