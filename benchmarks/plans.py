@@ -26,7 +26,7 @@ import numpy as np
 from robustness import Recording
 
 from fcslam.anchoring.anchors import Anchors
-from fcslam.anchoring.plan import FloorPlan
+from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
 from fcslam.mission import MissionConfig, run_mission
@@ -100,7 +100,7 @@ def mapped(scans: dict[str, list[LaserScan]]) -> SavedMission:
 
 
 def in_plan(mission: SavedMission, plan: OccupancyMap | None) -> Run:
-    return run_mission([], MissionConfig(), onto=mission, anchors=Anchors(plan and FloorPlan(plan)))
+    return run_mission([], MissionConfig(), onto=mission, anchors=Anchors(plan and BuildingPlan(plan)))
 
 
 def longer_scan(scan: LaserScan) -> LaserScan:

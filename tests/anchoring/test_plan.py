@@ -8,7 +8,7 @@ import pytest
 from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 
 from fcslam.anchoring.anchors import Anchors, anchored
-from fcslam.anchoring.plan import FloorPlan
+from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.cloud.report import fuse_members, keyscan_track
 from fcslam.errors import SourceError
@@ -18,7 +18,7 @@ from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
 
 def placed(result, plan=None, to_walls=False, by_hand=(), fixes=None):
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-    anchors = Anchors(None if plan is None else FloorPlan(plan), to_walls)
+    anchors = Anchors(None if plan is None else BuildingPlan(plan), to_walls)
     return anchored(
         result, anchors, fixes or {}, tracks, by_hand, lambda members: fuse_members(members, OccupancyConfig())
     )

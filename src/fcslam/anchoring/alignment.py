@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.anchoring.plan import FloorPlan
+from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
 from fcslam.lidar.submap import SPACING_M, Submap, agreement
 from fcslam.lidar.uniqueness import align_map, is_elsewhere, two_best
@@ -63,7 +63,7 @@ class PlanAlignment:
         return ""
 
 
-def align_to_plan(plan: FloorPlan, building: Submap, placed: bool) -> PlanAlignment | None:
+def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAlignment | None:
     """Align a map with a plan: from all positions, and by the directions of walls or all headings.
 
     Args:

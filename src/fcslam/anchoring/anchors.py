@@ -9,7 +9,7 @@ import numpy as np
 from fcslam.anchoring.alignment import PlanAlignment, align_to_plan
 from fcslam.anchoring.deviations import Comparison, compare_with_plan
 from fcslam.anchoring.gnss import Georeference, georeferenced
-from fcslam.anchoring.plan import FloorPlan
+from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import Track
@@ -34,7 +34,7 @@ FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
 class Anchors:
     """What is known about the building."""
 
-    plan: FloorPlan | None = None
+    plan: BuildingPlan | None = None
     to_walls: bool = False
     """Turn maps that nothing else places, so that their walls run along x and y."""
 

@@ -19,7 +19,7 @@ _HERE: Final = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
-class FloorPlan:
+class BuildingPlan:
     """A floor plan; all coordinates are those of the plan."""
 
     drawing: OccupancyMap

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.anchoring.plan import FloorPlan
+from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.anchored import PosePrior, optimize_anchored
@@ -62,7 +62,7 @@ def map_submap(robots: Sequence[MappedRobot]) -> Submap:
     return build_submap(scans, np.inf)
 
 
-def fit_to_plan(plan: FloorPlan, robots: Sequence[MappedRobot], graph: PoseGraph, T_plan_map: FloatArray) -> PlanFit:
+def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGraph, T_plan_map: FloatArray) -> PlanFit:
     """Fit a map to the plan, from an alignment.
 
     Args:
@@ -120,7 +120,7 @@ def _scaled_keyscan(keyscan: Keyscan, scale: float) -> Keyscan:
 
 
 def _priors(
-    plan: FloorPlan, scans: Sequence[tuple[int, PointScan]], poses: FloatArray, wide_scale_m: float
+    plan: BuildingPlan, scans: Sequence[tuple[int, PointScan]], poses: FloatArray, wide_scale_m: float
 ) -> list[PosePrior]:
     """The poses of scans by the walls of the plan that they see."""
     priors = []
@@ -135,7 +135,7 @@ def _priors(
     return priors
 
 
-def _scale(plan: FloorPlan, own: Submap, T_plan_map: FloatArray) -> float:
+def _scale(plan: BuildingPlan, own: Submap, T_plan_map: FloatArray) -> float:
     """The factor that brings a robot's lengths into the scale of the plan; 1 if it is not clearly another.
 
     Beside the scale and the motion, the steps find by how much the walls of the plan are drawn too thick or too thin:

@@ -233,13 +233,13 @@ def map_sources(
 
 def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None) -> "Anchors":
     from fcslam.anchoring.anchors import Anchors
-    from fcslam.anchoring.plan import FloorPlan
+    from fcslam.anchoring.plan import BuildingPlan
     from fcslam.anchoring.plan_files import read_plan
     from fcslam.errors import InputError
 
     if plan is None and scale is not None:
         raise InputError("--plan-scale belongs to --plan; name the plan, or leave the scale out")
-    return Anchors(None if plan is None else FloorPlan(read_plan(plan, scale)), align is AlignTo.WALLS)
+    return Anchors(None if plan is None else BuildingPlan(read_plan(plan, scale)), align is AlignTo.WALLS)
 
 
 @contextmanager
