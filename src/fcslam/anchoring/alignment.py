@@ -1,10 +1,11 @@
 """Where a map lies in a floor plan: conclusive, or not at all and why not."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from fcslam.anchoring.lengths import lengths_in_plan
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
 from fcslam.lidar.submap import SPACING_M, Submap, agreement
@@ -13,7 +14,7 @@ from fcslam.records import FloatArray
 
 LEAST_EXPLAINED: Final = 0.7
 """Least share of the plan's surface in the known area of the map that the scans saw."""
-MOST_VIOLATION: Final = 0.2
+MOST_VIOLATION: Final = 0.25
 """Largest share of it that stands in free space of the map."""
 LEAST_SURFACE_M: Final = 25.0
 """Least length of the plan's surface that the scans saw, and of the map's surface that the plan has."""
@@ -23,6 +24,8 @@ LEAD: Final = 2.0
 """Least ratio of the score to that of the best alignment elsewhere."""
 LEAST_RIVAL_M: Final = 10.0
 """Score of an alignment elsewhere that is always assumed."""
+LEAST_THICKNESS_M, MOST_THICKNESS_M = 0.02, 0.15
+"""Walls that differ in thickness by this much on each side are drawn as lines of another width, or as one line."""
 DIRECTED: Final = 0.5
 """Least length of the mean direction of walls, modulo a right angle, from which headings are chosen."""
 
@@ -31,6 +34,8 @@ DIRECTED: Final = 0.5
 class PlanAlignment:
     """The best alignment of a map with a floor plan."""
 
+    plan: BuildingPlan
+    """The plan, with walls as thick as those of the map."""
     T_plan_map: FloatArray
     """Shape (3,), metres and radians."""
     explained: float
@@ -87,11 +92,16 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
             return None
         best, rival = found
         lead = best.score_m / max(LEAST_RIVAL_M, rival.score_m if rival is not None else 0.0)
+    thickness_m = lengths_in_plan(target, building, best.T_a_b).thickness_m
+    if LEAST_THICKNESS_M < abs(thickness_m) < MOST_THICKNESS_M:
+        plan = replace(plan, thickness_m=thickness_m)
+        target = plan.submap
+        best = align_map(target, building, best.T_a_b)
     of_plan = agreement(target, building, se2.inverse(best.T_a_b))
     of_map = agreement(building, target, best.T_a_b)
     surface_m = SPACING_M * min(of_plan.count, of_map.count)
     share = of_map.count / len(building.surface)
-    return PlanAlignment(best.T_a_b, of_plan.explained, of_plan.violation, surface_m, share, lead)
+    return PlanAlignment(plan, best.T_a_b, of_plan.explained, of_plan.violation, surface_m, share, lead)
 
 
 def _headings(plan: Submap, building: Submap) -> FloatArray | None:

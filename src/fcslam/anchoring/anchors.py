@@ -83,9 +83,9 @@ def anchored(
         if anchors.plan is not None:
             alignment = align_to_plan(anchors.plan, map_submap(part.robots), is_placed)
             if alignment is not None and not alignment.refusal:
-                fit = fit_to_plan(anchors.plan, part.robots, part.graph, alignment.T_plan_map)
+                fit = fit_to_plan(alignment.plan, part.robots, part.graph, alignment.T_plan_map)
                 part = _Part(fit.robots, fit.graph)
-                compared = compare_with_plan(anchors.plan.submap, map_submap(part.robots))
+                compared = compare_with_plan(alignment.plan.submap, map_submap(part.robots))
                 reports.append(_plan_report(k, alignment, compared, fit.scales))
                 pictures.append(fuse(part.robots))
             else:

@@ -1,6 +1,6 @@
 """A floor plan as a submap: the surfaces of its lines, to match scans with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -24,12 +24,15 @@ class BuildingPlan:
 
     drawing: OccupancyMap
     """Its lines are occupied, the other cells are free."""
+    thickness_m: float = 0.0
+    """By how much the sides of walls lie farther from their middle than they are drawn."""
 
     @cached_property
     def submap(self) -> Submap:
         """Surfaces on both sides of every line, without free space: a plan leaves out furniture, so what it lacks
         never speaks against it."""
         edges = _edges(self.drawing)
+        edges = replace(edges, points=edges.points + self.thickness_m * edges.normals)
         field = SurfelField(edges.points.mean(axis=0))
         field.insert(edges, _HERE)
         surface = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))

@@ -22,6 +22,8 @@ WIDEST_M: Final = 400.0
 """Largest width and height of a plan."""
 TEXT_M: Final = 0.5
 """Lines that are connected and no longer and no higher than this are text and symbols."""
+WALL_M: Final = 0.2
+"""Two lines this close together are the sides of one wall."""
 FAINTEST: Final = 30
 """Least difference of the darkest lines from the background, in grey levels of 255."""
 FAINT_SHARE: Final = 0.4
@@ -65,7 +67,7 @@ def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
             f"{path}: the plan is {width * plan.resolution_m:.0f} m by {height * plan.resolution_m:.0f} m, "
             f"{WIDEST_M:.0f} m at most are possible; check the scale, or crop the plan"
         )
-    cells = _without_text(plan.cells, plan.resolution_m)
+    cells = _solid(_without_text(plan.cells, plan.resolution_m), plan.resolution_m)
     if not (cells == Occupancy.OCCUPIED).any():
         raise SourceError(f"{path}: the plan shows no lines longer than {TEXT_M:g} m; check the scale and the colours")
     return OccupancyMap(frozen(cells, np.uint8), plan.resolution_m, plan.origin_xy)
@@ -137,6 +139,15 @@ def _without_text(cells: NDArray[np.uint8], cell_m: float) -> NDArray[np.uint8]:
     small = size_m <= TEXT_M
     small[0] = True
     return np.where(small[labels], Occupancy.FREE, Occupancy.OCCUPIED).astype(np.uint8)
+
+
+def _solid(cells: NDArray[np.uint8], cell_m: float) -> NDArray[np.uint8]:
+    """The cells with walls filled that are drawn as two lines, hatched or not."""
+    side = 2 * int(0.5 * WALL_M / cell_m) + 1  # an even one would shift the walls
+    margin = side + 1
+    padded = cv2.copyMakeBorder(cells, *4 * (margin,), cv2.BORDER_CONSTANT, value=int(Occupancy.FREE))
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    return np.asarray(closed[margin:-margin, margin:-margin], np.uint8)
 
 
 def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:

@@ -6,13 +6,14 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.anchoring.lengths import lengths_in_plan
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.anchored import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.lidar.field import CELL_M, EMPTY
-from fcslam.lidar.matching import OPPOSED, match_scan
+from fcslam.lidar.field import CELL_M
+from fcslam.lidar.matching import match_scan
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import FloatArray, Keyscan, frozen
@@ -27,15 +28,6 @@ FARTHEST_CHI2: Final = 11.3
 """A pose by the plan that is farther from the map's own is wrong: the 99 % quantile of three degrees of freedom."""
 ROUNDS: Final = 4
 """Matching and solving alternate this often."""
-LARGEST_SCALE: Final = 0.03
-"""Largest difference of a robot's scale from 1 that is found."""
-SIGNIFICANT: Final = 3.0
-"""A scale counts if it differs from 1 by this many standard deviations, and by ``LEAST_SCALE``."""
-LEAST_SCALE: Final = 1e-3
-_WIDTHS_M: Final = (0.4, 0.3, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.06, 0.06)
-"""Scales of the robust loss in the steps that find the scale."""
-_CORRELATED: Final = 20.0
-"""Points of a wall whose errors are those of one point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +63,7 @@ def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGr
         graph: the constraints of these robots alone.
         T_plan_map: where the map lies in the plan, shape (3,), metres and radians.
     """
-    found = {robot.robot: _scale(plan, map_submap([robot]), T_plan_map) for robot in robots}
+    found = {robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map).scale for robot in robots}
     middle = np.append(plan.submap.surface.points.mean(axis=0), 0.0)
     # A robot's poses grow about the middle of the plan; solving puts them right.
     scaled = [scaled_robot(robot, found[robot.robot]) for robot in robots]
@@ -133,44 +125,3 @@ def _priors(
         information = np.linalg.inv(covariance)
         priors.append(PosePrior(variable, found.T_field_base, 0.5 * (information + information.T)))
     return priors
-
-
-def _scale(plan: BuildingPlan, own: Submap, T_plan_map: FloatArray) -> float:
-    """The factor that brings a robot's lengths into the scale of the plan; 1 if it is not clearly another.
-
-    Beside the scale and the motion, the steps find by how much the walls of the plan are drawn too thick or too thin:
-    a plan of the middle lines of walls makes no building larger.
-    """
-    points, normals = se2.transform(T_plan_map, own.surface.points), own.surface.normals
-    if not len(points):
-        return 1.0
-    middle, field = points.mean(axis=0), plan.submap.field
-    motion, scale, thickness = np.zeros(3), 1.0, 0.0
-    variance = np.inf
-    for width_m in _WIDTHS_M:
-        cos, sin = np.cos(motion[2] + T_plan_map[2]), np.sin(motion[2] + T_plan_map[2])
-        arms = se2.transform(np.array([0.0, 0.0, motion[2]]), points - middle) * scale
-        at = arms + middle + motion[:2]
-        labels = field.nearest(at)
-        facing = normals @ np.array([[cos, sin], [-sin, cos]])
-        known = labels != EMPTY
-        surfels, its = field.points[labels[known]], field.normals[labels[known]]
-        apart, arms, facing = at[known] - surfels, arms[known], facing[known]
-        same = np.einsum("na,na->n", its, facing) > -OPPOSED
-        apart, arms, its = apart[same], arms[same], its[same]
-        if len(apart) < 50:
-            return 1.0
-        across = np.einsum("na,na->n", its, apart)
-        along2 = np.maximum(0.0, np.einsum("na,na->n", apart, apart) - across**2)
-        off = across - thickness
-        weight = (width_m**2 / (width_m**2 + off**2 + 0.25 * along2)) ** 2
-        J = np.column_stack((
-            its, its[:, 1] * arms[:, 0] - its[:, 0] * arms[:, 1], np.einsum("na,na->n", its, arms), -np.ones(len(its))
-        ))  # fmt: skip
-        H = J.T @ (weight[:, None] * J) + 1e-6 * np.eye(5)
-        step = -np.linalg.solve(H, J.T @ (weight * off))
-        motion, scale, thickness = motion + step[:3], scale * (1.0 + step[3]), thickness + step[4]
-        variance = _CORRELATED * float((weight * off**2).sum() / weight.sum()) * float(np.linalg.inv(H)[3, 3])
-    changed = abs(scale - 1.0)
-    clear = changed > max(LEAST_SCALE, SIGNIFICANT * variance**0.5) and changed <= LARGEST_SCALE
-    return float(scale) if clear else 1.0
