@@ -6,8 +6,8 @@
 Two robots drive 60 m each in a building of about 22 m by 17 m. Its plan is drawn in pixels of 2 cm, without half of the
 furniture, and has one wall 0.6 m from where it is; the wall is one that scans saw over 1.5 m or more, alone at its
 place. "worst wall" is the largest median distance of scan points from a wall of the building that at least 50 points
-show. "wrong plans" are those of the next two buildings. "size" is the scale of the trajectories against the truth (least
-squares), minus 1, if all ranges and the odometry are 1 % too long; "without" is the same map without a plan.
+show. "wrong plans" are those of the next two buildings. "size" is the scale of the trajectories against the truth
+(least squares), minus 1, if all ranges and the odometry are 1 % too long; "without" is the same map without a plan.
 
 Passed: nine of ten maps aligned, the worst wall off by at most 5 cm, no wrong plan accepted, the size right to 0.2 %,
 the moved wall found in nine of ten buildings, at most two false deviations in each; the script fails otherwise.

@@ -1,5 +1,7 @@
 """A building with walls, its plan, and a map of it by ideal scans."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 
@@ -12,8 +14,8 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap
 WALLS = np.array(
     [
         (0, 0, 16, 0), (16, 0, 16, 7), (16, 7, 11, 7), (11, 7, 11, 10), (11, 10, 0, 10), (0, 10, 0, 0),
-        (0, 6, 3, 6), (4.2, 6, 8, 6), (8, 6, 8, 10), (5, 0, 5, 3), (10, 0, 10, 2.5), (10, 3.8, 10, 7), (12, 3.8, 16, 3.8),
-        (2, 8, 3, 8.6),
+        (0, 6, 3, 6), (4.2, 6, 8, 6), (8, 6, 8, 10), (5, 0, 5, 3), (10, 0, 10, 2.5), (10, 3.8, 10, 7),
+        (12, 3.8, 16, 3.8), (2, 8, 3, 8.6),
     ],
     dtype=float,
 )  # fmt: skip
@@ -26,8 +28,8 @@ OTHER_WALLS = np.array(
     dtype=float,
 )  # fmt: skip
 """Those of another building."""
-PATH = [(1, 3), (4, 4.5), (3.6, 7.5), (6.5, 8.5), (3.6, 7), (4, 4.5), (8, 4.5), (9, 8.5), (9, 3.2), (11, 3), (15, 2), (11, 3),
-        (11, 5.5), (15, 5.5)]  # fmt: skip
+PATH = [(1, 3), (4, 4.5), (3.6, 7.5), (6.5, 8.5), (3.6, 7), (4, 4.5), (8, 4.5), (9, 8.5), (9, 3.2), (11, 3), (15, 2),
+        (11, 3), (11, 5.5), (15, 5.5)]  # fmt: skip
 LASER = LaserModel(360, -np.pi, np.radians(1.0), 20.0)
 STEP_M = 0.5
 CELL_M, MARGIN_M, THICKNESS_M = 0.02, 0.5, 0.12
@@ -53,14 +55,16 @@ def plan_of(walls=WALLS):
     columns, rows = np.ceil((high - low) / CELL_M).astype(int)
     cells = np.full((rows, columns), Occupancy.FREE, np.uint8)
     for corners in outlines(walls):
-        cv2.fillPoly(cells, [np.round(((corners - low) / CELL_M - 0.5) * 16).astype(np.int32)], int(Occupancy.OCCUPIED), shift=4)
+        cv2.fillPoly(
+            cells, [np.round(((corners - low) / CELL_M - 0.5) * 16).astype(np.int32)], int(Occupancy.OCCUPIED), shift=4
+        )
     return OccupancyMap(cells, CELL_M, (float(low[0]), float(low[1])))
 
 
 def true_poses():
     corners = np.array(PATH, float)
     legs = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / STEP_M)), endpoint=False)
-            for a, b in zip(corners, corners[1:], strict=False)]  # fmt: skip
+            for a, b in pairwise(corners)]  # fmt: skip
     xy = np.concatenate(legs)
     return np.column_stack((xy, np.linspace(0.0, 3.0, len(xy))))
 
@@ -83,7 +87,10 @@ def mapped(T_map_building=(3.0, -2.0, 0.6), scale=1.0, walls=WALLS, drift_rad=0.
     true = true_poses()
     rng, seen = np.random.default_rng(0), sides(walls)
     keyscans = tuple(
-        Keyscan(KeyscanId("anna", k), float(k), frozen(scale * (ranges_at(pose, seen) + rng.normal(0, 0.005, 360)), np.float32))
+        Keyscan(
+            KeyscanId("anna", k), float(k),
+            frozen(scale * (ranges_at(pose, seen) + rng.normal(0, 0.005, 360)), np.float32),
+        )
         for k, pose in enumerate(true)
     )  # fmt: skip
     steps = se2.relative(true) * (scale, scale, 1.0) + (0.0, 0.0, drift_rad / len(true))

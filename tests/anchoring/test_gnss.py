@@ -4,14 +4,14 @@ import json
 
 import numpy as np
 import pytest
-from tests.anchoring.test_plan import placed
-from tests.planned_building import mapped
 
 from fcslam.geometry import se2
 from fcslam.records import GnssFix, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.writer import write_bag
 from fcslam.sources.faults import Fault
+from tests.anchoring.test_plan import placed
+from tests.planned_building import mapped
 
 pyproj = pytest.importorskip("pyproj")
 

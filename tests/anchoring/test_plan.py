@@ -5,7 +5,6 @@ import json
 import cv2
 import numpy as np
 import pytest
-from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 
 from fcslam.anchoring.anchors import Anchors, anchored
 from fcslam.anchoring.plan import BuildingPlan
@@ -14,6 +13,7 @@ from fcslam.cloud.report import fuse_members, keyscan_track
 from fcslam.errors import SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
+from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 
 
 def placed(result, plan=None, to_walls=False, by_hand=(), fixes=None):
@@ -64,10 +64,10 @@ def test_the_plan_of_another_building_changes_nothing():
 
 def test_a_building_that_looks_the_same_from_behind_needs_a_placement_by_hand():
     middle = np.array((16.0, 10.0, 16.0, 10.0))
-    walls = np.array([(0, 0, 16, 0), (16, 0, 16, 10), (16, 10, 0, 10), (0, 10, 0, 0), (0, 6, 3, 6), (4.2, 6, 8, 6)], float)
+    walls = np.array(
+        [(0, 0, 16, 0), (16, 0, 16, 10), (16, 10, 0, 10), (0, 10, 0, 0), (0, 6, 3, 6), (4.2, 6, 8, 6)], float
+    )
     walls = np.concatenate((walls, middle - walls))
-    result, true = mapped((0.0, 0.0, 0.0), walls=walls)
-    result.robots[0].T_map_base  # the true poses, so that a user's placement is right
     unplaced, by_hand = placed(mapped(walls=walls)[0], plan_of(walls)), mapped((1.1, 3.2, 0.02), walls=walls)[0]
     assert "elsewhere" in report_of(unplaced)["reason"]
     assert report_of(placed(by_hand, plan_of(walls), by_hand={0}))["aligned"]
@@ -109,7 +109,9 @@ def picture(folder, colours=((255, 255, 255), (0, 0, 0)), name="plan.png"):
     return folder / name
 
 
-@pytest.mark.parametrize("colours", [((255, 255, 255), (0, 0, 0)), ((90, 40, 10), (255, 230, 200)), ((240, 250, 255), (160, 90, 60))])
+@pytest.mark.parametrize(
+    "colours", [((255, 255, 255), (0, 0, 0)), ((90, 40, 10), (255, 230, 200)), ((240, 250, 255), (160, 90, 60))]
+)
 def test_a_drawing_is_read_in_any_colours_without_its_text(tmp_path, colours):
     plan, true = read_plan(picture(tmp_path, colours), 0.02), plan_of()
     lines, expected = plan.cells == Occupancy.OCCUPIED, true.cells == Occupancy.OCCUPIED
