@@ -40,6 +40,7 @@ ROOMS = [
     "learning",
     "federated",
     "simulation",
+    "anchoring",
     "driving",
     "mission_file",
     "mission",

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import Track
 from fcslam.errors import EditError
 from fcslam.geometry import se2
-from fcslam.map_edits import moved_map, region_in_map, wall_direction
+from fcslam.map_edits import moved_map, region_in_map
 from fcslam.mission_file import EMPTY
 from fcslam.records import RegionUse, frozen
 from fcslam.runs import OccupancyMap, RobotTrajectory, Run

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fcslam import sources
+from fcslam.anchoring.anchors import Anchors
 from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.mission import Live, MissionConfig, Watch, continued_config, run_mission
+from fcslam.mission import NOTHING_KNOWN, Live, MissionConfig, Watch, continued_config, run_mission
 from fcslam.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.robot.calibrating import calibrated
@@ -46,6 +47,7 @@ def map_recordings(
     live: Live | None = None,
     floors: str | Mapping[str, str] = "",
     verify_pairs: VerifyPairs = verify_here,
+    anchors: Anchors = NOTHING_KNOWN,
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -76,6 +78,7 @@ def map_recordings(
             floors are never compared, so each floor has maps of its own.
         verify_pairs: where closures are verified, see ``fcslam.cluster.verifying.verifying``; it does not change
             the run.
+        anchors: what is known about the building, such as its floor plan.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -92,7 +95,7 @@ def map_recordings(
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
     watch, look = progress or (lambda _: None), live or (lambda _: None)
-    run = run_mission(robots, settings, watch, tuple(vetoes), drive, earlier, look, floors, verify_pairs)
+    run = run_mission(robots, settings, watch, tuple(vetoes), drive, earlier, look, floors, verify_pairs, anchors)
     if output is not None:
         run.save(output, force)
     return run

@@ -14,11 +14,13 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
+from fcslam.anchoring.anchors import Anchored, Anchors, anchored
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
-from fcslam.cloud.report import Track, keyscan_track, run_of, traffic_metrics
+from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
+from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.config import Settings, dump
@@ -29,7 +31,7 @@ from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.metrics.jumps import JumpLimits
 from fcslam.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
 from fcslam.places.matcher import MatchDecision
-from fcslam.records import Channel, Edit, Veto
+from fcslam.records import Channel, Edit, GnssFix, Placement, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
@@ -43,6 +45,8 @@ from fcslam.wire.messages import Packet, PacketKind
 from fcslam.wire.packets import Label, SizedPacket, decode, measure
 
 _log = logging.getLogger(__name__)
+
+NOTHING_KNOWN = Anchors()
 
 AUTHOR = "fcslam map"
 """The author of vetoes that are given with the recordings."""
@@ -106,6 +110,7 @@ def run_mission(
     live: Live = lambda _: None,
     floors: Mapping[str, str] = MappingProxyType({}),
     verify_pairs: VerifyPairs = verify_here,
+    anchors: Anchors = NOTHING_KNOWN,
 ) -> Run:
     """Map recordings together, one robot each.
 
@@ -121,6 +126,7 @@ def run_mission(
         floors: floor of each recording that has one, by its robot's name; places of different floors are never
             compared.
         verify_pairs: verifies pairs of submaps, here or elsewhere; the run is the same.
+        anchors: what is known about the building; it places the maps, and joins none.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
@@ -152,7 +158,7 @@ def run_mission(
             cloud.apply(sent)
             live(cloud)
     meter.report(fusing=True)
-    return cloud.run(meter.tracks, meter.scans, meter.recorded_s)
+    return cloud.run(meter.tracks, meter.scans, meter.recorded_s, anchors, meter.fixes)
 
 
 class MissionCloud:
@@ -233,13 +239,18 @@ class MissionCloud:
         metrics = traffic_metrics(self._traffic.ledger(), tracks)
         return run_of(result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False)
 
-    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
+    def run(
+        self, tracks: Mapping[str, Track], scans: int, recorded_s: float, anchors: Anchors = NOTHING_KNOWN,
+        fixes: Mapping[str, Sequence[GnssFix]] = MappingProxyType({}),
+    ) -> Run:  # fmt: skip
         """The result of all packets so far.
 
         Args:
             tracks: the scans of the sessions, in their order. Other sessions come first, with their keyscans alone.
             scans: number of scans.
             recorded_s: length of the recordings together, seconds.
+            anchors: what is known about the building.
+            fixes: positions by satellites, by robot.
         """
         result = self._cloud.finalize()
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
@@ -248,8 +259,21 @@ class MissionCloud:
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
         mission = mission_bytes(self._settings, self._edits, self._packets, self._refused, tracks)
-        run = run_of(result, tracks, metrics, dump(self.config), self.config.map)
+        placing = self._placed(result, tracks, anchors, fixes)
+        run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
+        run = replace(run, map_files={**run.map_files, **placing.files})
         return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
+
+    def _placed(
+        self, result: FleetResult, tracks: Mapping[str, Track], anchors: Anchors,
+        fixes: Mapping[str, Sequence[GnssFix]],
+    ) -> Anchored:  # fmt: skip
+        if anchors == NOTHING_KNOWN and not any(fixes.values()):
+            return Anchored(result)
+        by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
+        placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
+        own = {robot.robot: fixes.get(robot_of(robot.robot), ()) for robot in result.robots}
+        return anchored(result, anchors, own, tracks, placed, lambda members: fuse_members(members, self.config.map))
 
     @property
     def _settings(self) -> CloudConfig:
@@ -287,6 +311,8 @@ class _Meter:
         self.scans = self.keyscans = 0
         self._tracks: dict[str, dict[str, Track]] = {robot: {} for robot in robots}
         """By robot and session, of the robots that are done."""
+        self.fixes: dict[str, tuple[GnssFix, ...]] = {}
+        """By robot, of the robots that are done."""
 
     @property
     def tracks(self) -> dict[str, Track]:
@@ -310,6 +336,7 @@ class _Meter:
             self.report()
         else:
             self._tracks[leg.robot] |= leg.tracks
+            self.fixes[leg.robot] = self.fixes.get(leg.robot, ()) + leg.fixes
             self._faults[leg.robot] = leg.faults
 
     def take_over(self, onto: SavedMission) -> None:

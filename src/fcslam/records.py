@@ -192,7 +192,23 @@ class CameraImage:
     """Odometry at the stamp, shape (3,); None if unknown."""
 
 
-SensorRecord = LaserScan | Odometry | CameraImage
+@dataclass(frozen=True, slots=True)
+class GnssFix:
+    """A position by satellites."""
+
+    stamp: float
+    latitude_deg: float
+    """On the ellipsoid WGS 84."""
+    longitude_deg: float
+    altitude_m: float
+    """Above the ellipsoid; 0 if unknown."""
+    sigma_m: float
+    """Standard deviation, east and north each."""
+    antenna_xy: tuple[float, float] = (0.0, 0.0)
+    """Position of the antenna in ``base``, metres."""
+
+
+SensorRecord = LaserScan | Odometry | CameraImage | GnssFix
 """A record of one of a robot's sensors."""
 
 

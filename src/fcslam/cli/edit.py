@@ -300,7 +300,7 @@ def _matched(pairs: list[str]) -> tuple["FloatArray", float]:
 def _turned(run: "Run", map_index: int, to_walls: bool, degrees: float, shift: tuple[float, float]) -> "FloatArray":
     import numpy as np
 
-    from fcslam.map_edits import wall_direction
+    from fcslam.anchoring.walls import wall_direction
 
     walls_rad = wall_direction(run.maps[map_index]) if to_walls and map_index in run.maps else 0.0
     return np.array((*shift, math.radians(degrees) - walls_rad))

@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
@@ -47,6 +48,7 @@ from fcslam.cli.warm_up import compiled, cores
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.anchoring.anchors import Anchors
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lidar.pair_verification import VerifyPairs
     from fcslam.mission import MissionConfig, Progress
@@ -56,6 +58,12 @@ if TYPE_CHECKING:
     from fcslam.runs import Run
     from fcslam.sources import Source
     from fcslam.sources.faults import Faults
+
+
+class AlignTo(StrEnum):
+    """What maps can be aligned with."""
+
+    WALLS = "walls"
 
 
 def map_recordings(
@@ -96,6 +104,21 @@ def map_recordings(
             "all closures between two robots."
         ),
     ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PLAN",
+            help="Floor plan of the building: a picture (with --plan-scale), a DXF drawing, or the YAML file of a ROS "
+            "map. The map is aligned with it, and given in its coordinates.",
+        ),
+    ] = None,
+    plan_scale: Annotated[
+        float | None, typer.Option(metavar="M", help="Metres per pixel of the plan, or per unit of a DXF drawing.")
+    ] = None,
+    align: Annotated[
+        AlignTo | None,
+        typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y."),
+    ] = None,
     config: ConfigFile = None,
     preset: PresetName = None,
     scan_topic: ScanTopic = None,
@@ -133,6 +156,7 @@ def map_recordings(
             config, seed, no_fuse, fusion, continued_config(earlier), preset, start or (), start_sigma
         )
         vetoes = read_vetoes(veto) if veto else ()
+        anchors = _anchors(plan, plan_scale, align)
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
@@ -142,7 +166,7 @@ def map_recordings(
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers)
     with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:
-        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors, verify)
+        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors, verify, anchors)
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
@@ -172,6 +196,7 @@ def map_sources(
     page: "LiveMap | None" = None,
     floors: "Mapping[str, str]" = MappingProxyType({}),
     verify_pairs: "VerifyPairs | None" = None,
+    anchors: "Anchors | None" = None,
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
@@ -181,6 +206,7 @@ def map_sources(
         from fcslam import api
         from fcslam.cli.progress import ProgressDisplay
         from fcslam.lidar.pair_verification import verify_here
+        from fcslam.mission import NOTHING_KNOWN
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -194,7 +220,7 @@ def map_sources(
         run = api.map_recordings(
             sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier,
             live=None if page is None else page.look, floors=floors,
-            verify_pairs=verify_pairs or verify_here,
+            verify_pairs=verify_pairs or verify_here, anchors=anchors or NOTHING_KNOWN,
         )  # fmt: skip
         display.start("writing")
         run.save(output, force)
@@ -203,6 +229,17 @@ def map_sources(
     print_faults(console, faults)
     _report(answers(), run, time.perf_counter() - began, output, settings, earlier)
     return run
+
+
+def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None) -> "Anchors":
+    from fcslam.anchoring.anchors import Anchors
+    from fcslam.anchoring.plan import BuildingPlan
+    from fcslam.anchoring.plan_files import read_plan
+    from fcslam.errors import InputError
+
+    if plan is None and scale is not None:
+        raise InputError("--plan-scale belongs to --plan; name the plan, or leave the scale out")
+    return Anchors(None if plan is None else BuildingPlan(read_plan(plan, scale)), align is AlignTo.WALLS)
 
 
 @contextmanager
@@ -247,6 +284,7 @@ def _report(
 ) -> None:  # fmt: skip
     from rich.table import Table
 
+    from fcslam.anchoring.anchors import anchoring_lines
     from fcslam.cloud.sessions import robot_and_epoch
 
     values = {name: metric.value for name, metric in run.metrics.items()}
@@ -284,6 +322,8 @@ def _report(
         print_line(console, f"{maps} maps" if joined else f"{maps} maps: one for each robot")
     if joined:
         _print_separations(console, run)
+    for line in anchoring_lines(run.map_files):
+        print_line(console, line)
     for name in sorted(name for name in run.map_files if name.endswith(".png")):
         print_line(console, f"map: {output / name}")
 

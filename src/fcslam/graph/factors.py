@@ -83,6 +83,12 @@ class FactorCache:
             weights: one for each closure, in their order, shape (K,).
             poses: shape (N, 3); each connected component is anchored at the pose of its first variable.
         """
+        graph = self.floating(weights)
+        self._anchor(graph, weights > 0.0, poses)
+        return graph
+
+    def floating(self, weights: FloatArray) -> Any:
+        """As ``squared``, without an anchor."""
         self._update()
         graph = gtsam.NonlinearFactorGraph(self._trusted)
         scales = np.sqrt(weights)
@@ -92,7 +98,6 @@ class FactorCache:
                 graph.push_back(unit)
             elif scale > 0.0:
                 graph.push_back(next(scaled))
-        self._anchor(graph, weights > 0.0, poses)
         return graph
 
     def robust(self, loss: Loss, kept: NDArray[np.bool_], poses: FloatArray) -> Any:

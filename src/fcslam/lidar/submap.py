@@ -56,16 +56,17 @@ class Submap:
     """Row of each point of ``surface`` among the surfels of ``field``, shape (N,); None: they are not among them."""
 
 
-def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
+def build_submap(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float = RADIUS_M) -> Submap:
     """Build a submap.
 
     Args:
         scans: points in ``base`` and ``T_anchor_base``, shape (3,), metres and radians, of each scan.
+        radius_m: surfaces and free space farther than this from the anchor are left out.
 
     Returns:
         The submap in the anchor's base.
     """
-    near = [(_near(scan, pose), pose) for scan, pose in scans]
+    near = [(_near(scan, pose, radius_m), pose) for scan, pose in scans]
     field = field_of(near)
     rows = _spaced_rows(field.points)
     points = field.points[rows]
@@ -79,9 +80,9 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
     return Submap(field, surface, FreeSpace(passes > 0, corner), rows.astype(np.int16))
 
 
-def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
+def _near(scan: PointScan, T_anchor_base: FloatArray, radius_m: float) -> PointScan:
     """Returns a field cell apart, within the radius of the anchor (measured from the robot: the window is short)."""
-    radius_m = max(1.0, RADIUS_M - math.hypot(T_anchor_base[0], T_anchor_base[1]))
+    radius_m = max(1.0, radius_m - math.hypot(T_anchor_base[0], T_anchor_base[1]))
     return scan.thinned(CELL_M, radius_m=radius_m)
 
 

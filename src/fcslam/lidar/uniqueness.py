@@ -95,11 +95,14 @@ def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | No
     return max(rivals, key=lambda rival: rival.score_m, default=None)
 
 
-def two_best(a: Submap, b: Submap) -> tuple[MapAlignment, MapAlignment | None] | None:
+def two_best(
+    a: Submap, b: Submap, headings: FloatArray | None = None
+) -> tuple[MapAlignment, MapAlignment | None] | None:
     """The best alignment of two maps from all headings and all positions, and the best one elsewhere, if any.
 
     Args:
         a, b: maps, each in the coordinate frame of its anchor.
+        headings: headings of b in a, shape (H,), radians; None: all.
 
     Returns:
         The two alignments; None if a map is empty.
@@ -107,16 +110,18 @@ def two_best(a: Submap, b: Submap) -> tuple[MapAlignment, MapAlignment | None] |
     if not len(a.surface) or not len(b.surface):
         return None
     middle = b.surface.points.mean(axis=0, keepdims=True)
-    refined = [align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [])]
+    refined = [align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [], headings)]
     best = max(refined, key=lambda alignment: alignment.score_m)
     rivals = (rival for rival in refined if is_elsewhere(rival.T_a_b, best.T_a_b, middle))
     return best, max(rivals, key=lambda rival: rival.score_m, default=None)
 
 
-def _distinct_peaks(a: Submap, b: Submap, middle: FloatArray, known: list[FloatArray]) -> list[FloatArray]:
+def _distinct_peaks(
+    a: Submap, b: Submap, middle: FloatArray, known: list[FloatArray], headings: FloatArray | None = None
+) -> list[FloatArray]:
     """The best transforms of the exhaustive search that are elsewhere than each other and than the ``known`` ones."""
     distinct = list(known)
-    for _, pose in sorted(_coarse_peaks(a, b), key=lambda peak: -peak[0]):
+    for _, pose in sorted(_coarse_peaks(a, b, headings), key=lambda peak: -peak[0]):
         if all(is_elsewhere(pose, other, middle) for other in distinct):
             distinct.append(pose)
         if len(distinct) >= REFINED + len(known):
@@ -158,15 +163,13 @@ def _drawing(submap: Submap) -> _Drawing:
     return _Drawing(points - middle, inside, middle, reach_m)
 
 
-def _coarse_peaks(a: Submap, b: Submap) -> Iterator[tuple[float, FloatArray]]:
+def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> Iterator[tuple[float, FloatArray]]:
     """Score and T_a_b of the best positions for every heading, by correlation of images."""
     one, other = _drawing(a), _drawing(b)
     cells = fft.next_fast_len(int(np.ceil(2.0 * (one.reach_m + other.reach_m) / CELL_M)) + 2, real=True)
     smear = _smear(cells)
     surface_a, worth_a = _spectra(one, 0.0, smear)
-    lever_m = float(np.quantile(np.hypot(*other.surface.T), 0.9))
-    headings = max(36, int(np.ceil(2.0 * np.pi * lever_m / (1.5 * CELL_M))))
-    for heading in np.arange(headings) * (2.0 * np.pi / headings):
+    for heading in _all_headings(other) if headings is None else headings:
         surface_b, worth_b = _spectra(other, heading, smear)
         scores = fft.irfft2(worth_a * np.conj(surface_b) + surface_a * np.conj(worth_b), (cells, cells))
         for _ in range(PEAKS):
@@ -177,6 +180,12 @@ def _coarse_peaks(a: Submap, b: Submap) -> Iterator[tuple[float, FloatArray]]:
             yield float(scores[row, column]), se2.compose(T_middle, np.append(-other.middle, 0.0))
             near = np.arange(-4, 5)
             scores[np.ix_((row + near) % cells, (column + near) % cells)] = -np.inf
+
+
+def _all_headings(drawing: _Drawing) -> FloatArray:
+    lever_m = float(np.quantile(np.hypot(*drawing.surface.T), 0.9))
+    count = max(36, int(np.ceil(2.0 * np.pi * lever_m / (1.5 * CELL_M))))
+    return np.asarray(np.arange(count) * (2.0 * np.pi / count), np.float64)
 
 
 def _smear(cells: int) -> NDArray[np.float32]:

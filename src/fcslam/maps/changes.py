@@ -78,7 +78,7 @@ def compare(maps: Sequence[OccupancyMap], periods: Sequence[Period]) -> Changes:
     reach = max(1, round(TOLERANCE_M / now.resolution_m))
     compared = (then.cells != Occupancy.UNKNOWN) & (now.cells != Occupancy.UNKNOWN)
     was, is_ = then.cells == Occupancy.OCCUPIED, now.cells == Occupancy.OCCUPIED
-    masks = {APPEARED: compared & is_ & ~_grown(was, reach), DISAPPEARED: compared & was & ~_grown(is_, reach)}
+    masks = {APPEARED: compared & is_ & ~grown(was, reach), DISAPPEARED: compared & was & ~grown(is_, reach)}
     latest = _latest_change(maps)
     found: list[ChangedRegion] = []
     for kind, mask in masks.items():
@@ -103,7 +103,7 @@ def _regions(
     """The regions of a mask that are large enough, and their cells."""
     side = now.resolution_m
     count, labels = cv2.connectedComponents(
-        _grown(mask, max(1, round(JOINED_M / (2.0 * side)))).astype(np.uint8), connectivity=8
+        grown(mask, max(1, round(JOINED_M / (2.0 * side)))).astype(np.uint8), connectivity=8
     )
     kept, regions = np.zeros_like(mask), []
     rows, columns = np.nonzero(mask)
@@ -121,7 +121,7 @@ def _regions(
     return regions, kept
 
 
-def _grown(mask: Mask, cells: int) -> Mask:
+def grown(mask: Mask, cells: int) -> Mask:
     """The mask, grown to all cells within this many rows and columns."""
     side = 2 * cells + 1
     grown: Cells = np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)), np.uint8)

@@ -195,7 +195,7 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
             metrics=read_metrics(path / METRICS, path),
             config_yaml=read_text(path / CONFIG, path),
             pose_graph_g2o=read_text(path / POSE_GRAPH, path),
-            map_files={file.name: read_bytes(file, path) for file in sorted(path.glob("map*.*")) if maps},
+            map_files={file.name: read_bytes(file, path) for file in _map_files(path) if maps},
             local_maps=_read_local_maps(path, robots) if maps else {},
             quality={file.name: read_bytes(file, path) for file in sorted(path.glob(f"{QUALITY}*.*")) if maps},
             mission=read_bytes(path / MISSION, path) if maps and (path / MISSION).exists() else b"",
@@ -203,6 +203,10 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
+
+
+def _map_files(folder: Path) -> list[Path]:
+    return sorted((*folder.glob("map*.*"), *folder.glob("plan.*")))
 
 
 @contextmanager

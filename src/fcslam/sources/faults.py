@@ -27,6 +27,7 @@ class Fault(StrEnum):
     NO_STAMP = "scans without a stamp taken as 1 s apart"
     REPEATED_STAMP = "scans with the stamp of the scan before kept"
     NON_FINITE_RANGE = "ranges that are not finite made invalid"
+    FIX_AT_ZERO = "GNSS fixes at latitude 0, longitude 0 skipped"
     NEGATIVE_RANGE = "negative ranges made invalid"
 
 

@@ -5,7 +5,7 @@ from copy import copy
 from dataclasses import replace
 
 from fcslam.errors import SourceError
-from fcslam.records import LaserScan, SensorRecord
+from fcslam.records import GnssFix, LaserScan, SensorRecord
 from fcslam.sources.faults import Faults
 from fcslam.sources.pose import Pose, pose_array, relative_pose
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
@@ -50,6 +50,9 @@ class Part:
         """As in Source; the first record is a scan at the identity, and records before it are dropped."""
         origin: Pose | None = None
         for record in self._whole.records(self._within(scans)):
+            if isinstance(record, GnssFix):
+                yield record
+                continue
             pose: Pose | None = None if record.T_odom_base is None else tuple(record.T_odom_base.tolist())
             if origin is None and isinstance(record, LaserScan):
                 origin = pose

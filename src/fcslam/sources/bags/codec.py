@@ -16,6 +16,7 @@ LIVOX_CLOUDS = "livox_ros_driver/CustomMsg", "livox_ros_driver2/CustomMsg"
 SCANS = *LASER_SCANS, POINT_CLOUD, *LIVOX_CLOUDS
 COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
 CAMERA_INFO = "sensor_msgs/CameraInfo"
+FIX = "sensor_msgs/NavSatFix"
 """Message types that are read, as ROS 1 writes them."""
 OLD_TRANSFORMS = "tf/tfMessage"
 """The name of TRANSFORMS in early ROS 1."""

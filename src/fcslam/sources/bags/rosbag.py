@@ -5,6 +5,7 @@ scans are consistent; damaged messages are skipped and counted. A robot that sta
 shows that there is odometry.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -14,8 +15,9 @@ from typing import NamedTuple
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.records import CameraModel, Odometry, SensorRecord
+from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord
 from fcslam.sources.bags.codec import LASER_SCANS
+from fcslam.sources.bags.fixes import FixAtZeroError, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
@@ -54,6 +56,7 @@ class _Reading(NamedTuple):
     rig: Rig
     placeholders: tuple[tuple[float, ...], ...]
     """Values that are no ranges, of each laser."""
+    base_frame: str
 
 
 class RosBag:
@@ -95,12 +98,14 @@ class RosBag:
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
+        first_s, last_s = math.inf, -math.inf
         for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
                 if values := placeholders[entry.scan.laser]:
                     record = replace(record, ranges_m=without(record.ranges_m, values))
                 watch.add(number, record)
+                first_s, last_s = min(first_s, record.stamp), max(last_s, record.stamp)
                 yield record
             elif isinstance(entry, OdometryReading):
                 yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
@@ -109,6 +114,22 @@ class RosBag:
                     yield rig.image(entry)
                 except ValueError:
                     audit.add(Fault.BROKEN_IMAGE, number)
+        # Where the fixes are in the order does not matter: they are used when all scans are mapped.
+        yield from (fix for fix in self._fixes(audit) if first_s <= fix.stamp <= last_s)
+
+    def _fixes(self, audit: Audit) -> Iterator[GnssFix]:
+        stream = self.stream
+        topics = fix_topics(stream.robot)[:1]
+        for message in stream.bag.messages(topics) if topics else ():
+            try:
+                fix = fix_of(stream.bag.decode(message), message.bag_time_ns, stream.tree, self._reading.base_frame)
+            except FixAtZeroError:
+                audit.add(Fault.FIX_AT_ZERO, message.number)
+            except ValueError:
+                audit.add(Fault.BROKEN_MESSAGE, message.number)
+            else:
+                if fix is not None:
+                    yield fix
 
     def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         entries = self.stream.entries(audit, with_images=with_images)
@@ -174,7 +195,7 @@ class RosBag:
         )
         rig = rig_of([laser.first.beams for laser in self.stream.lasers], farthest_m, mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
-        return _Reading(survey, rig, placeholders)
+        return _Reading(survey, rig, placeholders, base_frame)
 
     def _leave_out_body(self, bodies: list[BodySample], mountings: list[Mounting]) -> list[str]:
         """Leave out the points of clouds up to the farthest one that is of the robot, with a note."""

@@ -14,12 +14,22 @@ from fcslam.records import (
     CameraImage,
     CameraModel,
     FloatArray,
+    GnssFix,
     GroundTruth,
     LaserScan,
     RecordedItem,
     Transform,
 )
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, ODOMETRY, SCAN, TRANSFORMS, MessageCodec, full_name
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    FIX,
+    ODOMETRY,
+    SCAN,
+    TRANSFORMS,
+    MessageCodec,
+    full_name,
+)
 from fcslam.sources.bags.transforms import in_space
 from fcslam.sources.images import image_suffix
 
@@ -32,7 +42,8 @@ BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
 """Formats of bags that can be written: ROS 1, two file formats of ROS 2, and a folder of ROS 2."""
 
 _ODOM, _BASE, _LASER, _CAMERA, _BUILDING = "odom", "base_link", "laser", "camera_optical_frame", "building"
-_SCAN_TOPIC = "/scan"
+_GNSS = "gnss"
+_SCAN_TOPIC, _FIX_TOPIC = "/scan", "/fix"
 _TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, _SCAN_TOPIC: SCAN}
 """Odometry first: at equal times it is read before the scan."""
 _IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
@@ -40,7 +51,9 @@ _IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
     "/camera/camera_info",
     "/ground_truth",
 )
-_TOPICS_OF_SOME = {_IMAGE_TOPIC: COMPRESSED_IMAGE, _CAMERA_INFO_TOPIC: CAMERA_INFO, _GROUND_TRUTH_TOPIC: ODOMETRY}
+_TOPICS_OF_SOME = {
+    _IMAGE_TOPIC: COMPRESSED_IMAGE, _CAMERA_INFO_TOPIC: CAMERA_INFO, _GROUND_TRUTH_TOPIC: ODOMETRY, _FIX_TOPIC: FIX,
+}  # fmt: skip
 """Topics that are created only if there is a message."""
 _IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31
@@ -120,6 +133,9 @@ class _Bag:
             header = self._codec.header(stamp_ns, _BUILDING)
             self._put(_GROUND_TRUTH_TOPIC, self._odometry(header, item.T_building_base))
             return
+        if isinstance(item, GnssFix):
+            self._put_fix(stamp_ns, item)
+            return
         if item.T_odom_base is not None and not np.isnan(item.T_odom_base).all():
             self._put_odometry(stamp_ns, item.T_odom_base)
         if isinstance(item, LaserScan):
@@ -157,6 +173,20 @@ class _Bag:
         self._put(_CAMERA_INFO_TOPIC, self._camera_info(header, image.camera))
         data = np.frombuffer(image.encoded, dtype=np.uint8)
         self._put(_IMAGE_TOPIC, self._codec.make(COMPRESSED_IMAGE, header=header, format=encoding, data=data))
+
+    def _put_fix(self, stamp_ns: int, fix: GnssFix) -> None:
+        header, make = self._codec.header(stamp_ns, _GNSS), self._codec.make
+        self._mount(stamp_ns, _GNSS, in_space(np.array((*fix.antenna_xy, 0.0))))
+        position = {"latitude": fix.latitude_deg, "longitude": fix.longitude_deg, "altitude": fix.altitude_m}
+        message = make(
+            FIX,
+            header=header,
+            status=make("sensor_msgs/NavSatStatus", status=0, service=1),
+            **position,
+            position_covariance=fix.sigma_m**2 * np.eye(3).ravel(),
+            position_covariance_type=2,
+        )
+        self._put(_FIX_TOPIC, message)
 
     def _mount(self, stamp_ns: int, frame: str, T_base_frame: Transform) -> None:
         """Write the mounting of a sensor once."""

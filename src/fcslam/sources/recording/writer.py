@@ -14,7 +14,16 @@ from pydantic import ValidationError
 
 from fcslam.errors import OutputError, SourceError
 from fcslam.geometry.beams import is_same_laser
-from fcslam.records import CameraImage, CameraModel, GroundTruth, LaserModel, LaserScan, Odometry, RecordedItem
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    GnssFix,
+    GroundTruth,
+    LaserModel,
+    LaserScan,
+    Odometry,
+    RecordedItem,
+)
 from fcslam.runs import write_tum
 from fcslam.sources.images import check_image, image_suffix
 from fcslam.sources.recording.layout import (
@@ -174,6 +183,8 @@ class RecordingWriter:
         truth.cut(truth.content(0, truth.size).rfind(b"\n") + 1)
 
     def _check(self, item: RecordedItem) -> None:
+        if isinstance(item, GnssFix):
+            raise OutputError(f"{self._folder}: a recording of this kind holds no GNSS fixes; write a bag")
         pose = item.T_building_base if isinstance(item, GroundTruth) else item.T_odom_base
         is_scan = isinstance(item, LaserScan)
         is_sound = pose is None or bool(np.isfinite(pose).all() or (is_scan and np.isnan(pose).all()))

@@ -1,0 +1,256 @@
+"""Places the maps of a result by what is known about the building. Which robots share a map is decided before."""
+
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fcslam.anchoring.alignment import PlanAlignment, align_to_plan
+from fcslam.anchoring.deviations import Comparison, compare_with_plan
+from fcslam.anchoring.gnss import Georeference, georeferenced
+from fcslam.anchoring.plan import BuildingPlan
+from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
+from fcslam.anchoring.walls import wall_direction
+from fcslam.cloud.report import Track
+from fcslam.cloud.result import FleetResult, MappedRobot
+from fcslam.geometry import se2
+from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.maps.changes import grown
+from fcslam.maps.drawing import highlighted_png
+from fcslam.records import FloatArray, GnssFix, frozen
+from fcslam.runs.map_files import Occupancy, OccupancyMap, map_stem
+
+PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
+GEOREFERENCE = "_georeference.json"
+"""End of the name of the file that says where a map lies on the earth."""
+ONLY_SCANS, ONLY_PLAN = "only in the scans", "only in the plan"
+
+FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
+"""The occupancy map of robots that share one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """What is known about the building."""
+
+    plan: BuildingPlan | None = None
+    to_walls: bool = False
+    """Turn maps that nothing else places, so that their walls run along x and y."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchored:
+    """A result in the coordinates of the building or of the earth."""
+
+    result: FleetResult
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    """Files of the run folder about it, by name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """The robots of one map, and the graph of these alone."""
+
+    robots: tuple[MappedRobot, ...]
+    """With the variables of this graph."""
+    graph: PoseGraph
+
+
+def anchored(
+    result: FleetResult,
+    anchors: Anchors,
+    fixes: Mapping[str, Sequence[GnssFix]],
+    tracks: Mapping[str, Track],
+    placed: Collection[int],
+    fuse: FuseMembers,
+) -> Anchored:
+    """Place each map by the floor plan, else by fixes, else by its walls.
+
+    Args:
+        result: the maps, each in a frame of its own.
+        anchors: what is known.
+        fixes: fixes of satellite navigation of each robot, by its sessions.
+        tracks: the scans of each session.
+        placed: maps that a user placed; they stay about there.
+        fuse: draws a map.
+    """
+    files: dict[str, bytes] = {}
+    reports, pictures = [], []
+    for k in sorted({robot.map_index for robot in result.robots}):
+        part, is_placed = _part(result, k), k in placed
+        alignment = None
+        if anchors.plan is not None:
+            alignment = align_to_plan(anchors.plan, map_submap(part.robots), is_placed)
+            if alignment is not None and not alignment.refusal:
+                fit = fit_to_plan(alignment.plan, part.robots, part.graph, alignment.T_plan_map)
+                part = _Part(fit.robots, fit.graph)
+                compared = compare_with_plan(alignment.plan.submap, map_submap(part.robots))
+                reports.append(_plan_report(k, alignment, compared, fit.scales))
+                pictures.append(fuse(part.robots))
+            else:
+                reports.append({"map": k, "aligned": False, "reason": _why(alignment)})
+        in_plan = alignment is not None and not alignment.refusal
+        own = {robot.robot: fixes[robot.robot] for robot in part.robots if fixes.get(robot.robot)}
+        found = georeferenced(part.robots, part.graph, own, tracks, is_fixed=in_plan or is_placed)
+        if found is not None:
+            part = _Part(found.robots, found.graph)
+            files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))
+        if anchors.to_walls and not in_plan and not is_placed and (found is None or found.refusal):
+            turn = np.array((0.0, 0.0, -wall_direction(fuse(part.robots))))
+            part = _moved(part, turn)
+        result = _with_part(result, k, part)
+    if anchors.plan is not None:
+        files[PLAN_JSON] = _json({"maps": reports})
+        files[PLAN_PNG] = _picture(anchors.plan.drawing, pictures)
+    return Anchored(result, files)
+
+
+def _why(alignment: PlanAlignment | None) -> str:
+    return "the map has no walls" if alignment is None else alignment.refusal
+
+
+def _part(result: FleetResult, k: int) -> _Part:
+    members = [robot for robot in result.robots if robot.map_index == k]
+    rows = _variables(members)
+    number = {variable: row for row, variable in enumerate(rows.tolist())}
+    edges = [
+        Edge(number[e.i], number[e.j], e.T_i_j, e.information, e.robust)
+        for e in result.graph.edges
+        if e.i in number and e.j in number
+    ]
+    robots = tuple(
+        replace(robot, variables=frozen(np.searchsorted(rows, robot.variables), np.int64)) for robot in members
+    )
+    return _Part(robots, PoseGraph(result.graph.poses()[rows], edges))
+
+
+def _variables(robots: Sequence[MappedRobot]) -> FloatArray:
+    return np.sort(np.concatenate([robot.variables for robot in robots]))
+
+
+def _moved(part: _Part, T: FloatArray) -> _Part:
+    robots = tuple(replace(robot, T_map_base=frozen(se2.compose(T, robot.T_map_base))) for robot in part.robots)
+    return _Part(robots, PoseGraph(se2.compose(T, part.graph.poses()), list(part.graph.edges)))
+
+
+def _with_part(result: FleetResult, k: int, part: _Part) -> FleetResult:
+    """The result with one map as it is in ``part``."""
+    before = {robot.robot: robot for robot in result.robots}
+    after = {robot.robot: replace(robot, variables=before[robot.robot].variables) for robot in part.robots}
+    rows = _variables(list(after.values()))
+    poses = result.graph.poses()
+    poses[rows] = part.graph.poses()
+    inside = set(rows.tolist())
+    own = iter(part.graph.edges)
+    edges = [
+        Edge(e.i, e.j, (same := next(own)).T_i_j, same.information, e.robust) if {e.i, e.j} <= inside else e
+        for e in result.graph.edges
+    ]
+    T_after_before = {
+        name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1]))
+        for name, robot in after.items()
+    }
+    corrections = tuple(
+        replace(c, T_map_odom=frozen(se2.compose(T_after_before[c.robot], c.T_map_odom))) if c.robot in after else c
+        for c in result.corrections
+    )
+    first = part.robots[0]
+    T = se2.compose(first.T_map_base[0], se2.inverse(before[first.robot].T_map_base[0]))
+    regions = tuple(
+        replace(region, polygon=frozen(se2.transform(T, region.polygon))) if region.map_index == k else region
+        for region in result.regions
+    )
+    robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
+    return replace(result, robots=robots, corrections=corrections, graph=PoseGraph(poses, edges), regions=regions)
+
+
+def _plan_report(
+    k: int, alignment: PlanAlignment, compared: Comparison, scales: Mapping[str, float]
+) -> dict[str, object]:
+    deviations = [
+        {
+            "kind": deviation.kind,
+            "start": [round(value, 3) for value in deviation.start],
+            "end": [round(value, 3) for value in deviation.end],
+            "length_m": round(deviation.length_m, 3),
+            "by_m": None if deviation.by_m is None else round(deviation.by_m, 3),
+        }
+        for deviation in compared.deviations
+    ]
+    return {
+        "map": k,
+        "aligned": True,
+        "walls_seen": round(alignment.explained, 3),
+        "confirmed_m": round(compared.confirmed_m, 1),
+        "mean_off_m": round(compared.mean_off_m, 4),
+        "scales": {robot: round(scale, 5) for robot, scale in scales.items()},
+        "deviations": deviations,
+    }
+
+
+def _geo_report(found: Georeference) -> dict[str, object]:
+    if found.refusal:
+        return {"georeferenced": False, "reason": found.refusal, "fixes": found.fixes, "ignored": found.ignored}
+    return {
+        "georeferenced": True,
+        "latitude_deg": round(found.latitude_deg, 9),
+        "longitude_deg": round(found.longitude_deg, 9),
+        "altitude_m": round(found.altitude_m, 3),
+        "x_axis_from_east_deg": round(float(np.degrees(found.heading_rad)), 6),
+        "fixes": found.fixes,
+        "ignored": found.ignored,
+    }
+
+
+def _json(content: object) -> bytes:
+    return (json.dumps(content, indent=2) + "\n").encode()
+
+
+def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
+    """The plan and the maps that lie in it, laid on each other."""
+    side = maps[0].resolution_m if maps else max(plan.resolution_m, 0.05)
+    corners = [_corners(one) for one in (plan, *maps)]
+    low = np.floor(np.min([corner[0] for corner in corners], axis=0) / side) * side
+    size = np.ceil((np.max([corner[1] for corner in corners], axis=0) - low) / side).astype(int) + 1
+    lines, walls, free = (np.zeros(size[::-1], bool) for _ in range(3))
+    for one, state, mask in ((plan, Occupancy.OCCUPIED, lines), *((m, Occupancy.OCCUPIED, walls) for m in maps),
+                             *((m, Occupancy.FREE, free) for m in maps)):  # fmt: skip
+        rows, columns = np.nonzero(one.cells == state)
+        at = (np.column_stack((columns, rows)) + 0.5) * one.resolution_m + np.array(one.origin_xy) - low
+        column, row = np.floor(at / side).astype(np.int64).T
+        mask[row, column] = True
+    cells = np.where(free, Occupancy.FREE, Occupancy.UNKNOWN).astype(np.uint8)
+    cells[walls] = Occupancy.OCCUPIED
+    near = max(1, round(0.1 / side))
+    union = OccupancyMap(cells, side, (float(low[0]), float(low[1])))
+    return highlighted_png(union, walls & ~grown(lines, near), lines & ~grown(walls, near), (ONLY_SCANS, ONLY_PLAN))
+
+
+def _corners(one: OccupancyMap) -> tuple[FloatArray, FloatArray]:
+    low = np.array(one.origin_xy)
+    return low, low + one.resolution_m * np.array(one.cells.shape[::-1])
+
+
+def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
+    """What the files of a run folder say about plan and fixes, one sentence a map."""
+    for report in json.loads(files[PLAN_JSON])["maps"] if PLAN_JSON in files else ():
+        if not report["aligned"]:
+            yield f"map {report['map']} is not aligned with the plan: {report['reason']}"
+            continue
+        scales = [f"lengths of {robot} x {scale:.4f}" for robot, scale in report["scales"].items() if scale != 1.0]
+        count = len(report["deviations"])
+        yield (
+            f"map {report['map']} is aligned with the plan: {report['confirmed_m']:.0f} m of walls confirmed, "
+            f"{', '.join([*scales, f'{count} walls differ ({PLAN_JSON})'])}"
+        )
+    for name, content in files.items():
+        if name.endswith(GEOREFERENCE):
+            report = json.loads(content)
+            count, ignored = report["fixes"], report["ignored"]
+            where = name.removesuffix(GEOREFERENCE)
+            if report["georeferenced"]:
+                at = f"{report['latitude_deg']:.7f}, {report['longitude_deg']:.7f}"
+                yield f"{where} has its origin at {at}; {count - ignored} of {count} fixes agree"
+            else:
+                yield f"{where} is not placed on the earth: {report['reason']}"

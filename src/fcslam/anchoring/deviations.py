@@ -1,0 +1,231 @@
+"""How a building differs from its floor plan: walls that are missing, new, or somewhere else."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from fcslam.lidar.field import EMPTY, SurfelField
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap
+from fcslam.records import FloatArray
+
+OFF_M: Final = 0.10
+"""A wall that is off by less stands where the plan has it."""
+AWAY_M: Final = 0.30
+"""A surface farther than this from any surface of the other map is not in that map."""
+SHORTEST_M: Final = 1.5
+"""Shortest wall that is missing or moved: shorter lines of a plan are furniture and doors."""
+SHORTEST_NEW_M: Final = 2.0
+"""Shortest new wall: shorter surfaces are furniture."""
+FARTHEST_M: Final = 2.0
+"""A missing wall that stands parallel within this distance has moved."""
+HIDDEN_M: Final = 1.0
+"""A new wall this close to a wall of the plan that no scan can see is that wall."""
+_STEPS: Final = 6
+"""Steps of ``SPACING_M`` to either side in which a wall is looked for."""
+JOINED_M: Final = 0.35
+"""Points of one wall are at most this far apart."""
+LEAST_OFF: Final = 0.3
+"""Least share of a wall's points with a wall close by, by which its distance is known."""
+PARALLEL: Final = 0.94
+"""Least cosine between the normals of one wall."""
+
+
+class DeviationKind(StrEnum):
+    """What happened to a wall."""
+
+    MISSING = "missing"
+    """It is in the plan, and scans passed through it."""
+    NEW = "new"
+    """It is not in the plan."""
+    MOVED = "moved"
+    """It stands parallel to its place in the plan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """A wall that is not as the plan has it; coordinates are those of the plan, metres."""
+
+    kind: DeviationKind
+    start: tuple[float, float]
+    """One end: of a moved wall, in the plan."""
+    end: tuple[float, float]
+    by_m: float | None = None
+    """How far a moved wall stands from its place."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the wall that differs."""
+        return math.dist(self.start, self.end)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """A map compared with the plan."""
+
+    deviations: tuple[Deviation, ...]
+    """The longest first."""
+    confirmed_m: float
+    """Length of the plan's surface that scans saw where the plan has it."""
+    mean_off_m: float
+    """Mean distance of the confirmed surface from the plan; NaN without any."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Wall:
+    """Points of one straight wall."""
+
+    points: FloatArray
+    normals: FloatArray
+    off_m: float | None
+    """Median distance of the other map's wall; None if there is none close by."""
+
+    @property
+    def normal(self) -> FloatArray:
+        """Direction across the wall, shape (2,)."""
+        _, vectors = np.linalg.eigh(self.normals.T @ self.normals)
+        return np.asarray(vectors[:, 1])
+
+    def along(self, tangent: FloatArray) -> tuple[float, float]:
+        """First and last coordinate along a direction."""
+        at = self.points @ tangent
+        return float(at.min()), float(at.max())
+
+    @property
+    def length_m(self) -> float:
+        """Length of the wall."""
+        start, end = self.ends()
+        return math.dist(start, end)
+
+    def ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        normal = self.normal
+        tangent = np.array((-normal[1], normal[0]))
+        first, last = self.along(tangent)
+        across = float(np.median(self.points @ normal))
+        start, end = across * normal + first * tangent, across * normal + last * tangent
+        return (float(start[0]), float(start[1])), (float(end[0]), float(end[1]))
+
+
+def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
+    """Find the walls of a building that differ from its plan.
+
+    Args:
+        plan: the plan.
+        building: the map, in the coordinates of the plan.
+    """
+    points, normals = plan.surface.points, plan.surface.normals
+    across = _across(points, normals, building.field)
+    confirmed, unseen = np.abs(across) <= OFF_M, np.isnan(across)
+    passed = unseen & _in_free(points, building) & (_distance(points, building) > AWAY_M)
+    unknown = _distance(building.surface.points, plan) > AWAY_M
+    new = list(_walls(building.surface.points, building.surface.normals, np.zeros(len(unknown)), unknown))
+    taken: set[int] = set()
+    found: list[Deviation] = []
+    for wall in _walls(points, normals, across, passed | (~unseen & ~confirmed)):
+        match = _moved(wall, new, FARTHEST_M)
+        if match is not None:
+            taken.add(match[0])
+        by_m = wall.off_m if wall.off_m is not None else match[1] if match is not None else None
+        kind = DeviationKind.MISSING if by_m is None else DeviationKind.MOVED
+        found.append(Deviation(kind, *wall.ends(), by_m))
+    # A wall of which scans see one side may hide its place in the plan.
+    hidden = [wall for wall in _walls(points, normals, across, unseen & ~passed) if wall.length_m >= SHORTEST_M]
+    for wall in (wall for k, wall in enumerate(new) if k not in taken and wall.length_m >= SHORTEST_NEW_M):
+        match = _moved(wall, hidden, HIDDEN_M)
+        if match is None:
+            found.append(Deviation(DeviationKind.NEW, *wall.ends()))
+        else:
+            found.append(Deviation(DeviationKind.MOVED, *hidden[match[0]].ends(), match[1]))
+    kept = [deviation for deviation in found if deviation.length_m >= SHORTEST_M]
+    kept.sort(key=lambda deviation: (-deviation.length_m, deviation.start))
+    mean_off_m = float(np.abs(across[confirmed]).mean()) if confirmed.any() else float("nan")
+    return Comparison(tuple(kept), SPACING_M * int(confirmed.sum()), mean_off_m)
+
+
+def _across(points: FloatArray, normals: FloatArray, field: SurfelField) -> FloatArray:
+    """Distance of the other map's surface from each point (N, 2) along its normal; NaN if there is none close by."""
+    across = np.full(len(points), np.nan)
+    for shift_m in sorted(np.arange(-_STEPS, _STEPS + 1) * SPACING_M, key=abs):
+        rows = np.flatnonzero(np.isnan(across))
+        labels = field.nearest(points[rows] + shift_m * normals[rows])
+        rows, labels = rows[labels != EMPTY], labels[labels != EMPTY]
+        apart = field.points[labels] - points[rows]
+        distance = np.einsum("na,na->n", apart, normals[rows])
+        beside2 = np.einsum("na,na->n", apart, apart) - distance**2
+        same = np.einsum("na,na->n", field.normals[labels], normals[rows]) > PARALLEL
+        same &= (beside2 < (2.0 * SPACING_M) ** 2) & (np.abs(distance - shift_m) <= SPACING_M)
+        across[rows[same]] = distance[same]
+    return across
+
+
+def _distance(points: FloatArray, other: Submap) -> FloatArray:
+    """Distance of each point (N, 2) from the nearest surface of the other map."""
+    if not len(other.field.points):
+        return np.full(len(points), np.inf)
+    return np.asarray(cKDTree(other.field.points).query(points)[0])
+
+
+def _in_free(points: FloatArray, building: Submap) -> NDArray[np.bool_]:
+    free = building.free
+    column, row = np.floor((points - free.corner) / FREE_CELL_M).astype(np.int64).T
+    inside = (row >= 0) & (column >= 0) & (row < free.cells.shape[0]) & (column < free.cells.shape[1])
+    result = np.zeros(len(points), bool)
+    result[inside] = free.cells[row[inside], column[inside]]
+    return result
+
+
+def _walls(points: FloatArray, normals: FloatArray, across: FloatArray, chosen: NDArray[np.bool_]) -> Iterator[_Wall]:
+    """The straight walls among the chosen points: both sides of a wall are one."""
+    rows = np.flatnonzero(chosen & np.any(normals != 0.0, axis=1))
+    if not len(rows):
+        return
+    xy, its = points[rows], normals[rows]
+    i, j = cKDTree(xy).query_pairs(JOINED_M, output_type="ndarray").T
+    facing = np.einsum("na,na->n", its[i], its[j])
+    # Along the wall, not across it: parallel walls close by are two.
+    beside = np.abs(np.einsum("na,na->n", xy[j] - xy[i], its[i]))
+    joined = (facing < -PARALLEL) | ((facing > PARALLEL) & (beside < OFF_M))
+    links = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(rows), len(rows)))
+    _, label = connected_components(links, directed=False)
+    order = np.argsort(label, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        off = np.abs(across[rows[members]])
+        off = off[off > OFF_M]  # false for NaN
+        its_off_m = float(np.median(off)) if len(off) >= LEAST_OFF * len(members) else None
+        yield _Wall(xy[members], its[members], its_off_m)
+
+
+def _moved(wall: _Wall, others: Sequence[_Wall], farthest_m: float) -> tuple[int, float] | None:
+    """The nearest of other walls that stands beside a wall, parallel to it, and how far it is; None if none does."""
+    normal = wall.normal
+    tangent = np.array((-normal[1], normal[0]))
+    first, last = wall.along(tangent)
+    best: tuple[int, float] | None = None
+    for number, other in enumerate(others):
+        low, high = other.along(tangent)
+        overlap = min(last, high) - max(first, low)
+        if abs(float(other.normal @ normal)) < PARALLEL or overlap < 0.5 * min(last - first, SHORTEST_M):
+            continue
+        by_m = _apart(wall, other, normal)
+        if by_m <= farthest_m and (best is None or by_m < best[1]):
+            best = number, by_m
+    return best
+
+
+def _apart(wall: _Wall, other: _Wall, normal: FloatArray) -> float:
+    """Distance of two parallel walls, side by side of the same facing if both have one."""
+    sides = []
+    for sign in (-1.0, 1.0):
+        faces = [its.points[sign * (its.normals @ normal) > 0.0] @ normal for its in (wall, other)]
+        if all(len(face) for face in faces):
+            sides.append(float(np.median(faces[1]) - np.median(faces[0])))
+    if not sides:
+        sides = [float(np.median(other.points @ normal) - np.median(wall.points @ normal))]
+    return abs(float(np.mean(sides)))

@@ -1,0 +1,61 @@
+"""A floor plan as a submap: the surfaces of its lines, to match scans with."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import cv2
+import numpy as np
+
+from fcslam.lidar.field import SurfelField
+from fcslam.lidar.scan import PointScan
+from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
+from fcslam.records import FloatArray
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+
+NORMAL_SIGMA_PX: Final = 2.0
+"""Blur of the drawing whose gradient gives the normals."""
+_HERE: Final = np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class BuildingPlan:
+    """A floor plan; all coordinates are those of the plan."""
+
+    drawing: OccupancyMap
+    """Its lines are occupied, the other cells are free."""
+    thickness_m: float = 0.0
+    """By how much the sides of walls lie farther from their middle than they are drawn."""
+
+    @cached_property
+    def submap(self) -> Submap:
+        """Surfaces on both sides of every line, without free space: a plan leaves out furniture, so what it lacks
+        never speaks against it."""
+        edges = _edges(self.drawing)
+        edges = replace(edges, points=edges.points + self.thickness_m * edges.normals)
+        field = SurfelField(edges.points.mean(axis=0))
+        field.insert(edges, _HERE)
+        surface = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
+        field.compact()
+        corner = surface.points.min(axis=0) - FREE_CELL_M
+        columns, rows = np.ceil((surface.points.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
+        return Submap(field, surface, FreeSpace(np.zeros((rows, columns), bool), corner))
+
+
+def _edges(drawing: OccupancyMap) -> PointScan:
+    """The middle of each side between a line's cell and a blank one, with a normal towards the blank."""
+    lines = np.pad(drawing.cells == Occupancy.OCCUPIED, 1)
+    blurred = cv2.GaussianBlur(lines.astype(np.float32), (0, 0), NORMAL_SIGMA_PX)
+    slope = np.stack((cv2.Sobel(blurred, cv2.CV_32F, 1, 0), cv2.Sobel(blurred, cv2.CV_32F, 0, 1)), axis=-1)
+    points, normals = [], []
+    for row_step, column_step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        step = np.array((column_step, row_step), dtype=np.float64)
+        blank = np.roll(~lines, (-row_step, -column_step), axis=(0, 1))
+        rows, columns = np.nonzero(lines & blank)
+        normal = -(slope[rows, columns] + slope[rows + row_step, columns + column_step]).astype(np.float64)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = np.where(length > 1e-6, normal / np.maximum(length, 1e-6), step)
+        points.append(np.column_stack((columns, rows)) - 0.5 + 0.5 * step)
+        normals.append(np.where((normal @ step > 0.0)[:, None], normal, step))
+    xy: FloatArray = np.concatenate(points) * drawing.resolution_m + drawing.origin_xy
+    return PointScan(xy, np.concatenate(normals), np.zeros(len(xy), bool), np.zeros(2))

@@ -1,0 +1,211 @@
+"""Reads floor plans: a drawing as PNG, a map of ROS, or a DXF drawing. Each becomes a grid of lines and blank area."""
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from fcslam.errors import SourceError
+from fcslam.records import FloatArray, frozen
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.runs.ros_map import parse_ros_map
+
+DXF_CELL_M: Final = 0.02
+"""Side of a cell in which a DXF drawing is drawn."""
+MOST_PIXELS: Final = 1 << 27
+"""Largest number of pixels of a plan; 230 m by 230 m in pixels of 2 cm."""
+WIDEST_M: Final = 400.0
+"""Largest width and height of a plan."""
+TEXT_M: Final = 0.5
+"""Lines that are connected and no longer and no higher than this are text and symbols."""
+WALL_M: Final = 0.2
+"""Two lines this close together are the sides of one wall."""
+FAINTEST: Final = 30
+"""Least difference of the darkest lines from the background, in grey levels of 255."""
+FAINT_SHARE: Final = 0.4
+"""Lines differ from the background by at least this share of the difference of the darkest ones: fills are fainter."""
+_COLOUR_STEP: Final = 16
+"""Colours in steps of this size are one colour where the background is found."""
+_SHIFT: Final = 4
+"""Fractional bits of the coordinates that OpenCV takes."""
+_FLATNESS_M: Final = 0.005
+"""Largest distance of an arc from the line segments that replace it."""
+_NOT_WALLS: Final = ("TEXT", "MTEXT", "ATTRIB", "ATTDEF", "DIMENSION", "LEADER", "MULTILEADER", "IMAGE", "WIPEOUT")
+"""Kinds of entities of a DXF drawing that show no walls."""
+
+
+def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
+    """Read a floor plan: occupied cells are its lines, the others are free. Its coordinates are those of the plan.
+
+    Args:
+        path: a PNG (or JPEG, BMP, TIFF) drawing, whose origin is its lower left corner; the YAML file of a ROS map; or
+            a DXF drawing.
+        scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
+
+    Raises:
+        SourceError: the file cannot be read, shows no lines, or its scale is missing or out of range.
+    """
+    if scale is not None and not 0.0 < scale < math.inf:
+        raise SourceError(f"--plan-scale {scale:g}: give metres per pixel, above 0")
+    try:
+        match path.suffix.lower():
+            case ".yaml" | ".yml":
+                plan = _ros_plan(path, scale)
+            case ".dxf":
+                plan = _dxf_plan(path, scale)
+            case _:
+                plan = _drawn_plan(path, scale)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from error
+    height, width = plan.cells.shape
+    if max(height, width) * plan.resolution_m > WIDEST_M:
+        raise SourceError(
+            f"{path}: the plan is {width * plan.resolution_m:.0f} m by {height * plan.resolution_m:.0f} m, "
+            f"{WIDEST_M:.0f} m at most are possible; check the scale, or crop the plan"
+        )
+    cells = _solid(_without_text(plan.cells, plan.resolution_m), plan.resolution_m)
+    if not (cells == Occupancy.OCCUPIED).any():
+        raise SourceError(f"{path}: the plan shows no lines longer than {TEXT_M:g} m; check the scale and the colours")
+    return OccupancyMap(frozen(cells, np.uint8), plan.resolution_m, plan.origin_xy)
+
+
+def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
+    if scale is not None:
+        raise SourceError(f"{path}: a map of ROS has its own resolution; leave --plan-scale out")
+    description = path.read_text(encoding="utf-8", errors="replace")
+    try:
+        content = yaml.safe_load(description)
+    except yaml.YAMLError:
+        content = None
+    if not isinstance(content, dict) or not isinstance(content.get("image"), str):
+        raise SourceError(f"{path}: no map of map_server; it names no image")
+    plan = parse_ros_map(str(path), (path.parent / content["image"]).read_bytes(), description)
+    cells = np.where(plan.cells == Occupancy.OCCUPIED, plan.cells, Occupancy.FREE).astype(np.uint8)
+    return OccupancyMap(cells, plan.resolution_m, plan.origin_xy)
+
+
+def _drawn_plan(path: Path, scale: float | None) -> OccupancyMap:
+    if scale is None:
+        raise SourceError(f"{path}: a picture has no scale; give metres per pixel, as in --plan-scale 0.02")
+    data = path.read_bytes()
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        pixels: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error:  # more pixels than OpenCV reads
+        pixels = None
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+    if pixels is None:
+        raise SourceError(f"{path}: no picture that can be read; save the plan as PNG, DXF or a ROS map (YAML)")
+    if pixels.shape[0] * pixels.shape[1] > MOST_PIXELS:
+        raise SourceError(f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} pixels; make it smaller or crop it")
+    cells = np.where(_lines(_colours(pixels)), Occupancy.OCCUPIED, Occupancy.FREE).astype(np.uint8)
+    return OccupancyMap(cells[::-1], scale, (0.0, 0.0))
+
+
+def _colours(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Eight bits per colour, shape (H, W, 3), on white paper."""
+    levels = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
+    if levels != 255:
+        pixels = np.clip(pixels.astype(np.float32) * (255.0 / levels), 0.0, 255.0).astype(np.uint8)
+    if pixels.ndim == 2:
+        return np.repeat(pixels[..., None], 3, axis=2)
+    if pixels.shape[2] == 4:
+        opaque = pixels[..., 3:].astype(np.float32) / 255.0
+        pixels = np.round(pixels[..., :3] * opaque + 255.0 * (1.0 - opaque)).astype(np.uint8)
+    return np.asarray(pixels[..., :3], np.uint8)
+
+
+def _lines(colours: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels that clearly differ from the background, the most frequent colour; shape (H, W)."""
+    rough = (colours // _COLOUR_STEP).astype(np.int32)
+    numbers = (rough[..., 0] * 256 + rough[..., 1]) * 256 + rough[..., 2]
+    known, counts = np.unique(numbers, return_counts=True)
+    background = np.median(colours[numbers == known[np.argmax(counts)]], axis=0)
+    difference = np.abs(colours.astype(np.float32) - background.astype(np.float32)).max(axis=2)
+    darkest = float(difference.max())
+    return np.asarray(difference >= max(FAINT_SHARE * darkest, FAINTEST))
+
+
+def _without_text(cells: NDArray[np.uint8], cell_m: float) -> NDArray[np.uint8]:
+    """The cells without connected lines that are too small for walls."""
+    lines = (cells == Occupancy.OCCUPIED).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(lines, connectivity=8)
+    size_m = cell_m * stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    small = size_m <= TEXT_M
+    small[0] = True
+    return np.where(small[labels], Occupancy.FREE, Occupancy.OCCUPIED).astype(np.uint8)
+
+
+def _solid(cells: NDArray[np.uint8], cell_m: float) -> NDArray[np.uint8]:
+    """The cells with walls filled that are drawn as two lines, hatched or not."""
+    side = 2 * int(0.5 * WALL_M / cell_m) + 1  # an even one would shift the walls
+    margin = side + 1
+    padded = cv2.copyMakeBorder(cells, *4 * (margin,), cv2.BORDER_CONSTANT, value=int(Occupancy.FREE))
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    return np.asarray(closed[margin:-margin, margin:-margin], np.uint8)
+
+
+def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
+    try:
+        import ezdxf
+        from ezdxf import units
+        from ezdxf.enums import InsertUnits
+    except ImportError as error:
+        raise SourceError(f"{path}: reading DXF needs ezdxf; install it: pip install 'fcslam[plans]'") from error
+    try:
+        drawing: Any = ezdxf.readfile(path)  # type: ignore[attr-defined]
+    except (ezdxf.DXFError, UnicodeDecodeError, ValueError) as error:  # type: ignore[attr-defined]
+        raise SourceError(f"{path}: no DXF drawing that can be read ({error}); save it as DXF again") from error
+    if scale is None and not drawing.units:
+        raise SourceError(
+            f"{path}: the drawing does not name its unit; give metres per unit: --plan-scale 0.001 for millimetres"
+        )
+    unit_m = (
+        scale if scale is not None else float(units.conversion_factor(InsertUnits(drawing.units), InsertUnits.Meters))
+    )
+    lines = [unit_m * line for line in _dxf_lines(drawing, _FLATNESS_M / unit_m)]
+    if not lines:
+        raise SourceError(f"{path}: the drawing shows no lines in its model space")
+    points = np.concatenate(lines)
+    low = np.floor(points.min(axis=0) - 1.0)
+    size_m = points.max(axis=0) + 1.0 - low
+    if size_m.max() > WIDEST_M:
+        raise SourceError(
+            f"{path}: the drawing is {size_m[0]:.0f} m by {size_m[1]:.0f} m, {WIDEST_M:.0f} m at most are possible; "
+            "check its unit (--plan-scale), or delete what lies far outside"
+        )
+    cell_m = DXF_CELL_M * max(1.0, math.ceil(math.sqrt(size_m.prod() / MOST_PIXELS) / DXF_CELL_M))
+    width, height = np.ceil(size_m / cell_m).astype(int).tolist()
+    cells = np.full((height, width), Occupancy.FREE, np.uint8)
+    for line in lines:
+        corners = np.round(((line - low) / cell_m - 0.5) * (1 << _SHIFT)).astype(np.int32)
+        cv2.polylines(cells, [corners], False, int(Occupancy.OCCUPIED), 1, cv2.LINE_8, _SHIFT)
+    return OccupancyMap(cells, cell_m, (float(low[0]), float(low[1])))
+
+
+def _dxf_lines(drawing: Any, flatness: float) -> list[FloatArray]:
+    """The visible lines of a drawing as polylines, shape (N, 2) each, in its units."""
+    from ezdxf import path as paths
+    from ezdxf.disassemble import recursive_decompose
+
+    hidden = {layer.dxf.name.lower() for layer in drawing.layers if layer.is_off() or layer.is_frozen()}
+    shown = (entity for entity in drawing.modelspace() if entity.dxftype() not in _NOT_WALLS)
+    lines: list[FloatArray] = []
+    entity: Any
+    for entity in recursive_decompose(shown):
+        if entity.dxftype() in _NOT_WALLS or entity.dxf.get("layer", "0").lower() in hidden:
+            continue
+        try:
+            found = paths.from_hatch(entity) if entity.dxftype() == "HATCH" else [paths.make_path(entity)]
+            for path in found:
+                corners = np.array([(point.x, point.y) for point in path.flattening(flatness)])
+                if len(corners) > 1 and np.isfinite(corners).all():
+                    lines.append(corners)
+        except TypeError:  # an entity that is no line
+            continue
+    return lines

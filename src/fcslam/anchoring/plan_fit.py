@@ -1,0 +1,127 @@
+"""A map fitted to a floor plan: the scale of each robot's ranges, and poses that the walls of the plan correct."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from fcslam.anchoring.lengths import lengths_in_plan
+from fcslam.anchoring.plan import BuildingPlan
+from fcslam.cloud.result import MappedRobot
+from fcslam.geometry import se2
+from fcslam.graph.anchored import PosePrior, optimize_anchored
+from fcslam.graph.pose_graph import PoseGraph
+from fcslam.lidar.field import CELL_M
+from fcslam.lidar.matching import match_scan
+from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.submap import Submap, build_submap
+from fcslam.records import FloatArray, Keyscan, frozen
+
+WEAK_M, WEAK_RAD = 0.05, 0.02
+"""Least standard deviations of a pose by the plan, which is no more precise, however many points agree."""
+POINT_SIGMA_M: Final = 0.15
+"""Standard deviation of a wall in the plan, per point of a scan: errors of a plan are the same for all its points."""
+LEAST_EXPLAINED: Final = 0.3
+"""Least share of a scan's points that lie on walls of the plan."""
+FARTHEST_CHI2: Final = 11.3
+"""A pose by the plan that is farther from the map's own is wrong: the 99 % quantile of three degrees of freedom."""
+ROUNDS: Final = 4
+"""Matching and solving alternate this often."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanFit:
+    """The robots of one map in the plan."""
+
+    robots: tuple[MappedRobot, ...]
+    """With poses in the plan and ranges in its scale."""
+    poses: FloatArray
+    """Poses of the variables of their graph, shape (N, 3)."""
+    graph: PoseGraph
+    """The graph in their scale, at these poses."""
+    scales: Mapping[str, float]
+    """Scale of each robot's lengths."""
+
+
+def map_submap(robots: Sequence[MappedRobot]) -> Submap:
+    """The whole map of robots that share one."""
+    scans = [
+        (keyscan_points(keyscan, robot.lasers), robot.T_map_base[row])
+        for robot in robots
+        for keyscan, row in zip(robot.keyscans, robot.numbers().tolist(), strict=True)
+    ]
+    return build_submap(scans, np.inf)
+
+
+def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGraph, T_plan_map: FloatArray) -> PlanFit:
+    """Fit a map to the plan, from an alignment.
+
+    Args:
+        plan: the floor plan.
+        robots: the robots of one map; their variables are those of ``graph``.
+        graph: the constraints of these robots alone.
+        T_plan_map: where the map lies in the plan, shape (3,), metres and radians.
+    """
+    found = {robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map).scale for robot in robots}
+    middle = np.append(plan.submap.surface.points.mean(axis=0), 0.0)
+    # A robot's poses grow about the middle of the plan; solving puts them right.
+    scaled = [scaled_robot(robot, found[robot.robot]) for robot in robots]
+    owner = np.zeros(len(graph), np.int64)
+    for number, robot in enumerate(robots):
+        owner[robot.variables] = number
+    lengths = np.array([found[robot.robot] for robot in robots])[owner]
+    edges = [
+        replace(edge, T_i_j=edge.T_i_j * np.array([lengths[edge.i] ** 0.5 * lengths[edge.j] ** 0.5] * 2 + [1.0]))
+        for edge in graph.edges
+    ]
+    poses = se2.compose(T_plan_map, graph.poses())
+    poses[:, :2] = middle[:2] + (poses[:, :2] - middle[:2]) * lengths[:, None]
+    graph = PoseGraph(poses, edges)
+    scans = [
+        (int(robot.variables[row]), keyscan_points(keyscan, robot.lasers).thinned(CELL_M))
+        for robot in scaled
+        for keyscan, row in zip(robot.keyscans, robot.numbers().tolist(), strict=True)
+    ]
+    for number in range(ROUNDS):
+        priors = _priors(plan, scans, poses, wide_scale_m=0.4 if number == 0 else 0.2)
+        if number:
+            priors = [prior for prior in priors if prior.chi2(poses) < FARTHEST_CHI2]
+        if not priors:
+            break
+        poses = optimize_anchored(graph, poses, priors)
+    scaled = [replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in scaled]
+    return PlanFit(tuple(scaled), poses, PoseGraph(poses, list(graph.edges)), found)
+
+
+def scaled_robot(robot: MappedRobot, scale: float) -> MappedRobot:
+    """The robot with its ranges and its own map in another scale."""
+    if scale == 1.0:
+        return robot
+    lengths = np.array((scale, scale, 1.0))
+    return replace(
+        robot,
+        keyscans=tuple(_scaled_keyscan(keyscan, scale) for keyscan in robot.keyscans),
+        lasers=tuple(replace(laser, max_range_m=laser.max_range_m * scale) for laser in robot.lasers),
+        T_local_base=frozen(robot.T_local_base * lengths),
+    )
+
+
+def _scaled_keyscan(keyscan: Keyscan, scale: float) -> Keyscan:
+    return replace(keyscan, ranges_m=frozen(keyscan.ranges_m * np.float32(scale), np.float32))
+
+
+def _priors(
+    plan: BuildingPlan, scans: Sequence[tuple[int, PointScan]], poses: FloatArray, wide_scale_m: float
+) -> list[PosePrior]:
+    """The poses of scans by the walls of the plan that they see."""
+    priors = []
+    for variable, scan in scans:
+        found = match_scan(scan, plan.submap.field, poses[variable], np.zeros((3, 3)), wide_scale_m=wide_scale_m)
+        if found.explained < LEAST_EXPLAINED:
+            continue
+        information = found.information * (0.03 / POINT_SIGMA_M) ** 2 + 1e-2 * np.eye(3)
+        covariance = np.linalg.inv(information) + np.diag((WEAK_M**2, WEAK_M**2, WEAK_RAD**2))
+        information = np.linalg.inv(covariance)
+        priors.append(PosePrior(variable, found.T_field_base, 0.5 * (information + information.T)))
+    return priors

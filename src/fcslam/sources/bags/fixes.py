@@ -1,0 +1,60 @@
+"""The fixes of a satellite receiver in a bag: sensor_msgs/NavSatFix."""
+
+from math import isfinite
+from typing import Any, Final
+
+from fcslam.records import GnssFix
+from fcslam.sources.bags.codec import FIX
+from fcslam.sources.bags.container import Topic
+from fcslam.sources.bags.messages import header_of
+from fcslam.sources.bags.robots import BagRobot
+from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
+
+SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
+"""Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
+stations."""
+LEAST_SIGMA_M: Final = 0.02
+_NO_FIX: Final = -1
+
+
+class FixAtZeroError(ValueError):
+    """Latitude and longitude are 0: the receiver has no fix, and does not say so."""
+
+
+def fix_topics(robot: BagRobot) -> list[Topic]:
+    """The topics of fixes of a robot, the one with most messages first."""
+    topics = [topic for topic in robot.topics if topic.type == FIX and topic.message_count]
+    return sorted(topics, key=lambda topic: (-topic.message_count, topic.name))
+
+
+def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | None:
+    """Convert a message; None if it states that there is no fix.
+
+    Raises:
+        FixAtZeroError: latitude and longitude are 0.
+        ValueError: a number is out of range.
+    """
+    if content.status.status <= _NO_FIX:
+        return None
+    latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
+    if latitude == 0.0 == longitude:
+        raise FixAtZeroError("latitude and longitude are 0")
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
+        raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are no position on the earth")
+    stamp, frame = header_of(content.header, bag_time_ns)
+    east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
+    sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
+    if content.position_covariance_type and 0.0 < east2 < 1e8 and 0.0 < north2 < 1e8:
+        sigma_m = max(LEAST_SIGMA_M, (0.5 * (east2 + north2)) ** 0.5)
+    return GnssFix(
+        stamp, latitude, longitude, altitude if isfinite(altitude) else 0.0, sigma_m, _antenna(tree, base_frame, frame)
+    )
+
+
+def _antenna(tree: TransformTree, base_frame: str, frame: str) -> tuple[float, float]:
+    """Where tf says that the antenna sits; in the middle of the robot if it does not."""
+    try:
+        x, y, _ = mounting(tree.fixed(base_frame, frame)).T_base_laser
+    except NoTransformError:
+        return 0.0, 0.0
+    return x, y

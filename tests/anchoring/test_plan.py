@@ -1,0 +1,174 @@
+"""A map is aligned with the plan of its building, in its scale, and with no other; what differs is listed."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from fcslam.anchoring.anchors import Anchors, anchored
+from fcslam.anchoring.plan import BuildingPlan
+from fcslam.anchoring.plan_files import read_plan
+from fcslam.cloud.report import fuse_members, keyscan_track
+from fcslam.errors import SourceError
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
+from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
+
+
+def placed(result, plan=None, to_walls=False, by_hand=(), fixes=None):
+    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+    anchors = Anchors(None if plan is None else BuildingPlan(plan), to_walls)
+    return anchored(
+        result, anchors, fixes or {}, tracks, by_hand, lambda members: fuse_members(members, OccupancyConfig())
+    )
+
+
+def report_of(placing):
+    (report,) = json.loads(placing.files["plan.json"])["maps"]
+    return report
+
+
+def off_m(placing, true):
+    (robot,) = placing.result.robots
+    return np.hypot(*(robot.T_map_base[:, :2] - true[:, :2]).T)
+
+
+@pytest.mark.parametrize("T", [(3.0, -2.0, 0.6), (0.0, 0.0, 0.0), (-40.0, 7.0, -2.5)])
+def test_a_map_is_given_in_the_coordinates_of_its_plan(T):
+    result, true = mapped(T, drift_rad=0.05)
+    placing = placed(result, plan_of())
+    assert report_of(placing)["aligned"]
+    assert off_m(placing, true).max() < 0.05
+    assert np.array_equal(placing.result.graph.poses(), placing.result.robots[0].T_map_base)
+
+
+@pytest.mark.parametrize("scale", [0.985, 1.01])
+def test_lengths_get_the_scale_of_the_plan(scale):
+    result, true = mapped(scale=scale)
+    placing = placed(result, plan_of())
+    assert report_of(placing)["scales"]["anna"] == pytest.approx(1.0 / scale, abs=0.001)
+    assert off_m(placing, true).max() < 0.05
+    (before,), (after,) = result.robots, placing.result.robots
+    assert after.keyscans[0].ranges_m / before.keyscans[0].ranges_m == pytest.approx(1.0 / scale, abs=0.001)
+
+
+def test_the_plan_of_another_building_changes_nothing():
+    result, _ = mapped()
+    placing = placed(result, plan_of(OTHER_WALLS))
+    report = report_of(placing)
+    assert not report["aligned"]
+    assert "needed" in report["reason"] or "allowed" in report["reason"]
+    assert np.array_equal(placing.result.robots[0].T_map_base, result.robots[0].T_map_base)
+
+
+def test_a_building_that_looks_the_same_from_behind_needs_a_placement_by_hand():
+    middle = np.array((16.0, 10.0, 16.0, 10.0))
+    walls = np.array(
+        [(0, 0, 16, 0), (16, 0, 16, 10), (16, 10, 0, 10), (0, 10, 0, 0), (0, 6, 3, 6), (4.2, 6, 8, 6)], float
+    )
+    walls = np.concatenate((walls, middle - walls))
+    unplaced, by_hand = placed(mapped(walls=walls)[0], plan_of(walls)), mapped((1.1, 3.2, 0.02), walls=walls)[0]
+    assert "elsewhere" in report_of(unplaced)["reason"]
+    assert report_of(placed(by_hand, plan_of(walls), by_hand={0}))["aligned"]
+
+
+def test_walls_that_moved_are_gone_or_are_new_are_listed():
+    walls = WALLS.copy()
+    walls[9] += (0.6, 0.0, 0.6, 0.0)  # moved
+    extra = np.array([(13.0, 0.0, 13.0, 2.5)])  # in the plan only
+    result, _ = mapped()
+    plan = np.concatenate((np.delete(walls, 12, axis=0), extra))  # 12 is new
+    found = {d["kind"]: d for d in report_of(placed(result, plan_of(plan)))["deviations"]}
+    assert set(found) == {"moved", "missing", "new"}
+    assert found["moved"]["by_m"] == pytest.approx(0.6, abs=0.05)
+    for kind, x, y in (("moved", 5.6, 1.5), ("missing", 13.0, 1.25), ("new", 14.0, 3.8)):
+        middle = 0.5 * (np.array(found[kind]["start"]) + found[kind]["end"])
+        assert np.hypot(*(middle - (x, y))) < 0.5, kind
+
+
+def test_walls_of_the_plan_that_stand_are_no_deviations():
+    assert report_of(placed(mapped()[0], plan_of()))["deviations"] == []
+
+
+def test_a_map_without_a_plan_can_be_turned_to_its_walls():
+    result, _ = mapped((3.0, -2.0, 0.3))
+    (robot,) = placed(result, to_walls=True).result.robots
+    turned = robot.T_map_base[0, 2] - 0.0  # the robot begins along the walls
+    assert (turned + np.pi / 4) % (np.pi / 2) - np.pi / 4 == pytest.approx(0.0, abs=0.005)
+
+
+def picture(folder, colours=((255, 255, 255), (0, 0, 0)), name="plan.png"):
+    """A drawing of the walls with a title, seen with the top at the largest y."""
+    background, ink = colours
+    lines = plan_of().cells[::-1] == Occupancy.OCCUPIED
+    pixels = np.full((*lines.shape, 3), background, np.uint8)
+    pixels[lines] = ink
+    cv2.putText(pixels, "Kitchen", (300, 150), cv2.FONT_HERSHEY_SIMPLEX, 0.6, ink, 1, cv2.LINE_AA)
+    cv2.imwrite(str(folder / name), pixels)
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    "colours", [((255, 255, 255), (0, 0, 0)), ((90, 40, 10), (255, 230, 200)), ((240, 250, 255), (160, 90, 60))]
+)
+def test_a_drawing_is_read_in_any_colours_without_its_text(tmp_path, colours):
+    plan, true = read_plan(picture(tmp_path, colours), 0.02), plan_of()
+    lines, expected = plan.cells == Occupancy.OCCUPIED, true.cells == Occupancy.OCCUPIED
+    assert np.array_equal(lines, expected)
+    assert plan.origin_xy == (0.0, 0.0)
+
+
+def test_a_map_of_ros_is_a_plan_in_its_own_coordinates(tmp_path):
+    true = plan_of()
+    (tmp_path / "map.pgm").write_bytes(pgm_bytes(true))
+    (tmp_path / "map.yaml").write_text(map_yaml(true, "map.pgm"))
+    plan = read_plan(tmp_path / "map.yaml")
+    assert np.array_equal(plan.cells, true.cells)
+    assert plan.origin_xy == pytest.approx(true.origin_xy)
+
+
+def drawing(folder, unit):
+    ezdxf = pytest.importorskip("ezdxf")
+    document = ezdxf.new()
+    document.units = unit
+    lengths = {6: 1.0, 4: 1000.0, 0: 1000.0}[unit]
+    for x1, y1, x2, y2 in (lengths * WALLS).tolist():
+        document.modelspace().add_line((x1, y1), (x2, y2))
+    document.modelspace().add_text("Kitchen", height=0.3 * lengths).set_placement((3.0 * lengths, 3.0 * lengths))
+    document.saveas(folder / "plan.dxf")
+    return folder / "plan.dxf"
+
+
+@pytest.mark.parametrize(("unit", "scale"), [(6, None), (4, None), (0, 0.001)])
+def test_a_drawing_of_lines_is_read_in_its_unit(tmp_path, unit, scale):
+    plan = read_plan(drawing(tmp_path, unit), scale)
+    rows, columns = np.nonzero(plan.cells == Occupancy.OCCUPIED)
+    at = np.column_stack((columns, rows)) * plan.resolution_m + plan.origin_xy
+    assert at.min(axis=0) == pytest.approx((0.0, 0.0), abs=0.03)
+    assert at.max(axis=0) == pytest.approx((16.0, 10.0), abs=0.03)
+
+
+def test_a_plan_that_cannot_be_used_gets_one_line(tmp_path):
+    blank = tmp_path / "blank.png"
+    cv2.imwrite(str(blank), np.full((50, 50), 255, np.uint8))
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    (tmp_path / "broken.dxf").write_text("no drawing")
+    cases = [
+        (picture(tmp_path), None, "--plan-scale 0.02"),
+        (picture(tmp_path), -1.0, "above 0"),
+        (picture(tmp_path), 10.0, "check the scale"),
+        (blank, 0.02, "no lines"),
+        (tmp_path / "broken.png", 0.02, "no picture"),
+        (tmp_path / "missing.png", 0.02, "cannot be read"),
+        (tmp_path / "missing.yaml", None, "cannot be read"),
+    ]
+    for path, scale, text in cases:
+        with pytest.raises(SourceError, match=text) as caught:
+            read_plan(path, scale)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_drawing_without_a_unit_gets_one_line(tmp_path):
+    with pytest.raises(SourceError, match="does not name its unit"):
+        read_plan(drawing(tmp_path, 0))
