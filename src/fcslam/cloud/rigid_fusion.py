@@ -1,11 +1,11 @@
 """Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps aligned by matched points.
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
-translation between the two, eqs. (5) and (6). The paper does not say which two. ``two_point`` takes the two most similar
-matches, ``first_two`` the first two to arrive; in both maps the two lie ``DIRECTION_M`` or more apart. No closure is
-doubted and nothing is optimised: a false match turns a whole map, and the drift within the robots' maps stays.
-``n_point`` is the same with all matched points, in the least squares sense. All are here to be compared with the joint
-graph.
+translation between the two, eqs. (5) and (6). The paper does not say which two. ``two_point`` takes the two most
+similar matches, ``first_two`` the first two to arrive; in both maps the two lie ``DIRECTION_M`` or more apart. No
+closure is doubted and nothing is optimised: a false match turns a whole map, and the drift within the robots' maps
+stays. ``n_point`` is the same with all matched points, in the least squares sense. All are here to be compared with the
+joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.

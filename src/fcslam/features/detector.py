@@ -110,7 +110,7 @@ class OnnxConfig(Settings):
         default=4.0, ge=0.0, le=64.0, description="side of the boxes of non-maximum suppression around keypoints [px]"
     )
     scales: tuple[Annotated[float, Field(gt=0.0, le=1.0)], ...] = Field(
-        default=(1.0,),
+        default=(1.0, 0.71, 0.5),
         min_length=1,
         max_length=8,
         description="scales of the image pyramid; the strongest keypoints of all scales together are kept",
