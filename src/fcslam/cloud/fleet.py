@@ -287,7 +287,8 @@ class Fleet:
         if session not in indices:
             return None
         quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
-        changes, members, pose_of = self._decisions.changes, self._decisions.map_of(session), self._graph.pose
+        changes, pose_of = self._decisions.changes, self._graph.pose
+        members: Sequence[str] = self._decisions.map_of(session)
         T_map_odom = self._graph.T_map_odom(session)
         if rigid:
             members = next(robots for robots in rigid.maps if session in robots)
