@@ -100,14 +100,20 @@ def test_the_strategy_changes_what_is_concluded_and_nothing_that_was_found(resul
             assert c.status in (ClosureStatus.ACCEPTED, ClosureStatus.VERIFIED)
 
 
-def test_two_points_of_each_further_robot_are_used(results):
+@pytest.mark.parametrize("strategy", [FusionStrategy.TWO_POINT, FusionStrategy.FIRST_TWO])
+def test_two_points_of_each_further_robot_are_used(results, strategy):
     """Three robots in one map are two relations."""
-    used = between(results[FusionStrategy.TWO_POINT], ClosureStatus.ACCEPTED)
+    used = between(results[strategy], ClosureStatus.ACCEPTED)
     assert len(used) == 4
     assert {c.reason for c in used} == {Reason(ReasonCode.MATCHED_POINT, 2)}
+
+
+def test_all_points_are_used_of_the_pairs_of_robots_that_join(results):
+    """The first two join the same pairs of robots."""
+    first = between(results[FusionStrategy.FIRST_TWO], ClosureStatus.ACCEPTED)
     every = between(results[FusionStrategy.N_POINT], ClosureStatus.ACCEPTED)
-    assert len(every) > len(used)
-    assert {(c.i, c.j) for c in used} <= {(c.i, c.j) for c in every}
+    assert len(every) > len(first)
+    assert {(c.i, c.j) for c in first} <= {(c.i, c.j) for c in every}
 
 
 @rigid
