@@ -385,7 +385,7 @@ def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log
     assert run_map(log, "--preset", "paper", "--fusion", "joint", "--output", tmp_path / "other") == 2
     assert capsys.readouterr().err.splitlines() == [
         "fcslam: the command line: fleet: matcher.decision similarity measures no transform, which the joint "
-        "graph needs; set fusion to two_point or n_point"
+        "graph needs; set fusion to two_point, first_two or n_point"
     ]
 
 

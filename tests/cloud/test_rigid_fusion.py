@@ -22,7 +22,7 @@ POSES = rectangle()
 A, B = ("a", POSES), ("b", POSES)
 LATER = 1000.0
 MEETINGS = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]
-RIGID = [FusionStrategy.TWO_POINT, FusionStrategy.N_POINT]
+RIGID = [FusionStrategy.TWO_POINT, FusionStrategy.FIRST_TWO, FusionStrategy.N_POINT]
 
 rigid = pytest.mark.parametrize("strategy", RIGID)
 
@@ -100,14 +100,20 @@ def test_the_strategy_changes_what_is_concluded_and_nothing_that_was_found(resul
             assert c.status in (ClosureStatus.ACCEPTED, ClosureStatus.VERIFIED)
 
 
-def test_two_points_of_each_further_robot_are_used(results):
+@pytest.mark.parametrize("strategy", [FusionStrategy.TWO_POINT, FusionStrategy.FIRST_TWO])
+def test_two_points_of_each_further_robot_are_used(results, strategy):
     """Three robots in one map are two relations."""
-    used = between(results[FusionStrategy.TWO_POINT], ClosureStatus.ACCEPTED)
+    used = between(results[strategy], ClosureStatus.ACCEPTED)
     assert len(used) == 4
     assert {c.reason for c in used} == {Reason(ReasonCode.MATCHED_POINT, 2)}
+
+
+def test_all_points_are_used_of_the_pairs_of_robots_that_join(results):
+    """The first two join the same pairs of robots."""
+    first = between(results[FusionStrategy.FIRST_TWO], ClosureStatus.ACCEPTED)
     every = between(results[FusionStrategy.N_POINT], ClosureStatus.ACCEPTED)
-    assert len(every) > len(used)
-    assert {(c.i, c.j) for c in used} <= {(c.i, c.j) for c in every}
+    assert len(every) > len(first)
+    assert {(c.i, c.j) for c in first} <= {(c.i, c.j) for c in every}
 
 
 @rigid
@@ -143,7 +149,7 @@ def test_true_matches_of_robots_without_drift_leave_no_error(scripted, strategy)
     result = feed(scripted(closures(A, B, MEETINGS), fusion=strategy), two_robots()).finalize()
     assert error_m(result) < 1e-3
     used = between(result, ClosureStatus.ACCEPTED)
-    assert len(used) == (2 if strategy is FusionStrategy.TWO_POINT else len(MEETINGS))
+    assert len(used) == (len(MEETINGS) if strategy is FusionStrategy.N_POINT else 2)
     assert {c.reason for c in between(result, ClosureStatus.VERIFIED)} <= {Reason(ReasonCode.UNUSED)}
 
 
@@ -279,6 +285,33 @@ def test_the_first_two_points_that_lie_apart_are_taken():
         own_maps(a=(0, 0, 0), b=(0, 0, 1)), FusionStrategy.TWO_POINT,
     )  # fmt: skip
     assert [c.status is ClosureStatus.ACCEPTED for c in fused.closures] == [True, False, True, False]
+
+
+def test_the_two_most_similar_points_that_lie_apart_are_taken():
+    """The third is as similar as the second but lies beside it; the first two to arrive are the least similar."""
+    lines = closures(A, B, [(0, 0), (8, 8), (16, 16), (16, 16), (24, 24)])
+    log = ClosureLog()
+    for line, similarity in zip(lines, (0.1, 0.2, 0.9, 0.8, 0.3), strict=True):
+        log.add(PlaceMatch.verified(line.i, line.j, Channel.LIDAR, similarity, verified(line), predicted=False))
+    used = {}
+    for strategy in FusionStrategy.TWO_POINT, FusionStrategy.FIRST_TWO:
+        fused = fuse_rigidly(log, own_maps(a=(0, 0, 0), b=(0, 0, 1)), strategy)
+        used[strategy] = [c.status is ClosureStatus.ACCEPTED for c in fused.closures]
+    assert used[FusionStrategy.TWO_POINT] == [False, False, True, False, True]
+    assert used[FusionStrategy.FIRST_TWO] == [True, True, False, False, False]
+
+
+@rigid
+def test_a_live_map_is_fused_as_the_finished_one(scripted, strategy):
+    """Robots without loops of their own: the live maps are those that are fused in the end."""
+    cloud = feed(scripted(by_words(MEETINGS), fusion=strategy), two_robots())
+    live, finished = cloud.fleet.estimate(), cloud.finalize()
+    assert map_of(live) == map_of(finished) == {"a": 0, "b": 0}
+    for now, then in zip(live.robots, finished.robots, strict=True):
+        assert np.allclose(se2.between(now.T_map_base, then.T_map_base), 0.0, atol=1e-6)
+    for now, then in zip(cloud.fleet.corrections(), finished.corrections, strict=True):
+        assert (now.robot, now.map_index) == (then.robot, then.map_index)
+        assert np.allclose(now.T_map_odom, then.T_map_odom, atol=1e-6)
 
 
 @rigid

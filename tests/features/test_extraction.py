@@ -191,3 +191,19 @@ def test_taking_some_takes_all_that_is_known_of_them(image):
     assert np.array_equal(some.scores, features.scores[[5, 2]])
     assert not some.descriptors.flags.writeable
     assert len(NO_FEATURES.take(slice(3)).scores) == 0
+
+
+def test_scales_of_the_command_line(images, tmp_path, capsys):
+    tiny_network(tmp_path / "n.onnx")
+    given = ["extract", str(images / "grey.png"), "--weights", str(tmp_path / "n.onnx"), "--keypoints", "50", "-o"]
+    for scales in ("1", "0.5", "1,0.5"):
+        assert main([*given, str(tmp_path / scales), "--scales", scales]) == 0
+    one, half, both = (read_features(tmp_path / scales / "grey.npz")[0] for scales in ("1", "0.5", "1,0.5"))
+    assert half.scores.max() <= 0.5
+    strongest = np.sort(np.concatenate((one.scores, half.scores)))[::-1][:50]
+    assert np.array_equal(both.scores, strongest)
+    capsys.readouterr()
+    for wrong in ("0", "2", "half"):
+        assert main([*given, str(tmp_path / "wrong"), "--scales", wrong]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("fcslam: the command line: scales.0: ")

@@ -94,6 +94,30 @@ def test_settings_bound_what_is_kept(weights):
     assert np.all(found.scores > 0.5)
 
 
+def test_keypoints_of_all_scales_are_in_pixels_of_the_image(weights):
+    """A flat square of 12 x 12 px is centred at (37.5, 21.5); half the size has the same centre."""
+    image = np.zeros((64, 96), np.uint8)
+    image[16:28, 32:44] = 200
+    image[20:24, 36:40] = 255
+    for scales in ((0.5,), (1.0, 0.5)):
+        found = OnnxDetector(OnnxConfig(weights=weights, scales=scales, nms_px=16)).detect(image)
+        centred = np.abs(found.keypoints_px - (37.5, 21.5)).max(axis=1) <= 1.0
+        assert centred.sum() >= len(scales)
+        assert (np.diff(found.scores) <= 0).all()
+    assert found.descriptors.shape == (len(found.scores), 32)
+
+
+def test_one_scale_of_a_pyramid_is_the_image_itself(weights):
+    image = np.random.default_rng(1).integers(0, 256, (120, 160), np.uint8)
+    plain = OnnxDetector(OnnxConfig(weights=weights, scales=(1.0,))).detect(image)
+    several = OnnxDetector(OnnxConfig(weights=weights, scales=(1.0, 0.25), most_features=2000)).detect(image)
+    ranks = {
+        tuple(point): code.tobytes() for point, code in zip(several.keypoints_px, several.descriptors, strict=True)
+    }
+    for point, code in zip(plain.keypoints_px, plain.descriptors, strict=True):
+        assert ranks[tuple(point)] == code.tobytes()
+
+
 @pytest.mark.parametrize(
     ("broken", "message"),
     [

@@ -36,8 +36,8 @@ def way(k=0):
     return np.array([(1.0, 1.0 + 0.5 * k, 0.0), (5.0, 1.0 + 0.5 * k, 0.0)])
 
 
-def match(i, j, channel=Channel.LIDAR, x=1.0):
-    return MatchedPlaces(ROBOTS[i], np.array((x, 1.0)), ROBOTS[j], np.array((x + 1.0, 2.0)), channel)
+def match(i, j, channel=Channel.LIDAR, x=1.0, accepted=True):
+    return MatchedPlaces(ROBOTS[i], np.array((x, 1.0)), ROBOTS[j], np.array((x + 1.0, 2.0)), channel, accepted)
 
 
 @pytest.fixture
@@ -123,6 +123,15 @@ def test_a_line_over_a_chart_rises_and_others_are_straight(charts):
     assert [rise > 1.0 for rise in rises] == [False, False, True, False]
 
 
+def test_every_match_that_is_not_accepted_is_a_line_of_its_own_color(charts):
+    many = [match(0, 1, x=1.0 + 0.1 * k, accepted=False) for k in range(2 * MATCHES_DRAWN)]
+    shown = replace(charts, matches=[match(0, 1), *many])
+    lines = [line for line in sheet(shown).lines if line.get_gid() == "unused"]
+    assert len(lines) == len(many)
+    assert LIDAR not in {line.get_color() for line in lines}
+    assert {"recognised by LiDAR: 1 closure", f"matched, not accepted: {len(many)}"} <= texts(shown)
+
+
 def test_closures_are_counted_by_channel(charts):
     assert {"recognised by LiDAR: 3 closures", "recognised by camera: 1 closure"} <= texts(charts)
     assert [text for text in texts(replace(charts, matches=[match(0, 1)])) if "camera" in text] == []
@@ -152,7 +161,7 @@ def test_lines_do_not_crowd_and_stay_under_the_titles(robots):
     names = [f"robot_{k}" for k in range(robots)]
     pairs = list(combinations(names, 2))
     xy = [np.array((x, 3.9)) for x in np.linspace(0.5, 5.5, 30)]
-    matches = [MatchedPlaces(i, at, j, at, Channel.LIDAR) for i, j in pairs for at in xy]
+    matches = [MatchedPlaces(i, at, j, at, Channel.LIDAR, True) for i, j in pairs for at in xy]
     trajectories = {name: way() for name in names}
     local = {name: Chart(hall(), {name: way()}) for name in names}
     charts = FleetCharts(local, Chart(hall(), trajectories), Chart(hall(), trajectories), matches)
@@ -232,8 +241,8 @@ def test_charts_of_a_run_folder(run_folder):
     np.testing.assert_allclose(
         charts.fused.place(charts.fused.trajectories["b"]), charts.building.trajectories["b"][:, :2], atol=1e-6
     )
-    ((robot_i, xy_i, robot_j, xy_j, channel),) = charts.matches
-    assert (robot_i, robot_j, channel) == ("a", "b", Channel.CAMERA)
+    ((robot_i, xy_i, robot_j, xy_j, channel, accepted),) = charts.matches
+    assert (robot_i, robot_j, channel, accepted) == ("a", "b", Channel.CAMERA, True)
     np.testing.assert_allclose((xy_i, xy_j), [(2.0, 0.0), (1.0, 0.0)])
 
 

@@ -36,6 +36,9 @@ def extract(
             show_default="4 for onnx, 0 for orb",
         ),
     ] = None,
+    scales: Annotated[
+        str, typer.Option(metavar="S,S,...", help="Scales of the image pyramid of a network.")
+    ] = "1,0.71,0.5",
     longest_side: Annotated[
         int, typer.Option(min=16, max=16384, help="Shrink larger images to this longest side, in pixels.")
     ] = 2048,
@@ -44,6 +47,7 @@ def extract(
 ) -> None:
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.config import changed
     from fcslam.errors import FeatureError
     from fcslam.features.classical import OrbConfig
     from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
@@ -54,7 +58,9 @@ def extract(
     kind = DetectorKind.ONNX if is_network else DetectorKind.ORB
     if weights is not None and not is_network:
         raise FeatureError(f"{weights}: detector orb has no weights; leave --weights out, or --detector")
-    onnx = OnnxConfig(weights=weights, most_features=keypoints, nms_px=4.0 if nms is None else nms, threads=threads)
+    nms_px = 4.0 if nms is None else nms
+    onnx = OnnxConfig(weights=weights, most_features=keypoints, nms_px=nms_px, threads=threads)
+    onnx = changed(onnx, {"scales": scales.split(",")}, "the command line")
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images

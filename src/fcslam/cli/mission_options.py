@@ -34,8 +34,8 @@ NoFuse = Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone an
 Fusion = Annotated[
     FusionStrategy | None,
     typer.Option(
-        help="How maps are fused. joint: one robust pose graph of all robots. two_point, n_point: rigid maps, "
-        "aligned on two or on all of their matched points.",
+        help="How maps are fused. joint: one robust pose graph of all robots. two_point, first_two, n_point: "
+        "rigid maps, aligned on the two most similar, the first two, or all of their matched points.",
         show_default=_FROM_CONFIG,
     ),
 ]

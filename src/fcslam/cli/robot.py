@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.learning_options import LearnConfig, RobotLearning
-from fcslam.cli.mission_options import ConfigFile, mission_config
+from fcslam.cli.mission_options import ConfigFile, PresetName, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices, print_line
 from fcslam.cli.recordings import (
@@ -157,6 +157,7 @@ def robot(
         ),
     ] = "max",
     config: ConfigFile = None,
+    preset: PresetName = None,
     token_file: TokenFile = None,
     ca: Ca = None,
     certificate: Certificate = None,
@@ -201,7 +202,7 @@ def robot(
     from fcslam.wire.keys import read_token
 
     keep_private()
-    settings = mission_config(config)
+    settings = mission_config(config, preset=preset)
     token = None if token_file is None else read_token(token_file)
     own = _own_certificate(certificate, key)
     if localize is None and initial_pose is not None:

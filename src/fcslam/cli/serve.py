@@ -8,10 +8,11 @@ import typer
 
 from fcslam.cli.learning_options import LearnConfig
 from fcslam.cli.listening import check_tls, is_loopback, listen
-from fcslam.cli.mission_options import ConfigFile, mission_config
+from fcslam.cli.mission_options import ConfigFile, PresetName, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
+from fcslam.presets import Preset
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,6 +56,7 @@ def serve(
         ),
     ] = None,
     config: ConfigFile = None,
+    preset: PresetName = None,
     learning: Annotated[
         Path | None,
         typer.Option(
@@ -126,7 +128,7 @@ def serve(
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
-        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
+        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config, preset)
         if store is None:
             state = _state(data, authenticator, given, learning, chosen)
         else:
@@ -238,8 +240,8 @@ def _state(
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
 
 
-def _cloud_config(file: Path | None) -> "CloudConfig":
+def _cloud_config(file: Path | None, preset: Preset | None) -> "CloudConfig":
     from fcslam.cloud.settings import CloudConfig
 
-    config = mission_config(file)
+    config = mission_config(file, preset=preset)
     return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)

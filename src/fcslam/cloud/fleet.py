@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
+from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
 from fcslam.cloud.edits import floors, is_removed, needs_new_fleet
@@ -195,8 +196,10 @@ class Fleet:
         sessions = self._present()
         poses: dict[str, FloatArray] = {session: frozen(self._graph.trajectory(session)) for session in sessions}
         own: dict[str, FloatArray] = {session: frozen(self._graph.chain(session)) for session in sessions}
-        entries = [e for e in self._decisions.closures if e.closure.i.robot in poses and e.closure.j.robot in poses]
-        fusion = Fusion(self._present_maps(), poses, own, tuple(entry.closure for entry in entries))
+        entries = self._present_closures()
+        fusion = self._rigid_fusion() or Fusion(
+            self._present_maps(), poses, own, tuple(entry.closure for entry in entries)
+        )
         return conclude(self._sessions, self._graph, entries, fusion, self._decisions.version, self._decisions.changes)
 
     def conclude(self) -> FleetResult:
@@ -241,12 +244,14 @@ class Fleet:
 
     def correction(self, session: str) -> Correction | None:
         """Where the session's odometry lies in its map by now; None if removed or without a keyscan."""
-        return self._correction(session, map_indices(self._present_maps()))
+        rigid = self._rigid_fusion()
+        return self._correction(session, map_indices(rigid.maps if rigid else self._present_maps()), rigid)
 
     def corrections(self) -> tuple[Correction, ...]:
         """The corrections of all sessions that are not removed."""
-        indices = map_indices(self._present_maps())
-        corrections = (self._correction(session, indices) for session in self._present())
+        rigid = self._rigid_fusion()
+        indices = map_indices(rigid.maps if rigid else self._present_maps())
+        corrections = (self._correction(session, indices, rigid) for session in self._present())
         return tuple(correction for correction in corrections if correction is not None)
 
     def vocabularies(self) -> tuple[VocabularyState, ...]:
@@ -265,13 +270,31 @@ class Fleet:
         """The maps of these; a removed session is in a map of its own."""
         return [map_ for map_ in self._decisions.maps if not is_removed(map_[0], self._decisions.changes)]
 
-    def _correction(self, session: str, indices: Mapping[str, int]) -> Correction | None:
+    def _present_closures(self) -> list[ClosureEntry]:
+        """The closures of sessions that are not removed."""
+        present = set(self._present())
+        return [e for e in self._decisions.closures if {e.closure.i.robot, e.closure.j.robot} <= present]
+
+    def _rigid_fusion(self) -> Fusion | None:
+        """The present rigid maps; None if all robots are in the joint graph."""
+        if self._config.fusion is FusionStrategy.JOINT:
+            return None
+        poses = {session: self._graph.trajectory(session) for session in self._present()}
+        own: dict[str, FloatArray] = {session: frozen(se2.between(T[0], T)) for session, T in poses.items()}
+        return fuse_rigidly(self._present_closures(), own, self._config.fusion)
+
+    def _correction(self, session: str, indices: Mapping[str, int], rigid: Fusion | None) -> Correction | None:
         if session not in indices:
             return None
         quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
+        changes, pose_of = self._decisions.changes, self._graph.pose
+        members: Sequence[str] = self._decisions.map_of(session)
         T_map_odom = self._graph.T_map_odom(session)
-        changes, members = self._decisions.changes, self._decisions.map_of(session)
-        T = T_placed_map(members, self._sessions, self._graph.pose, changes)
+        if rigid:
+            members = next(robots for robots in rigid.maps if session in robots)
+            pose_of = rigid.pose
+            T_map_odom = self._graph.T_map_odom(session, rigid.T_map_base[session][-1])
+        T = T_placed_map(members, self._sessions, pose_of, changes)
         T_map_odom = frozen(T_map_odom if T is None else se2.compose(T, T_map_odom))
         return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 

@@ -11,4 +11,6 @@ class FusionStrategy(StrEnum):
     N_POINT = "n_point"
     """Rigid maps, each pair aligned by all matched points in the least-squares sense."""
     TWO_POINT = "two_point"
-    """Rigid maps, each pair aligned by its first two matched points: the paper's eqs. (5)-(6)."""
+    """Rigid maps, each pair aligned by its two most similar matched points: the paper's eqs. (5)-(6)."""
+    FIRST_TWO = "first_two"
+    """As ``two_point``, but by the two matched points that arrived first."""

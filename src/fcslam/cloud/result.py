@@ -92,6 +92,11 @@ class Fusion:
     apart: Mapping[frozenset[str], Reason] = field(default_factory=dict)
     """Pairs of robots that must not share a map, because paths contradict each other."""
 
+    def pose(self, keyscan: KeyscanId) -> FloatArray:
+        """Pose of a keyscan in its map, shape (3,)."""
+        pose: FloatArray = self.T_map_base[keyscan.robot][keyscan.number]
+        return pose
+
 
 def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:
     """Number of each robot's map: the map of most robots is 0, and of two as large the one that started first."""
@@ -139,7 +144,7 @@ def conclude(
         for entry, closure in zip(closures, fusion.closures, strict=True)
         if closure.status is not ClosureStatus.ACCEPTED
     }
-    regions = placed_regions(index, sessions, lambda keyscan: _pose(fusion, keyscan), changes)
+    regions = placed_regions(index, sessions, fusion.pose, changes)
     return FleetResult(robots, fusion.closures, corrections, graph.held(fusion.T_map_base, left_out), regions)
 
 
@@ -147,12 +152,7 @@ def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change]) -
     """The same with every map where users want it."""
     T_map_base = dict(fusion.T_map_base)
     for members in fusion.maps:
-        T = T_placed_map(members, sessions, lambda keyscan: _pose(fusion, keyscan), changes)
+        T = T_placed_map(members, sessions, fusion.pose, changes)
         if T is not None:
             T_map_base |= {session: frozen(se2.compose(T, T_map_base[session])) for session in members}
     return replace(fusion, T_map_base=T_map_base)
-
-
-def _pose(fusion: Fusion, keyscan: KeyscanId) -> FloatArray:
-    pose: FloatArray = fusion.T_map_base[keyscan.robot][keyscan.number]
-    return pose

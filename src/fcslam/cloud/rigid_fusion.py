@@ -1,21 +1,23 @@
 """Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps aligned by matched points.
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
-translation between the two, eqs. (5) and (6). No closure is doubted and nothing is optimised: a false match turns a
-whole map, and the drift within the robots' maps stays. ``n_point`` is the same with all matched points, in the least
-squares sense. Both are here to be compared with the joint graph.
+translation between the two, eqs. (5) and (6). The paper does not say which two. ``two_point`` takes the two most
+similar matches, ``first_two`` the first two to arrive; in both maps the two lie ``DIRECTION_M`` or more apart. No
+closure is doubted and nothing is optimised: a false match turns a whole map, and the drift within the robots' maps
+stays. ``n_point`` is the same with all matched points, in the least squares sense. All are here to be compared with the
+joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
 Where words alone decide, no ``T_i_j`` is measured; it is zero, and the two positions are one as in the paper.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
+from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
@@ -43,15 +45,17 @@ class _Match:
 _Links = Mapping[tuple[str, str], Sequence[_Match]]
 
 
-def fuse_rigidly(closures: ClosureLog, T_local_base: Mapping[str, FloatArray], strategy: FusionStrategy) -> Fusion:
+def fuse_rigidly(
+    closures: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray], strategy: FusionStrategy
+) -> Fusion:
     """Every robot's own map (N, 3) moved as a whole, into the frame of the robot of its map that started first.
 
     ``T_local_base`` has the robots in the order in which they started. Whatever geometry verified between two robots
     and no veto excludes is a match, including closures that the joint map predicted. The closures that align two maps
     are accepted, the others stay verified; closures within robots keep their status.
     """
-    order = list(T_local_base)
-    matches = [_match(entry, T_local_base, order) for entry in closures if _is_valid(entry)]
+    order, entries = list(T_local_base), list(closures)
+    matches = [_match(entry, T_local_base, order) for entry in entries if _is_valid(entry)]
     links = _links(matches, strategy)
     maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
     used: dict[ClosureEntry, Reason] = {}
@@ -61,7 +65,7 @@ def fuse_rigidly(closures: ClosureLog, T_local_base: Mapping[str, FloatArray], s
     T_map_base: dict[str, FloatArray] = {
         robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
     }
-    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in closures))
+    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in entries))
 
 
 def _is_valid(entry: ClosureEntry) -> bool:
@@ -80,20 +84,24 @@ def _match(entry: ClosureEntry, T_local_base: Mapping[str, FloatArray], order: S
 def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
     """The matches that align the maps of each pair of robots; pairs in the order in which they had two."""
     known: dict[tuple[str, str], list[_Match]] = {}
-    first_two: dict[tuple[str, str], Sequence[_Match]] = {}
+    two: dict[tuple[str, str], Sequence[_Match]] = {}
+    if strategy is FusionStrategy.TWO_POINT:
+        matches = sorted(matches, key=lambda match: -match.entry.closure.similarity)
     for match in matches:
+        if match.robots in two and strategy is not FusionStrategy.N_POINT:
+            continue
         earlier = known.setdefault(match.robots, [])
         partner = next((other for other in earlier if match.is_distinct(other)), None)
         if partner is not None:
-            first_two.setdefault(match.robots, (partner, match))
+            two.setdefault(match.robots, (partner, match))
         earlier.append(match)
-    return first_two if strategy is FusionStrategy.TWO_POINT else {robots: known[robots] for robots in first_two}
+    return {robots: known[robots] for robots in two} if strategy is FusionStrategy.N_POINT else two
 
 
 def _relation(matches: Sequence[_Match], strategy: FusionStrategy) -> FloatArray:
     """T_a_b (3,) of two robots' own maps; NaN if the points contradict each other so much that no rotation is best."""
     # A robot may claim to be so far away that its two points are one to a computer.
-    align = two_point_alignment if strategy is FusionStrategy.TWO_POINT else n_point_alignment
+    align = n_point_alignment if strategy is FusionStrategy.N_POINT else two_point_alignment
     try:
         return align([match.xy_a for match in matches], [match.xy_b for match in matches])
     except ValueError:

@@ -21,7 +21,7 @@ class FleetConfig(Settings):
     )
     fusion: FusionStrategy = Field(
         default=FusionStrategy.JOINT,
-        description="how maps are fused: joint (one robust graph), rigid maps aligned by two_point or n_point",
+        description="how maps are fused: joint (one robust graph), or rigid maps by two_point, first_two or n_point",
     )
     sight_m: float = Field(
         default=6.0, gt=0, description="largest distance, in metres, at which places in the same map are compared"
@@ -68,7 +68,7 @@ class FleetConfig(Settings):
         if self.matcher.decision is MatchDecision.SIMILARITY and self.fusion is FusionStrategy.JOINT:
             raise ValueError(
                 "matcher.decision similarity measures no transform, which the joint graph needs; "
-                "set fusion to two_point or n_point"
+                "set fusion to two_point, first_two or n_point"
             )
         return self
 

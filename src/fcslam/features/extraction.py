@@ -4,11 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from fcslam.errors import FeatureError, OutputError
-from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures
+from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures, in_original, shrink
 from fcslam.features.files import read_grey, write_features
 from fcslam.features.nms import box_nms
 from fcslam.records import frozen
@@ -72,12 +71,7 @@ def extract(image: GreyImage, detector: FeatureDetector, longest_side_px: int) -
 
     Keypoints are in pixels of the original image.
     """
-    height, width = image.shape
-    share = longest_side_px / max(height, width)
-    if share >= 1.0:
-        return detector.detect(image)
-    size = (max(1, round(width * share)), max(1, round(height * share)))
-    found = detector.detect(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8))
-    scale = np.array([width / size[0], height / size[1]])
-    positions = (found.keypoints_px + 0.5) * scale - 0.5
+    shrunk = shrink(image, longest_side_px / max(image.shape))
+    found = detector.detect(shrunk)
+    positions = in_original(found.keypoints_px, shrunk, image)
     return ImageFeatures(frozen(positions, np.float32), found.scores, found.descriptors)

@@ -17,13 +17,15 @@ IDENTITY: Final = (0.0, 0.0, 0.0)
 
 
 class MatchedPlaces(NamedTuple):
-    """An accepted closure between two robots: the position of each in its own map, shape (2,), metres."""
+    """A verified closure between two robots: the position of each in its own map, shape (2,), metres."""
 
     robot_i: str
     xy_i: FloatArray
     robot_j: str
     xy_j: FloatArray
     channel: Channel
+    accepted: bool
+    """Whether the joint map uses it."""
 
 
 class Outline(NamedTuple):

@@ -41,7 +41,7 @@ SHADES: Final = 128
 FINE_PX: Final = 2.5
 """Walls of cells smaller than this are drawn one cell thicker."""
 MATCHES_DRAWN: Final = 15
-"""Most matches of one channel, shared by all pairs of robots; at least one for each pair."""
+"""Most accepted matches of one channel, shared by all pairs of robots; at least one for each pair."""
 BOW: Final = 0.15
 """Rise of a line that crosses a chart, as a share of its length."""
 TITLE_PT, TEXT_PT = 12.0, 9.5
@@ -88,17 +88,20 @@ def write_figure(charts: FleetCharts, path: Path) -> None:
 
 
 def draw_figure(charts: FleetCharts) -> "Figure":
-    """Draw the figure; each line between matched places has the gid ``match``."""
+    """Draw the figure; the lines of accepted matches have the gid ``match``, others ``unused``."""
     lower = _row((charts.fused, charts.building), MARGIN_PX + SCALE_PX)
     legend_px = _top(lower) + TITLE_PX
     upper = _row(tuple(charts.local.values()), legend_px + LEGEND_PX + NAME_PX)
     local = dict(zip(charts.local, upper, strict=True))
     lines = [(match.channel, _line(match, local)) for match in _chosen(charts)]
-    titles_px = max(_top(upper), *(line[:, 1].max() for _, line in lines), 0.0)
+    unused = [_line(match, local) for match in charts.matches if not match.accepted]
+    titles_px = max(_top(upper), *(line[:, 1].max() for line in (*unused, *(line for _, line in lines))), 0.0)
     figure, axes = _sheet(titles_px + TITLE_PX)
     colors = {robot: _hex(color) for robot, color in robot_colors(charts.local).items()}
     for panel in (*upper, *lower):
         _draw_chart(axes, panel, colors)
+    for line in unused:
+        axes.plot(*line.T, color=_hex(INK), linewidth=0.4, alpha=0.4, gid="unused")
     for channel, line in lines:
         color = _hex(CLOSURES[channel])
         axes.plot(*line.T, color=color, linewidth=0.9, alpha=0.85, gid="match")
@@ -115,7 +118,8 @@ def draw_figure(charts: FleetCharts) -> "Figure":
 
 def _chosen(charts: FleetCharts) -> list[MatchedPlaces]:
     pairs = math.comb(len(charts.local), 2)
-    return spread(charts.matches, max(1, MATCHES_DRAWN // max(1, pairs)))
+    accepted = [match for match in charts.matches if match.accepted]
+    return spread(accepted, max(1, MATCHES_DRAWN // max(1, pairs)))
 
 
 def _line(match: MatchedPlaces, local: Mapping[str, _Panel]) -> FloatArray:
@@ -217,13 +221,16 @@ def _draw_title(axes: "Axes", x: float, bottom_px: float, title: str, words: str
 
 
 def _draw_legend(axes: "Axes", y: float, matches: Sequence[MatchedPlaces]) -> None:
-    """At the left: the colour and the number of closures of each channel."""
+    """At the left: the colour and the number of accepted closures of each channel, and the number of the others."""
     left = float(MARGIN_PX)
     for channel, sensor in SENSORS.items():
-        if count := sum(match.channel is channel for match in matches):
+        if count := sum(match.channel is channel and match.accepted for match in matches):
             axes.plot((left, left + 60), (y, y), "o-", color=_hex(CLOSURES[channel]), linewidth=1.6, markersize=3.5)
             text = _write(axes, left + 80, y, f"recognised by {sensor}: {count} closure{'s' * (count > 1)}")
             left = text.get_window_extent().x1 + 60
+    if count := sum(not match.accepted for match in matches):
+        axes.plot((left, left + 60), (y, y), color=_hex(INK), linewidth=0.8, alpha=0.6)
+        _write(axes, left + 80, y, f"matched, not accepted: {count}")
 
 
 def _draw_scale(axes: "Axes", y: float, scale: float) -> None:

@@ -53,7 +53,7 @@ class MatcherConfig(Settings):
     decision: MatchDecision = Field(
         default=MatchDecision.GEOMETRY,
         description="what decides whether two places are the same. geometry: the overlap of their submaps; similarity: "
-        "at least delta (Algorithm 1 of FC-SLAM), for fleet.fusion two_point and n_point only",
+        "at least delta (Algorithm 1 of FC-SLAM), for a rigid fleet.fusion only",
     )
     delta: float = Field(
         default=0.85,

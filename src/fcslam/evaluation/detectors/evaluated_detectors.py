@@ -14,6 +14,7 @@ from fcslam.errors import EvaluationError
 from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift
 from fcslam.features.detector import (
     BUNDLED_NETWORK,
+    MATCHING_SCALES,
     GreyImage,
     ImageFeatures,
     KeypointDetector,
@@ -128,7 +129,7 @@ def one_thread() -> Iterator[None]:
 
 
 def _network(name: EvaluatedDetectorKind, weights: Path | None) -> EvaluatedDetector:
-    network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES))
+    network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES, scales=MATCHING_SCALES))
     if name is EvaluatedDetectorKind.LOGITS:
         return _run_here(f"{network.version}-logits", network.detect_floats)
     return _run_here(network.version, network.detect)

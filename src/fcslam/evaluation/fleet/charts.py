@@ -55,7 +55,7 @@ def _matches(run: Run) -> list[MatchedPlaces]:
     return [
         _match(closure, run.local_maps)
         for closure in run.closures
-        if closure.status is ClosureStatus.ACCEPTED and closure.robot_i != closure.robot_j
+        if closure.status in (ClosureStatus.ACCEPTED, ClosureStatus.VERIFIED) and closure.robot_i != closure.robot_j
     ]
 
 
@@ -63,7 +63,7 @@ def _match(closure: ClosureRow, local: Mapping[str, LocalMap]) -> MatchedPlaces:
     """Both ends of a closure, ordered by the robots' names."""
     ends = sorted([(closure.robot_i, closure.stamp_i), (closure.robot_j, closure.stamp_j)])
     (robot_i, xy_i), (robot_j, xy_j) = ((robot, _position(local[robot], stamp)) for robot, stamp in ends)
-    return MatchedPlaces(robot_i, xy_i, robot_j, xy_j, closure.channel)
+    return MatchedPlaces(robot_i, xy_i, robot_j, xy_j, closure.channel, closure.status is ClosureStatus.ACCEPTED)
 
 
 def _position(local: LocalMap, stamp: float) -> FloatArray:
