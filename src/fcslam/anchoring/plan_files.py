@@ -158,8 +158,8 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
     except ImportError as error:
         raise SourceError(f"{path}: reading DXF needs ezdxf; install it: pip install 'fcslam[plans]'") from error
     try:
-        drawing: Any = ezdxf.readfile(path)  # type: ignore[attr-defined]
-    except (ezdxf.DXFError, UnicodeDecodeError, ValueError) as error:  # type: ignore[attr-defined]
+        drawing: Any = ezdxf.readfile(path)
+    except (ezdxf.DXFError, UnicodeDecodeError, ValueError) as error:
         raise SourceError(f"{path}: no DXF drawing that can be read ({error}); save it as DXF again") from error
     if scale is None and not drawing.units:
         raise SourceError(
