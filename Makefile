@@ -9,7 +9,7 @@ DEMO ?= demo
 SECONDS ?= 60
 # What draws the pictures of simulated cameras where there is no display and no graphics card.
 GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
-HAS_GL := $(BIN)/python -c "from fcslam.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
+HAS_GL := $(BIN)/python -c "from fcslam.lab.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
 # A real ROS as the peer of tests, in an environment of its own: rclpy from PyPI, rospy and roscore from Debian.
@@ -100,7 +100,7 @@ test-system: $(INSTALLED)
 
 # A service and three robots that learn while they map; needs what `make learning` installs.
 test-learning: $(INSTALLED)
-	@$(PYTEST) -m system -rs tests/federated/test_learning_fleet.py
+	@$(PYTEST) -m system -rs tests/learning/federated/test_learning_fleet.py
 
 test-attack: $(INSTALLED)
 	@$(PYTEST) -m attack -rs

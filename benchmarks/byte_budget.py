@@ -23,8 +23,8 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
-from fcslam.mission import MissionConfig
+from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend

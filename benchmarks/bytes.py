@@ -23,10 +23,10 @@ import common
 import numpy as np
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.evaluation.fleet.closures import ClosureScope, evaluate_closures
-from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.closures import ClosureScope, evaluate_closures
+from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.metrics.closures import ClosureCriteria
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split

@@ -20,10 +20,10 @@ import common
 import numpy as np
 from closure_learning import ROBOTS, TEST, recorded
 
-from fcslam.evaluation.fleet.report import evaluate_fleet
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
+from fcslam.lab.evaluation.fleet.report import evaluate_fleet
 from fcslam.metrics.bootstrap import mean_interval
-from fcslam.mission import MissionCloud, MissionConfig, run_mission
+from fcslam.mission.mission import MissionCloud, MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, FloatArray
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.views import ViewsConfig

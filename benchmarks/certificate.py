@@ -13,11 +13,11 @@ import json
 import common
 import numpy as np
 
-from fcslam.evaluation.fleet.quality import judge
+from fcslam.lab.evaluation.fleet.quality import judge
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.maps.certificate import QUANTILE
-from fcslam.mission import MissionConfig, run_mission
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.sources.faults import Faults
 from fcslam.sources.source import WHOLE, Survey
 

@@ -49,29 +49,32 @@ import torch
 from matplotlib.figure import Figure
 
 from fcslam.cloud.teaching import HEAD_BYTES, RECORD_BYTES, PlacePoints, teach
-from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.evaluation.detectors.homography import evaluate_homography
-from fcslam.evaluation.detectors.measures import mean
-from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.evaluation.federated.mapped_drives import MappedDrive, Tie, map_drives, ties
-from fcslam.evaluation.federated.poison import PoisonedClient
-from fcslam.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
-from fcslam.evaluation.places.simulated_views import EVERY_M, EVERY_RAD, lidar_overlap
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.lidar_depth import LidarView
-from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
-from fcslam.federated.client_app import build_client_app
-from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.federated.flower import InProcessGrid
-from fcslam.federated.initial_weights import prepare_initial_weights
-from fcslam.federated.networks import weights_to_network, weights_version
-from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.weights import Weights
 from fcslam.geometry import se2
+from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
+from fcslam.lab.evaluation.detectors.homography import evaluate_homography
+from fcslam.lab.evaluation.detectors.measures import mean
+from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
+from fcslam.lab.evaluation.federated.mapped_drives import MappedDrive, Tie, map_drives, ties
+from fcslam.lab.evaluation.federated.poison import PoisonedClient
+from fcslam.lab.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
+from fcslam.lab.evaluation.places.simulated_views import EVERY_M, EVERY_RAD, lidar_overlap
+from fcslam.lab.simulation.options import Lighting
+from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
+from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
+from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+from fcslam.learning.federated.flower import InProcessGrid
+from fcslam.learning.federated.initial_weights import prepare_initial_weights
+from fcslam.learning.federated.networks import weights_to_network, weights_version
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights
 from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
@@ -85,14 +88,11 @@ from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.metrics.framing import HomographyGroundTruth
 from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan
 from fcslam.robot.frontend import RobotConfig
-from fcslam.simulation.options import Lighting
-from fcslam.simulation.recording import prepare_fleet_folder, record_robot
-from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.sources import Recording
 
 TRAIN, TEST, SEEDS = tuple(range(301, 311)), tuple(range(411, 421)), (1, 2, 3)

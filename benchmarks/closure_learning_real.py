@@ -32,19 +32,19 @@ import cv2
 import numpy as np
 from closure_learning import FORGETTING, Learner, federated, photograph_rows, ranked, trained_here
 
-from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_images
-from fcslam.evaluation.places.report import evaluate_set
-from fcslam.evaluation.places.scoring import DescribedSet, strategy_scorer
-from fcslam.evaluation.places.sets import PlaceSet, read_place_set
-from fcslam.evaluation.places.tum_sequence import Sequence as TumSequence
-from fcslam.evaluation.places.tum_sequence import read_sequence
-from fcslam.evaluation.places.verification import PairVerifier
-from fcslam.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_overlap
 from fcslam.features.detector import BUNDLED_NETWORK, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.files import read_grey
-from fcslam.federated.initial_weights import prepare_initial_weights
-from fcslam.federated.live_settings import LiveRounds
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_images
+from fcslam.lab.evaluation.places.report import evaluate_set
+from fcslam.lab.evaluation.places.scoring import DescribedSet, strategy_scorer
+from fcslam.lab.evaluation.places.sets import PlaceSet, read_place_set
+from fcslam.lab.evaluation.places.tum_sequence import Sequence as TumSequence
+from fcslam.lab.evaluation.places.tum_sequence import read_sequence
+from fcslam.lab.evaluation.places.verification import PairVerifier
+from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_overlap
 from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.initial_weights import prepare_initial_weights
+from fcslam.learning.federated.live_settings import LiveRounds
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair

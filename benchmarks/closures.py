@@ -16,7 +16,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.evaluation.fleet.closures import STAGES, ClosureReport, ClosureScope, closure_metrics, evaluate_closures
+from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureReport, ClosureScope, closure_metrics, evaluate_closures
 from fcslam.metrics.closures import ClosureCriteria
 
 SETS = {"log": "", "closures": "", "stage": ""}

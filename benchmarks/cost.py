@@ -26,11 +26,11 @@ import numpy as np
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
-from fcslam.driving import track_of
-from fcslam.mission import MissionCloud, MissionConfig
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.mission.driving import track_of
+from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.robot.frontend import RobotFrontend
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.packets import SizedPacket, decode, measure
 
 ROBOTS = (1, 5, 20, 50, 100)

@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from fcslam.evaluation.detectors.evaluated_detectors import (
+from fcslam.features.detector import GreyImage
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.lab.evaluation.detectors.evaluated_detectors import (
     EvaluatedDetector,
     FramedImage,
     choose_detectors,
     frame,
     one_thread,
 )
-from fcslam.evaluation.detectors.homography import LARGE, described, match_pair
-from fcslam.evaluation.detectors.scenes import find_scenes
-from fcslam.features.detector import GreyImage
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.lab.evaluation.detectors.homography import LARGE, described, match_pair
+from fcslam.lab.evaluation.detectors.scenes import find_scenes
 
 SCENES = ("oxford_affine", "hpatches_subset")
 DETECTORS = [name for name in EvaluatedDetectorKind if name is not EvaluatedDetectorKind.LOGITS]

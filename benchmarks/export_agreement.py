@@ -17,19 +17,19 @@ import common
 import numpy as np
 from homography import SCENES, SEED
 
-from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors, frame, one_thread
-from fcslam.evaluation.detectors.homography import (
+from fcslam.features.dense import Logits, Probabilities, sample_codes
+from fcslam.features.detector import GreyImage, OnnxConfig, OnnxDetector
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors, frame, one_thread
+from fcslam.lab.evaluation.detectors.homography import (
     LARGE,
     MATCHED,
     MATCHING_NMS_PX,
     HomographyReport,
     evaluate_homography,
 )
-from fcslam.evaluation.detectors.measures import difference, mean
-from fcslam.evaluation.detectors.scenes import Scene, find_scenes
-from fcslam.features.dense import Logits, Probabilities, sample_codes
-from fcslam.features.detector import GreyImage, OnnxConfig, OnnxDetector
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.lab.evaluation.detectors.measures import difference, mean
+from fcslam.lab.evaluation.detectors.scenes import Scene, find_scenes
 
 Network = Callable[[GreyImage], tuple[Probabilities, Logits]]
 BITS = {"compared": "s", "images": "d", "codes": "d", "bits that differ, %": ".4f", "in the worst image, %": ".4f",

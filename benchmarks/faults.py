@@ -155,8 +155,8 @@ class Worlds:
         return self._known[key]
 
     def _record(self, scenario: Scenario, folder: Path) -> tuple[list[Path], float]:
-        from fcslam.simulation.noise import LidarSettings
-        from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+        from fcslam.lab.simulation.noise import LidarSettings
+        from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
         from fcslam.sources import write_carmen
 
         if scenario.log:

@@ -40,15 +40,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, points, robots, run
 
-from fcslam.federated.privacy import epsilon
-from fcslam.federated.settings import FederatedSettings, PrivacySettings
+from fcslam.learning.federated.privacy import epsilon
+from fcslam.learning.federated.settings import FederatedSettings, PrivacySettings
 from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from training_fleet import Rows
 
-    from fcslam.evaluation.federated.study import StudyResults
+    from fcslam.lab.evaluation.federated.study import StudyResults
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
@@ -176,7 +176,7 @@ def places() -> list[tuple[str, str]]:
 
 def home_rows(findings: "StudyResults") -> Iterator[tuple[object, ...]]:
     """What a robot's own network makes of its own images, and of others', beside the networks that all have."""
-    from fcslam.evaluation.federated.pairs import MEASURES
+    from fcslam.lab.evaluation.federated.pairs import MEASURES
 
     owners = np.array(findings.owners)
     everybody = {arm: np.nanmean(findings.measured[arm], axis=(0, 1)) for arm in ("central", "together")}

@@ -181,13 +181,13 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
 
     import torch
 
-    from fcslam.federated import client
-    from fcslam.federated.client_app import build_client_app
-    from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-    from fcslam.federated.flower import InProcessGrid
-    from fcslam.federated.networks import network_to_weights, weights_version
-    from fcslam.federated.public_images import public_evaluation, read_public_images
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated import client
+    from fcslam.learning.federated.client_app import build_client_app
+    from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+    from fcslam.learning.federated.flower import InProcessGrid
+    from fcslam.learning.federated.networks import network_to_weights, weights_version
+    from fcslam.learning.federated.public_images import public_evaluation, read_public_images
+    from fcslam.learning.federated.settings import FederatedSettings
     from fcslam.learning.network import KeypointNetwork
     from fcslam.learning.settings import TrainingSettings
 

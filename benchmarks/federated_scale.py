@@ -30,17 +30,17 @@ import common
 import numpy as np
 
 from fcslam.errors import TrainingError
-from fcslam.federated.client import ClientUpdate
-from fcslam.federated.client_app import build_client_app
-from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.federated.fleet_grid import FleetGrid
-from fcslam.federated.fleet_robot import RobotLink, robot_context, serve_requests
-from fcslam.federated.fleet_server import FleetApp, listening
-from fcslam.federated.flower import InProcessGrid, RobotGrid
-from fcslam.federated.history import RoundReport
-from fcslam.federated.initial_weights import read_detector_weights
-from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.weights import Weights
+from fcslam.learning.federated.client import ClientUpdate
+from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+from fcslam.learning.federated.fleet_grid import FleetGrid
+from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
+from fcslam.learning.federated.fleet_server import FleetApp, listening
+from fcslam.learning.federated.flower import InProcessGrid, RobotGrid
+from fcslam.learning.federated.history import RoundReport
+from fcslam.learning.federated.initial_weights import read_detector_weights
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 
 DETECTOR = common.REPOSITORY / "src/fcslam/features/networks/detector.onnx"

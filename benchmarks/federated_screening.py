@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fcslam.features.detector import BUNDLED_NETWORK
 
 if TYPE_CHECKING:
-    from fcslam.federated.weights import Weights
+    from fcslam.learning.federated.weights import Weights
 
     Round = tuple[Weights, dict[str, Weights]]
     """The weights that were sent, and those that came back, by robot."""
@@ -63,9 +63,9 @@ def write_images(vision: Path, robot: str, seed: int, folder: Path) -> Path:
 
 def honest_rounds(vision: Path, seed: int, count: int, folder: Path) -> Iterator["Round"]:
     """Rounds in which the weights of all robots are averaged."""
-    from fcslam.federated.client import RobotClient, seeded_noise
-    from fcslam.federated.initial_weights import prepare_initial_weights
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated.client import RobotClient, seeded_noise
+    from fcslam.learning.federated.initial_weights import prepare_initial_weights
+    from fcslam.learning.federated.settings import FederatedSettings
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.trainer import ExecutionOptions
 
@@ -88,7 +88,7 @@ def honest_rounds(vision: Path, seed: int, count: int, folder: Path) -> Iterator
 
 def flipped(update: "Weights", sent: "Weights") -> "Weights":
     """The parameters of an update with the opposite sign; its batch statistics stay."""
-    from fcslam.federated.weights import apply_update, trained_names, update_vector
+    from fcslam.learning.federated.weights import apply_update, trained_names, update_vector
 
     names = trained_names(sent, frozen_statistics=True)
     opposite = apply_update(sent, -update_vector(update, sent, names), names)
@@ -96,8 +96,8 @@ def flipped(update: "Weights", sent: "Weights") -> "Weights":
 
 
 def screened(rounds: list["Round"], robots: int, attackers: int) -> tuple[object, ...]:
-    from fcslam.federated.screening import screen
-    from fcslam.federated.settings import ScreeningSettings
+    from fcslam.learning.federated.screening import screen
+    from fcslam.learning.federated.settings import ScreeningSettings
 
     rng = np.random.default_rng(0)
     groups = caught = lost = 0
@@ -121,7 +121,7 @@ def main() -> None:
     except ImportError:
         print("skipped: needs fcslam[federated]")
         return
-    from fcslam.federated.screening import statistics_distances
+    from fcslam.learning.federated.screening import statistics_distances
 
     vision = common.recordings(*PLACES, kind="vision")
     torch.set_num_threads(1)

@@ -21,16 +21,16 @@ from typing import TYPE_CHECKING, Any
 import common
 from training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 
-from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.evaluation.detectors.homography import evaluate_homography
-from fcslam.evaluation.detectors.measures import difference, mean
-from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
+from fcslam.lab.evaluation.detectors.homography import evaluate_homography
+from fcslam.lab.evaluation.detectors.measures import difference, mean
+from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.metrics.framing import HomographyGroundTruth
 
 if TYPE_CHECKING:
-    from fcslam.evaluation.detectors.homography import HomographyReport
+    from fcslam.lab.evaluation.detectors.homography import HomographyReport
 
 SCENES = ("oxford_affine", "hpatches_subset")
 ROUNDS, PAIRS, IMAGES = 40, 1000, 64
@@ -76,9 +76,9 @@ def main() -> None:
 
 def exported(folder: Path, arm: str) -> Path:
     """What an arm came to, as robots run it."""
-    from fcslam.federated.initial_weights import read_detector_weights
-    from fcslam.federated.networks import weights_to_network
     from fcslam.learning.export import export_onnx
+    from fcslam.learning.federated.initial_weights import read_detector_weights
+    from fcslam.learning.federated.networks import weights_to_network
 
     target = folder / f"{arm}.onnx"
     export_onnx(weights_to_network(read_detector_weights(folder / arm / "checkpoint.npz", "light"), "light"), target)

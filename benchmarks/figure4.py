@@ -21,10 +21,10 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.evaluation.places.figures import save
-from fcslam.evaluation.places.growth_figure import draw_growth
-from fcslam.evaluation.places.vocabulary_growth import (
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
+from fcslam.lab.evaluation.places.figures import save
+from fcslam.lab.evaluation.places.growth_figure import draw_growth
+from fcslam.lab.evaluation.places.vocabulary_growth import (
     MEASURES,
     Arrival,
     Growth,

@@ -23,8 +23,8 @@ from pathlib import Path
 import common
 
 from fcslam.config import load
-from fcslam.evaluation.fleet.report import evaluate_fleet
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import Run
 from fcslam.sources import open_source

@@ -17,8 +17,8 @@ from pathlib import Path
 import common
 
 from fcslam.cloud.fusion_strategy import FusionStrategy
-from fcslam.evaluation.fleet.report import FleetReport, evaluate_fleet
-from fcslam.simulation.options import Building
+from fcslam.lab.evaluation.fleet.report import FleetReport, evaluate_fleet
+from fcslam.lab.simulation.options import Building
 
 ROW = {"seed": "", "strategy": "", "maps": "", "ATE, m": ".4f", "across robots: mean, m": ".4f", "max, m": ".3f",
        "mean, deg": ".3f", "max, deg": ".2f", "worst join, m": ".4f", "F1": ".4f", "closures used": ".0f",

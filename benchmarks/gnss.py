@@ -22,10 +22,10 @@ from robustness import Recording, position_errors
 from yards import SCANNERS, largest_map, simulated_robot
 
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.lab.simulation.options import OdometryKind
+from fcslam.lab.simulation.simulated_fleet import SimulatedRobot
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import FloatArray, GnssFix
-from fcslam.simulation.options import OdometryKind
-from fcslam.simulation.simulated_fleet import SimulatedRobot
 
 SEEDS = tuple(range(1, 11))
 MOST_M = 0.5

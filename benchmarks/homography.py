@@ -17,10 +17,16 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.evaluation.detectors.homography import LARGE, MATCHING_NMS_PX, SMALL, HomographyReport, evaluate_homography
-from fcslam.evaluation.detectors.measures import difference, interval, mean
-from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
+from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
+from fcslam.lab.evaluation.detectors.homography import (
+    LARGE,
+    MATCHING_NMS_PX,
+    SMALL,
+    HomographyReport,
+    evaluate_homography,
+)
+from fcslam.lab.evaluation.detectors.measures import difference, interval, mean
+from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.metrics.bootstrap import Interval
 from fcslam.metrics.framing import HomographyGroundTruth
 

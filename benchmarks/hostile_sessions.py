@@ -34,10 +34,10 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.records import Constraint, ConstraintKind, Keyscan, KeyscanId, Place, Removal, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources import open_source
 from fcslam.sources.split import split
 from fcslam.wire.checks import check

@@ -42,14 +42,14 @@ from processes import PATIENCE_S, Process, compare, wait_for
 
 from fcslam.cli import main as fcslam
 from fcslam.cloud.settings import CloudConfig
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.mission.mission_store import MissionStore
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.service.intake import Intake
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import Registry
 from fcslam.service.shared.schema import prepare
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources import open_source, write_carmen
 from fcslam.storage.postgres import Postgres, take_password
 from fcslam.wire.batches import MEDIA_TYPE, write_batch

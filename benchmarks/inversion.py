@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from fcslam.features.detector import FeatureDetector
 from fcslam.features.factory import make_detector
 from fcslam.learning.images import find_images, read_image
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 
 SIZE = (320, 240)
 HALF = 24

@@ -26,10 +26,10 @@ from faults import cloud, finalize
 
 import fcslam
 from fcslam.geometry import se2
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
 from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
 RADIUS_M = 0.25
 

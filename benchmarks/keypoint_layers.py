@@ -40,11 +40,11 @@ from closure_learning import (
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.federated.initial_weights import prepare_initial_weights
-from fcslam.federated.networks import weights_to_network
-from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.batches import draw_batch
 from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.initial_weights import prepare_initial_weights
+from fcslam.learning.federated.networks import weights_to_network
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.images import find_images, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.local_training import LocalTrainingPlan, train_layers

@@ -94,8 +94,8 @@ def case(sessions: int, path_m: float, seed: int, kept: int) -> list[tuple]:
 
 def robots(sessions: int, path_m: float, seed: int) -> list[Any]:
     """The robot of each session: one building that changes."""
-    from fcslam.simulation.noise import LidarSettings
-    from fcslam.simulation.simulated_fleet import STAMP_SHIFT_S, SimulationSettings, simulate_fleet
+    from fcslam.lab.simulation.noise import LidarSettings
+    from fcslam.lab.simulation.simulated_fleet import STAMP_SHIFT_S, SimulationSettings, simulate_fleet
 
     settings = SimulationSettings(
         robots=sessions, path_length_m=path_m, camera=None, lidar=LidarSettings(rate_hz=5.0),
@@ -134,9 +134,9 @@ def with_people(robot: Any, seed: int) -> Iterator[Any]:
 
 def record(place: Path, sessions: int, path_m: float, seed: int) -> None:
     """What the robot sends, as the service would have stored it."""
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
+    from fcslam.mission.mission_store import MissionStore, StoredPacket
     from fcslam.robot.frontend import RobotFrontend
-    from fcslam.service.mission_store import MissionStore, StoredPacket
     from fcslam.wire.packets import encode, read_label, readdress
 
     store = MissionStore(place / "mission.sqlite")
@@ -156,8 +156,8 @@ def live(place: Path, sessions: int, path_m: float, seed: int, kept: int) -> lis
     """One row after each of the sessions that are shown."""
     from fcslam.cloud.fleet import Fleet
     from fcslam.cloud.packet_log import PacketLog
-    from fcslam.mission import MissionConfig
-    from fcslam.service.mission_store import MissionStore
+    from fcslam.mission.mission import MissionConfig
+    from fcslam.mission.mission_store import MissionStore
 
     warm_up()
     config, store, drivers = MissionConfig(), MissionStore(place / "mission.sqlite"), robots(sessions, path_m, seed)
@@ -251,8 +251,8 @@ def against_truth(first: list[Any], now: Any, plain: Any, drivers: list[Any]) ->
 
 def building_now(drivers: list[Any]) -> Any:
     """The building as the last robot found it, seen from wherever a robot could stand in it."""
-    from fcslam.simulation.ground_truth import true_map
-    from fcslam.simulation.simulated_fleet import SimulatedFleet
+    from fcslam.lab.simulation.ground_truth import true_map
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 
     plan, here = drivers[-1].plan, []
     surfaces = segment_points(plan)
@@ -266,9 +266,9 @@ def building_as_seen(drivers: list[Any]) -> Any:
     """Each cell as the last robot that saw it found it."""
     import numpy as np
 
+    from fcslam.lab.simulation.ground_truth import true_map
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
     from fcslam.runs.map_files import Occupancy
-    from fcslam.simulation.ground_truth import true_map
-    from fcslam.simulation.simulated_fleet import SimulatedFleet
 
     maps = [true_map(SimulatedFleet(driver.plan, (driver,))) for driver in drivers]
     cells = maps[0].cells

@@ -37,12 +37,12 @@ import httpx
 import numpy as np
 from faults import cloud, finalize
 
-from fcslam.mission import MissionConfig
+from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Correction
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.sender import SEND_INTERVAL_S
 from fcslam.service.missions import FIRST
-from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch, write_batch
 from fcslam.wire.packets import decode, encode
 

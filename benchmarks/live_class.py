@@ -21,12 +21,12 @@ import common
 import numpy as np
 
 import fcslam
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.live.playback import PlaybackPace
 from fcslam.live.robot import LARGEST_BACKLOG
 from fcslam.records import LaserScan
 from fcslam.robot.beside import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources import open_source
 
 QUANTILES = (50, 95, 99, 99.9, 100)

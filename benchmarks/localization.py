@@ -36,15 +36,15 @@ from wean_hall import LOGS as WEAN_HALL
 import fcslam
 from fcslam import sources
 from fcslam.errors import SourceError
-from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.geometry import se2
-from fcslam.localization import read_map
+from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.simulation.options import Building
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.metrics.trajectory import align
+from fcslam.mission.localization import read_map
 from fcslam.records import FloatArray, LaserScan, SensorRecord
 from fcslam.runs import LocalizedPoses, Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.simulation.options import Building
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources.faults import Faults
 
 WRONG_M = 0.5
@@ -137,8 +137,8 @@ def found(run: Run) -> tuple[float, ...]:
 
 def localized(source: Any, place: Path | Any) -> tuple[Run, float]:
     """The run of a localisation, and its CPU time."""
-    from fcslam.localization import run_localization
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.localization import run_localization
+    from fcslam.mission.mission import MissionConfig
 
     occupancy = read_map(place) if isinstance(place, Path) else place
     began = time.process_time()

@@ -17,12 +17,12 @@ import common
 import cv2
 import numpy as np
 
-from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX, HomographyReport, evaluate_homography
-from fcslam.evaluation.detectors.measures import difference, interval, mean
-from fcslam.evaluation.detectors.scenes import find_scenes
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_grey
+from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
+from fcslam.lab.evaluation.detectors.homography import MATCHING_NMS_PX, HomographyReport, evaluate_homography
+from fcslam.lab.evaluation.detectors.measures import difference, interval, mean
+from fcslam.lab.evaluation.detectors.scenes import find_scenes
 from fcslam.learning.warps import random_change, relight, warp_image
 from fcslam.metrics.bootstrap import Interval
 

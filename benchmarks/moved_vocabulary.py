@@ -18,10 +18,10 @@ from typing import NamedTuple
 import common
 import numpy as np
 
-from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_sets
-from fcslam.evaluation.places.scoring import DescribedSet, index_scores
-from fcslam.evaluation.places.sets import FLEET
-from fcslam.evaluation.places.simulated_views import read_fleet_views
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets
+from fcslam.lab.evaluation.places.scoring import DescribedSet, index_scores
+from fcslam.lab.evaluation.places.sets import FLEET
+from fcslam.lab.evaluation.places.simulated_views import read_fleet_views
 from fcslam.metrics.bootstrap import mean_interval
 from fcslam.metrics.retrieval import recall_at, single_best
 from fcslam.places.index import PlaceIndex

@@ -26,8 +26,8 @@ import numpy as np
 import simulated_fleet
 import yaml
 
+from fcslam.lab.presets import Preset
 from fcslam.metrics.bootstrap import mean_interval
-from fcslam.presets import Preset
 
 CASES = ("default", "corridor", "default, other light")
 PAPER, VGG, LIGHT, BOTH = "paper's network, camera", "vgg, camera", "light, camera", "light, LiDAR and camera"

@@ -20,7 +20,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel, Keyscan, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split

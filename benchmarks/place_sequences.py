@@ -13,10 +13,10 @@ from collections.abc import Iterator
 
 import common
 
-from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_sets
-from fcslam.evaluation.places.report import evaluate_set
-from fcslam.evaluation.places.scoring import DescribedSet, strategy_scorer
-from fcslam.evaluation.places.sequences import in_sequence
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets
+from fcslam.lab.evaluation.places.report import evaluate_set
+from fcslam.lab.evaluation.places.scoring import DescribedSet, strategy_scorer
+from fcslam.lab.evaluation.places.sequences import in_sequence
 from fcslam.metrics.bootstrap import Interval
 from fcslam.metrics.retrieval import recall_at
 from fcslam.places.matcher import MatcherConfig

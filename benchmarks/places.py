@@ -18,11 +18,11 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.evaluation.places.figures import curves_figure
-from fcslam.evaluation.places.report import SetResult, evaluate_set
-from fcslam.evaluation.places.scoring import DescribedSet, choose_scorers
-from fcslam.evaluation.places.verification import PairVerifier
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
+from fcslam.lab.evaluation.places.figures import curves_figure
+from fcslam.lab.evaluation.places.report import SetResult, evaluate_set
+from fcslam.lab.evaluation.places.scoring import DescribedSet, choose_scorers
+from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes

@@ -28,14 +28,14 @@ from robustness import Recording
 from fcslam.anchoring.anchors import Anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
+from fcslam.lab.simulation.floorplan import Piece, PieceKind
+from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings, simulate_fleet
 from fcslam.lidar.scan import point_scan
-from fcslam.mission import MissionConfig, run_mission
-from fcslam.mission_file import SavedMission, read_mission
+from fcslam.mission.mission import MissionConfig, run_mission
+from fcslam.mission.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.runs import Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.simulation.floorplan import Piece, PieceKind
-from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulationSettings, simulate_fleet
 
 SEEDS = tuple(range(1, 11))
 CELL_M, MARGIN_M = 0.02, 0.5

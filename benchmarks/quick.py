@@ -18,7 +18,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 
 CASES = (*((name, 1) for name in common.SPLITS), ("intel", 3))
 TITLE = "Figures"

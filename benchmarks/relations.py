@@ -13,7 +13,7 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.metrics.relations import RelationErrors
 
 PEERS = (

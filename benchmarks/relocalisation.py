@@ -27,13 +27,13 @@ import numpy as np
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.sessions import session_name
 from fcslam.geometry import se2
+from fcslam.lab.simulation.options import Building
+from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.lidar.lost import LostConfig
 from fcslam.metrics.trajectory import align, position_errors
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel, Constraint, ConstraintKind, Correction, FloatArray, Keyscan, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.options import Building
-from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode, encode
 

@@ -43,8 +43,8 @@ def main() -> None:
 
 
 def simulated() -> Any:
-    from fcslam.simulation.noise import LidarSettings
-    from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+    from fcslam.lab.simulation.noise import LidarSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
     lidar = LidarSettings(rate_hz=5.0)
     return simulate_fleet(SimulationSettings(robots=3, path_length_m=60.0, camera=None, lidar=lidar), 1).robots
@@ -54,7 +54,7 @@ def one_round(robot: Any) -> tuple[list, Any]:
     """A robot's packets, and T_last_first of its keyscans."""
     from fcslam.cloud.cloud import Cloud
     from fcslam.geometry import se2
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
 
     config = MissionConfig()
@@ -101,8 +101,8 @@ def repeated(packets: list, back: Any) -> Iterator[Any]:
 
 def restarted(place: Path, rounds: list[tuple[list, Any]], size: int) -> Iterator[tuple]:
     """One row with a snapshot, one without."""
+    from fcslam.mission.mission_store import MissionStore
     from fcslam.service.mission_folder import MissionFolder
-    from fcslam.service.mission_store import MissionStore
 
     folder = MissionFolder(place)
     store = MissionStore(folder.store)
@@ -119,7 +119,7 @@ def restarted(place: Path, rounds: list[tuple[list, Any]], size: int) -> Iterato
 
 
 def stored(rounds: list[tuple[list, Any]]) -> Iterator[Any]:
-    from fcslam.service.mission_store import StoredPacket
+    from fcslam.mission.mission_store import StoredPacket
     from fcslam.wire.packets import encode, read_label
 
     streams = [repeated(packets, back) for packets, back in rounds]

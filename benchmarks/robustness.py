@@ -18,7 +18,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, FloatArray, LaserScan, frozen
 from fcslam.runs import Run
 from fcslam.sources import Source, open_source

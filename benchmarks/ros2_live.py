@@ -111,8 +111,8 @@ def drive(speed, mounting, folder):
 
 def heard_transforms(environment):
     """A list that grows by the time at which each transform arrives."""
-    from fcslam.bridges.network import Quality
-    from fcslam.bridges.ros2 import Ros2Network
+    from fcslam.ros.network import Quality
+    from fcslam.ros.ros2 import Ros2Network
 
     if not hasattr(heard_transforms, "network"):
         heard_transforms.network = Ros2Network(DOMAIN, environment)

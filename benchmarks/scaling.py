@@ -123,7 +123,7 @@ class Watches:
 def drive_again(log: Path, rounds: int) -> list[tuple]:
     """One row after 1, 2, 4 ... rounds of the recording."""
     from fcslam.cloud.cloud import Cloud
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
     from fcslam.sources import open_source
 
@@ -212,7 +212,7 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
     import numpy as np
 
     from fcslam.cloud.cloud import Cloud
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
     from fcslam.records import ClosureStatus
     from fcslam.robot.frontend import RobotFrontend
 
@@ -238,8 +238,8 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
 
 def simulated(building: int, robots: int, path_length_m: float = 60.0) -> Iterator[Any]:
     """Recordings of robots in a building of their own."""
-    from fcslam.simulation.noise import LidarSettings
-    from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+    from fcslam.lab.simulation.noise import LidarSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
     settings = SimulationSettings(
         robots=robots, path_length_m=path_length_m, camera=None, lidar=LidarSettings(rate_hz=5.0)
@@ -252,7 +252,7 @@ def warm_up() -> None:
     """Load or compile every kernel of robot and cloud."""
     from fcslam.cloud.cloud import Cloud
     from fcslam.cloud.report import fuse_members
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
 
     config, watches = MissionConfig(), Watches()

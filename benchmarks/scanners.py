@@ -20,9 +20,9 @@ import common
 import numpy as np
 from robustness import Recording
 
-from fcslam.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.fleet.relations import pose_table
 from fcslam.metrics.relations import read_relations, relation_errors
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserScan, frozen
 from fcslam.sources import open_source
 

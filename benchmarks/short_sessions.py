@@ -33,7 +33,7 @@ def measured(count: int) -> tuple[int, float, float]:
     from fcslam.cloud.cloud import Cloud
     from fcslam.cloud.report import keyscan_track, run_of
     from fcslam.lidar.occupancy import OccupancyConfig
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
 
     config = MissionConfig()
     cloud, began_s = Cloud(config.fleet, config.seed), time.process_time()

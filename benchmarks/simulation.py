@@ -13,8 +13,8 @@ from pathlib import Path
 
 import common
 
-from fcslam.simulation.options import Building
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.lab.simulation.options import Building
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
 COLUMNS = {"building": "", "cameras": "", "floor, m2": ".0f", "rooms": "", "driven, s": ".0f", "scans": ",",
            "images": ",", "wall, s": ".1f", "CPU, s": ".1f", "x real time": ".1f", "if alone": ".1f",

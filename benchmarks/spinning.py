@@ -21,16 +21,16 @@ import common
 import numpy as np
 from robustness import Recording
 
-from fcslam.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.lab.simulation.noise import SCANNERS
+from fcslam.lab.simulation.odometry import KINDS
+from fcslam.lab.simulation.options import OdometryKind, Scanner
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.metrics.relations import read_relations, relation_errors
 from fcslam.metrics.trajectory import PositionErrors, align, position_errors
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan, frozen
 from fcslam.robot.calibrating import calibrated
-from fcslam.simulation.noise import SCANNERS
-from fcslam.simulation.odometry import KINDS
-from fcslam.simulation.options import OdometryKind, Scanner
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources import open_source
 from fcslam.sources.bags.writer import write_bag
 

@@ -27,7 +27,7 @@ from scaling import Repeated, alone, back_to_the_start, scan_poses
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.live.robot import LARGEST_BACKLOG
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserScan
 from fcslam.robot.beside import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend

@@ -10,8 +10,8 @@ import common
 from fcslam.metrics.bootstrap import Interval
 
 if TYPE_CHECKING:
-    from fcslam.evaluation.federated.report import ArmReport
-    from fcslam.evaluation.federated.study import StudyResults
+    from fcslam.lab.evaluation.federated.report import ArmReport
+    from fcslam.lab.evaluation.federated.study import StudyResults
 
     Rows = dict[tuple[str, str], ArmReport]
     """By measure and arm."""
@@ -36,7 +36,7 @@ def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> 
     """Train and measure whatever is missing of a study in a folder; ``content`` is of ``StudySettings``."""
     import torch
 
-    from fcslam.evaluation.federated.study import Study, StudySettings, run_study
+    from fcslam.lab.evaluation.federated.study import Study, StudySettings, run_study
     from fcslam.learning.trainer import ExecutionOptions
 
     torch.set_num_threads(1)
@@ -50,7 +50,7 @@ def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> 
 
 def compare(findings: "StudyResults", against: str) -> "Rows":
     """Every arm by every measure, compared to one."""
-    from fcslam.evaluation.federated.report import report
+    from fcslam.lab.evaluation.federated.report import report
 
     return {(row.measure, row.arm): row for row in report(findings, against=against)}
 

@@ -101,11 +101,11 @@ def _start(stack: ExitStack, kind: str, *options: str) -> None:
 def compared(count: int) -> list[list]:
     """Batches of pairs, ``count`` in all."""
     from fcslam.cloud.fleet import Fleet
+    from fcslam.lab.simulation.noise import LidarSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
     from fcslam.lidar.pair_verification import verify_here
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
-    from fcslam.simulation.noise import LidarSettings
-    from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
     asked: list = []
 

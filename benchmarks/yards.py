@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from robustness import Recording, position_errors
 
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.odometry import KINDS
+from fcslam.lab.simulation.options import Building, OdometryKind
+from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, FloatArray
 from fcslam.runs import Run
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.odometry import KINDS
-from fcslam.simulation.options import Building, OdometryKind
-from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 
 WORST_MEAN_M, WORST_SLIP_M = 0.20, 0.5
 WRONG_M, WRONG_RAD = 0.5, np.radians(10.0)

@@ -8,7 +8,7 @@ Replace `simulated.scans()` by the scans of your driver, and the script maps you
 import sys
 
 import fcslam
-from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
 
 def main(folder: str) -> None:

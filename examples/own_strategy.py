@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from flwr.serverapp.strategy import FedAvg
 
-from fcslam.federated.job import FederatedJob, ProgressCallbacks
-from fcslam.federated.local import federate_locally
-from fcslam.federated.settings import FederatedSettings
+from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks
+from fcslam.learning.federated.local import federate_locally
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.trainer import ExecutionOptions
 
 SETTINGS = FederatedSettings.model_validate(

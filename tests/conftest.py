@@ -11,8 +11,8 @@ from hypothesis import settings
 from fcslam.cloud import recognition
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
-from fcslam.simulation.ground_truth import write_ground_truth
-from fcslam.simulation.simulated_fleet import SimulatedFleet
+from fcslam.lab.simulation.ground_truth import write_ground_truth
+from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
 from tests import small_fleet

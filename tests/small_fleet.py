@@ -6,9 +6,9 @@ import numpy as np
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.result import FleetResult
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 

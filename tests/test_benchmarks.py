@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from fcslam.config import load as load_config
 from fcslam.features.classical import OrbConfig
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel
 from tests.features.networks import tiny_network
 

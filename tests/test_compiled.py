@@ -23,7 +23,7 @@ assert tell_uncached(notices(False))
 AFTER_ALL = """
 import json, sys
 from numba.core.dispatcher import Dispatcher
-from fcslam.driving import one_by_one
+from fcslam.mission.driving import one_by_one
 from fcslam.robot.frontend import RobotConfig
 from fcslam.service.warmup import WARM_UPS, is_cold
 from fcslam.sources import open_source

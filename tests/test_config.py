@@ -9,7 +9,7 @@ from pydantic import Field
 
 from fcslam.config import Settings, dump, load, parse, parse_yaml
 from fcslam.errors import ConfigError
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 
 
 class Colour(StrEnum):

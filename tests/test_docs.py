@@ -13,7 +13,7 @@ import yaml
 
 from fcslam.cli import app
 from fcslam.config import Settings
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import ReasonCode
 from tests.test_imports import ROOMS
 

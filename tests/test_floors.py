@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.test_mission_file import contents
 
 import fcslam
 from fcslam.cloud.cloud import Cloud
@@ -11,15 +12,14 @@ from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import ConfigError, EditError, PacketError, SourceError
-from fcslam.localization import read_map
-from fcslam.mission_file import edit_mission
+from fcslam.mission.localization import read_map
+from fcslam.mission.mission_file import edit_mission
 from fcslam.records import ManualClosure
 from fcslam.runs import open_run, separations
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
 from tests import small_fleet
 from tests.small_fleet import feed, fingerprint, in_order, map_of
-from tests.test_mission_file import contents
 
 
 @pytest.fixture(scope="module")

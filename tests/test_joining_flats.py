@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import LaserModel, ReasonCode
 from fcslam.runs import separations
 from tests.flats import BACK, ROUND, Drive, doors, flat, lookalike

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import SourceError
-from fcslam.localization import read_map
+from fcslam.mission.localization import read_map
 from fcslam.runs.map_files import Occupancy
 
 F, O, U = Occupancy.FREE, Occupancy.OCCUPIED, Occupancy.UNKNOWN  # noqa: E741

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserModel, LaserScan, frozen
 from fcslam.runs.map_files import Occupancy, parse_map
 from fcslam.sources.faults import Faults

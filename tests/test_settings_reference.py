@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from fcslam.config import dump
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from tools import settings_reference
 
 

@@ -19,7 +19,7 @@ from backports import zstd
 from fcslam import untrusted
 from fcslam.config import load
 from fcslam.errors import ConfigError, EvaluationError, SourceError
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.runs import open_run
 from fcslam.sources import open_source
 from fcslam.sources.logs.archive import numbered_lines
@@ -31,17 +31,17 @@ BOMB_BYTES = 1 << 30
 
 OWN = {
     "compiled.py": "the cache of this user",
-    "bridges/record.py": "the recording that this process writes",
+    "ros/record.py": "the recording that this process writes",
     "cli/robot.py": "the robot's own token",
     "cli/serve_learning.py": "written by the training that this service started",
     "federated": "the folder of this user's training",
     "features/onnx_runtime.py": "no file",
     "learning": "the folder of this user's training",
-    "mission_file.py": "what this process wrote",
+    "mission/mission_file.py": "what this process wrote",
     "page/report.py": "files of the package",
     "page/routes.py": "files of the package",
     "service": "the folder of the service",
-    "simulation/recording.py": "the settings that this process writes",
+    "lab/simulation/recording.py": "the settings that this process writes",
     "sources/logs/carmen_writer.py": "the log that this process writes",
     "sources/bags/mcap_records.py": "the recording that this process writes",
     "sources/recording/writer.py": "the recording that this process writes",

@@ -32,7 +32,7 @@ DOWNLINK = re.compile(r"downlink|acknowledgement|correction|release|detector_upd
 
 RUN = """
 import hashlib, sys
-import fcslam.mission as mission
+import fcslam.mission.mission as mission
 from fcslam.wire import packets as wire
 coder, path = mission if hasattr(mission, "encode") else wire, sys.argv.pop(1)
 uplink, encode = {"Hello", "Keyscan", "Constraint", "Place"}, coder.encode

@@ -17,7 +17,7 @@ import fcslam
 from fcslam.features.birdseye import BirdseyeConfig, describe, likelihood_picture
 from fcslam.geometry import se2
 from fcslam.maps import palette
-from fcslam.mission_file import read_mission
+from fcslam.mission.mission_file import read_mission
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import ClosureStatus, FloatArray, Place

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fcslam.features.factory import make_detector
 from fcslam.learning.images import find_images, read_image
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel, Codes, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import open_source, split

@@ -20,11 +20,11 @@ from pydantic.fields import FieldInfo
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import Settings
-from fcslam.federated.live_settings import FleetLearningSettings, RobotLearningSettings
-from fcslam.federated.settings import FederatedSettings
+from fcslam.learning.federated.live_settings import FleetLearningSettings, RobotLearningSettings
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.settings import TrainingSettings
 from fcslam.lidar.frontend import LidarConfig
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.robot.frontend import RobotConfig
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"

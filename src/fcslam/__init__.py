@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
     from fcslam.live.robot import Robot
-    from fcslam.mission import MissionConfig, Progress
+    from fcslam.mission.mission import MissionConfig, Progress
     from fcslam.records import CameraModel, Channel, ClosureStatus, LaserModel, Transform, Veto
     from fcslam.runs import (
         ClosureRow,
@@ -118,10 +118,10 @@ _LAZY: Final = {
     "LocalizedPoses": "fcslam.runs",
     "LocalizedRobot": "fcslam.live.localized_robot",
     "Metric": "fcslam.runs",
-    "MissionConfig": "fcslam.mission",
+    "MissionConfig": "fcslam.mission.mission",
     "Occupancy": "fcslam.runs",
     "OccupancyMap": "fcslam.runs",
-    "Progress": "fcslam.mission",
+    "Progress": "fcslam.mission.mission",
     "Robot": "fcslam.live.robot",
     "RobotEvent": "fcslam.live.records",
     "RobotPose": "fcslam.live.records",

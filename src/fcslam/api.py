@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Any
 from fcslam import sources
 from fcslam.anchoring.anchors import Anchors
 from fcslam.config import load, parse
-from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.mission import NOTHING_KNOWN, Live, MissionConfig, Watch, continued_config, run_mission
-from fcslam.mission_file import SavedMission, read_mission
+from fcslam.mission.driving import side_by_side
+from fcslam.mission.mission import NOTHING_KNOWN, Live, MissionConfig, Watch, continued_config, run_mission
+from fcslam.mission.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
 
 if TYPE_CHECKING:
-    from fcslam.localization import LocalizationProgress
     from fcslam.maps.changes import Changes
+    from fcslam.mission.localization import LocalizationProgress
 
 StrPath = str | os.PathLike[str]
 Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
@@ -138,7 +138,7 @@ def localize(
     Raises:
         InputError: the recording, the map, the configuration or the output folder cannot be used.
     """
-    from fcslam.localization import read_map, run_localization  # SciPy's images: mapping alone needs none
+    from fcslam.mission.localization import read_map, run_localization  # SciPy's images: mapping alone needs none
 
     if output is not None:
         prepare_output(Path(output), force)
@@ -177,7 +177,7 @@ def changes(
     Raises:
         InputError: the run, a time or the output folder cannot be used.
     """
-    from fcslam.map_changes import check_output, find_changes, save_changes
+    from fcslam.mission.map_changes import check_output, find_changes, save_changes
 
     if output is not None:
         check_output(Path(output), force)

@@ -14,8 +14,8 @@ from pydantic import Field
 from fcslam import __version__, cli
 from fcslam.cli import BAD_INPUT, main
 from fcslam.config import Settings, load
-from fcslam.mission import MissionConfig
-from fcslam.presets import Preset
+from fcslam.lab.presets import Preset
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, RobotTrajectory, Run, open_run
 
@@ -52,9 +52,9 @@ def test_config_dump_prints_the_mission_configuration(capsys, monkeypatch):
     class MissionConfig(Settings):
         seed: int = Field(default=7, description="of everything random")
 
-    mission = types.ModuleType("fcslam.mission")
+    mission = types.ModuleType("fcslam.mission.mission")
     mission.MissionConfig = MissionConfig
-    monkeypatch.setitem(sys.modules, "fcslam.mission", mission)
+    monkeypatch.setitem(sys.modules, "fcslam.mission.mission", mission)
     assert main(["config", "dump"]) == 0
     assert capsys.readouterr().out == "# of everything random\nseed: 7\n"
 

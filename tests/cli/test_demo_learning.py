@@ -4,15 +4,15 @@ import pytest
 from rich.console import Console
 
 from fcslam.cli import main
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import demo, demo_learning
-from fcslam.federated import job
-from fcslam.federated.client import RobotClient, seeded_noise
-from fcslam.federated.history import RoundReport
+from fcslam.learning.federated import job
+from fcslam.learning.federated.client import RobotClient, seeded_noise
+from fcslam.learning.federated.history import RoundReport
 
 
 class Recorded:

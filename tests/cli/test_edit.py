@@ -9,7 +9,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.geometry import se2
-from fcslam.mission_file import edit_mission, read_mission
+from fcslam.mission.mission_file import edit_mission, read_mission
 from fcslam.records import ClosureStatus, MapRegion, ReasonCode, RegionUse
 from fcslam.runs import open_run
 from fcslam.runs.map_files import Occupancy, parse_map

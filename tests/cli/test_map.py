@@ -16,7 +16,7 @@ from fcslam.cli import main
 from fcslam.cli import map as mapping
 from fcslam.config import dump
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.runs import read_tum
 from tests.small_fleet import truth_at
 from tests.sources.carmen_text import drive, flaser, odom, pose_at, save

@@ -12,9 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rich.console import Console
+from tests.bridges.memory_network import MemoryNetwork
 
-from fcslam.bridges.parameters import NodeParameters
-from fcslam.bridges.topics import SensorTopics
 from fcslam.cli import live, main
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.cli.robot import _watch
@@ -22,12 +21,13 @@ from fcslam.errors import CloudError, StateError
 from fcslam.live.records import RobotStatus
 from fcslam.live.robot import Robot
 from fcslam.robot.outbox import WaitingPackets
+from fcslam.ros.parameters import NodeParameters
+from fcslam.ros.topics import SensorTopics
 from fcslam.runs import read_tum
 from fcslam.sources import BagOptions, write_carmen
 from fcslam.sources.bags.codec import ODOMETRY, SCAN
 from fcslam.wire.packets import decode
 from tests import small_fleet
-from tests.bridges.memory_network import MemoryNetwork
 from tests.live.same_thread import SameThread
 from tests.robot.fake_cloud import FakeCloud
 from tests.robot.http_cloud import serving
@@ -200,7 +200,7 @@ def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypat
         def close(self):
             told.append("closed")
 
-    monkeypatch.setattr("fcslam.federated.learning_beside.LearningBeside", Process)
+    monkeypatch.setattr("fcslam.learning.federated.learning_beside.LearningBeside", Process)
     robot = SimpleNamespace(name="anna", first_epoch=3, stand_still=lambda: told.append("keyframes are placed"))
     with live._learning("plan", robot, told.append) as follow:
         watch = live._watch(told.append, follow)
@@ -227,9 +227,9 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
 
     kinds = {"/scan": SCAN, "/odom": ODOMETRY}
     topics = SensorTopics(kinds, ("/scan",), "/odom", ("/tf", "/tf_static"))
-    monkeypatch.setattr("fcslam.bridges.addresses.open_network", lambda *_: MemoryNetwork())
-    monkeypatch.setattr("fcslam.bridges.node.await_sensors", lambda *_: topics)
-    monkeypatch.setattr("fcslam.bridges.node.RobotNode.run", run)
+    monkeypatch.setattr("fcslam.ros.addresses.open_network", lambda *_: MemoryNetwork())
+    monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
+    monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
     start = partial(Turned, executor=SameThread())
     arguments = ("ros2:/anna", None, start, BagOptions(), None, NodeParameters(), tmp_path / "run")
     with pytest.raises(type(failure), match=re.escape(str(failure))):
@@ -254,7 +254,7 @@ def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
     def stand_still():
         raise CloudError("the token is not known (401)")
 
-    monkeypatch.setattr("fcslam.federated.learning_beside.LearningBeside", Process)
+    monkeypatch.setattr("fcslam.learning.federated.learning_beside.LearningBeside", Process)
     robot = SimpleNamespace(name="anna", first_epoch=3, stand_still=stand_still)
     with live._learning("plan", robot, told.append) as follow:
         for scan in range(1, 30):

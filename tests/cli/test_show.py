@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main, show
-from fcslam.mission_file import mission_path
+from fcslam.mission.mission_file import mission_path
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 

@@ -66,7 +66,7 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
 @pytest.mark.parametrize("file", ["joint/checkpoint.npz", "detector.onnx"])
 def test_training_starts_from_given_weights(file, photos, tmp_path, capsys):
     pytest.importorskip("torch", reason="needs fcslam[train]")
-    from fcslam.federated.initial_weights import read_detector_weights
+    from fcslam.learning.federated.initial_weights import read_detector_weights
     from fcslam.learning.training_step import LAST_RATE
     from fcslam.untrusted import read_arrays
 

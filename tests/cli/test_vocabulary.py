@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from fcslam.cli import main
-from fcslam.mission_file import read_mission
+from fcslam.mission.mission_file import read_mission
 from fcslam.places.words import read_vocabularies
 from fcslam.records import Channel, Constraint, Keyscan, MapTile, WordPlace
 from fcslam.runs.map_files import OccupancyMap, parse_map

@@ -11,6 +11,7 @@ from fcslam.cloud import submaps
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
+from fcslam.lab.simulation.ground_truth import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.submap import PackedSubmap, Submap
 from fcslam.lidar.submap_bytes import submap_bytes
@@ -21,7 +22,6 @@ from fcslam.places.matcher import MatcherConfig
 from fcslam.records import Channel, Place, Veto
 from fcslam.runs import open_run
 from fcslam.runs.map_files import Occupancy
-from fcslam.simulation.ground_truth import true_map
 from fcslam.storage.state_file import parse_state, state_bytes
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.sources import open_source
 
 DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"

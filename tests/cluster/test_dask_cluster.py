@@ -22,9 +22,9 @@ from fcslam.lidar.pair_verification import Pair, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.verification import VerificationConfig
+from fcslam.mission.mission_store import MissionStore
 from fcslam.service.credentials import make_cluster_credentials
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.supervisor import READY
 from tests import small_fleet
 from tests.cluster.clusters import Cluster, needs_dask, wait_for

@@ -16,8 +16,9 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump, load
 from fcslam.errors import FcslamError, PacketError
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.localization import read_map
-from fcslam.mission import MissionConfig
+from fcslam.mission.localization import read_map
+from fcslam.mission.mission import MissionConfig
+from fcslam.mission.mission_store import MissionStore, StoredPacket, check_mission
 from fcslam.records import (
     Cut,
     FloorLabel,
@@ -34,7 +35,6 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.service.detectors import DetectorStore
-from fcslam.service.mission_store import MissionStore, StoredPacket, check_mission
 from fcslam.sources import open_source, write_bag, write_carmen, write_recording
 from fcslam.storage.database import seal
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch
@@ -207,8 +207,8 @@ def maps(folder: Path) -> Iterator[Attempt]:
 @contextmanager
 def federated(_: Path) -> Iterator[Attempt]:
     """Replies of robots to the server, as bytes, and the server's requests to a robot."""
-    from fcslam.federated.codec import GlobalModel, weights_to_record
-    from fcslam.federated.flower import (
+    from fcslam.learning.federated.codec import GlobalModel, weights_to_record
+    from fcslam.learning.federated.flower import (
         Message,
         RecordDict,
         message_to_bytes,
@@ -216,10 +216,10 @@ def federated(_: Path) -> Iterator[Attempt]:
         request_from_bytes,
         use_own_identity,
     )
-    from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, client_reply, read_request, request_config
-    from fcslam.federated.replies import read_replies
-    from fcslam.federated.screening import screen
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, client_reply, read_request, request_config
+    from fcslam.learning.federated.replies import read_replies
+    from fcslam.learning.federated.screening import screen
+    from fcslam.learning.federated.settings import FederatedSettings
 
     use_own_identity()
     rng = np.random.default_rng(0)

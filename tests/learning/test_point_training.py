@@ -9,8 +9,8 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
-from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
-from fcslam.federated.networks import weights_to_network  # noqa: E402
+from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
+from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
 from fcslam.learning.local_training import LocalTrainingPlan, layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.point_training import LOST_FACTOR, train_points, voted_targets  # noqa: E402

@@ -18,7 +18,7 @@ from fcslam.lidar.lost import (
     is_lost,
 )
 from fcslam.lidar.odometry import OdometryTrust
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserModel, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.motion_prediction import PREDICTED

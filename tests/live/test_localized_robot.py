@@ -8,7 +8,7 @@ import pytest
 import fcslam
 from fcslam.errors import InputError
 from fcslam.geometry import se2
-from fcslam.localization import read_map
+from fcslam.mission.localization import read_map
 from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.sources import write_carmen
 from tests import small_fleet

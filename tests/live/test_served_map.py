@@ -13,7 +13,7 @@ import uvicorn
 from fcslam.cli import main
 from fcslam.errors import CloudError, OutputError, SourceError
 from fcslam.live.served_map import fetch_maps
-from fcslam.localization import read_map
+from fcslam.mission.localization import read_map
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.runs import RobotTrajectory, Run

@@ -9,8 +9,8 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.fleet.charts import fleet_charts
 from fcslam.geometry import se2
+from fcslam.lab.evaluation.fleet.charts import fleet_charts
 from fcslam.maps import palette
 from fcslam.maps.charts import RAY_M, Chart, FleetCharts, MatchedPlaces, Outline, spread
 from fcslam.maps.fleet_figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from fcslam.mission import MissionCloud, MissionConfig
+from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.page.live_map import LiveMap
 from fcslam.page.shown_run import ShownRun
 from fcslam.service.mission_folder import MissionFolder

@@ -19,7 +19,7 @@ from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EvaluationError
-from fcslam.mission_file import as_stored, mission_bytes
+from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.page import ASSETS, MODULES, viewer
 from fcslam.page.report import MOST_TILES, report_html
 from fcslam.page.shown_run import ShownRun

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fcslam.config import load
-from fcslam.mission import MissionConfig
+from fcslam.lab.presets import Preset
+from fcslam.mission.mission import MissionConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.matcher import PlaceMatcher
-from fcslam.presets import Preset
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
 
 PAPER = load(MissionConfig, Preset.PAPER.file).fleet.matcher

@@ -12,9 +12,9 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.uniqueness import best_elsewhere, two_best
-from fcslam.localization import run_localization
 from fcslam.maps.fusion import fuse
-from fcslam.mission import MissionConfig
+from fcslam.mission.localization import run_localization
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import Keyscan, KeyscanId
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapLocalizer

@@ -10,7 +10,7 @@ from fcslam.config import parse
 from fcslam.errors import ConfigError, FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION
 from fcslam.maps.fusion import joined_tiles, laid_together
-from fcslam.mission import MissionConfig
+from fcslam.mission.mission import MissionConfig
 from fcslam.places.words import train_words, write_vocabularies
 from fcslam.records import Channel, Constraint, Keyscan, MapTile, Place, WordPlace
 from fcslam.robot.frontend import RobotConfig, RobotFrontend

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.replies import SessionCorrection
 from fcslam.errors import PacketConflictError, PacketError
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Correction, frozen
 from fcslam.service import intake as module
 from fcslam.service.intake import LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
-from fcslam.service.mission_store import MissionStore
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode

@@ -3,7 +3,7 @@
 import pytest
 
 from fcslam.errors import EvaluationError
-from fcslam.federated.history import ROUNDS_FILE, RoundReport, write_rows
+from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, write_rows
 from fcslam.service import learning_rounds
 from fcslam.service.learning_rounds import MOST_ROUNDS, read_rounds
 

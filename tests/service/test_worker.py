@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
+from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import ClosureStatus, FloorLabel, Place, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service import worker as worker_module
 from fcslam.service.crash_log import MOST_CRASHES
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import MissionStore, StoredPacket
 from fcslam.service.supervisor import PROGRESS, STAGE_MS, STAGE_RUNS
 from fcslam.service.worker import AT_ONCE, SNAPSHOT_EVERY_S, Worker
 from fcslam.sources import open_source

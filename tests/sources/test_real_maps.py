@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.mission import MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan
 from fcslam.sources import open_source
 from tests.sources.carmen_text import scans_of

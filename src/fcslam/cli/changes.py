@@ -26,7 +26,7 @@ def changes(
     force: Force = False,
 ) -> None:
     """Show what appeared and disappeared in the building between two sessions or dates."""
-    from fcslam.map_changes import PICTURE, TABLE, check_output, find_changes, save_changes
+    from fcslam.mission.map_changes import PICTURE, TABLE, check_output, find_changes, save_changes
 
     output = output or new_folder(CHANGES)
     check_output(output, force)

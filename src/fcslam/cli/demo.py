@@ -11,13 +11,13 @@ import typer
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.show import Live, OpenBrowser, Port, live_page
-from fcslam.simulation.options import Building, Scanner
+from fcslam.lab.simulation.options import Building, Scanner
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.mission import MissionConfig
-    from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
+    from fcslam.mission.mission import MissionConfig
 
 RECORDINGS, LEARNING, RUN, FIGURE, TABLE = "recordings", "learning", "run", "figure.png", "evaluation.csv"
 ABOUT = "about"
@@ -49,10 +49,10 @@ def demo(
     from fcslam.cli.demo_learning import learn_together
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
-    from fcslam.mission import MissionConfig
-    from fcslam.simulation.noise import SCANNERS
-    from fcslam.simulation.recording import prepare_fleet_folder
-    from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.lab.simulation.noise import SCANNERS
+    from fcslam.lab.simulation.recording import prepare_fleet_folder
+    from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.mission.mission import MissionConfig
     from fcslam.sources import open_source
 
     began = time.perf_counter()
@@ -93,7 +93,7 @@ def demo(
 
 def _check_libraries(settings: "SimulationSettings") -> None:
     """Check before the work, and before an earlier demo is removed, that everything can run."""
-    from fcslam.simulation.engine import gl_context, mujoco
+    from fcslam.lab.simulation.engine import gl_context, mujoco
 
     if settings.camera:
         gl_context(16, 16).free()
@@ -155,9 +155,9 @@ def _with_detector(config: "MissionConfig", network: Path | None) -> "MissionCon
 def _evaluate(output: Path, console: "Console") -> None:
     from fcslam.cli.evaluate.fleet import show_fleet
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.fleet.metrics import fleet_metrics
-    from fcslam.evaluation.fleet.relations import write_metrics
-    from fcslam.evaluation.fleet.report import evaluate_fleet
+    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
+    from fcslam.lab.evaluation.fleet.relations import write_metrics
+    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
 
     with ProgressDisplay(console) as display:
         display.start("evaluating")
@@ -169,10 +169,10 @@ def _evaluate(output: Path, console: "Console") -> None:
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.fleet.charts import fleet_charts
+    from fcslam.lab.evaluation.fleet.charts import fleet_charts
+    from fcslam.lab.simulation.floorplan import PieceKind
     from fcslam.maps.charts import Outline
     from fcslam.maps.fleet_figure import write_figure
-    from fcslam.simulation.floorplan import PieceKind
 
     with ProgressDisplay(console) as display:
         display.start("drawing")

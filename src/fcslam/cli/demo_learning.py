@@ -9,8 +9,8 @@ from fcslam.cli.output import print_line
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.federated.client import RobotClient
-    from fcslam.mission import MissionConfig
+    from fcslam.learning.federated.client import RobotClient
+    from fcslam.mission.mission import MissionConfig
     from fcslam.sources import Source
 
 ROUNDS, STEPS, JUDGED = 6, 50, 2
@@ -41,11 +41,11 @@ def learn_together(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import parse
     from fcslam.features.detector import BUNDLED_NETWORK
-    from fcslam.federated.client_app import build_client_app
-    from fcslam.federated.flower import Context, InProcessGrid
-    from fcslam.federated.history import RoundReport
-    from fcslam.federated.job import FederatedJob, ProgressCallbacks, run_job
-    from fcslam.federated.live_settings import GateSettings, LiveRounds
+    from fcslam.learning.federated.client_app import build_client_app
+    from fcslam.learning.federated.flower import Context, InProcessGrid
+    from fcslam.learning.federated.history import RoundReport
+    from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
+    from fcslam.learning.federated.live_settings import GateSettings, LiveRounds
     from fcslam.learning.trainer import ExecutionOptions
 
     given = {"rounds": ROUNDS, "local_steps": STEPS, "judge_every": JUDGED, "minimum_robots": 1}
@@ -87,9 +87,9 @@ def learn_together(
 
 def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotClient":
     """A robot that drove its recording, with what it saw again."""
-    from fcslam.federated.client import RobotClient, seeded_noise
-    from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings
-    from fcslam.federated.own_examples import own_examples
+    from fcslam.learning.federated.client import RobotClient, seeded_noise
+    from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
+    from fcslam.learning.federated.own_examples import own_examples
     from fcslam.robot.backend import RobotBackend
     from fcslam.robot.beside import Inline
     from fcslam.robot.frontend import RobotFrontend

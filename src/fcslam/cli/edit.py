@@ -11,7 +11,7 @@ import typer
 from fcslam.cli.examples import examples
 
 if TYPE_CHECKING:
-    from fcslam.mission_file import SavedMission
+    from fcslam.mission.mission_file import SavedMission
     from fcslam.records import Change, FloatArray, Pin, RegionUse, Undo, Veto
     from fcslam.runs import Run
 
@@ -51,7 +51,7 @@ def list_edits(mission: Mission) -> None:
 
     from fcslam.cli.output import answers, print_line
     from fcslam.cloud.edits import edit_json, kind_of, undone
-    from fcslam.mission_file import read_mission
+    from fcslam.mission.mission_file import read_mission
 
     edits, console = read_mission(mission).edits, answers()
     gone = undone(edits)
@@ -259,7 +259,7 @@ def place(
     """Choose the map's coordinate frame: by walls or a motion, by a pose, or by points, for example of a floor plan."""
     from fcslam.cli.recordings import pose as read_pose
     from fcslam.errors import InputError
-    from fcslam.map_edits import moved_map
+    from fcslam.mission.map_edits import moved_map
     from fcslam.records import Placement
 
     if (at is None) != (pose is None):
@@ -288,7 +288,7 @@ def _matched(pairs: list[str]) -> tuple["FloatArray", float]:
     import numpy as np
 
     from fcslam.geometry import se2
-    from fcslam.map_edits import motion_to_points
+    from fcslam.mission.map_edits import motion_to_points
 
     ends = [pair.partition("=")[::2] for pair in pairs]
     points, targets = ([_point("--match", end[k]) for end in ends] for k in (0, 1))
@@ -308,7 +308,7 @@ def _turned(run: "Run", map_index: int, to_walls: bool, degrees: float, shift: t
 
 def _decide(mission: Path, decision: "Veto | Pin", author: str | None) -> None:
     """Append a decision about closures; a run folder says which closures there are."""
-    from fcslam.map_edits import check_closure
+    from fcslam.mission.map_edits import check_closure
     from fcslam.runs import open_run
 
     if mission.is_dir():
@@ -317,7 +317,7 @@ def _decide(mission: Path, decision: "Veto | Pin", author: str | None) -> None:
 
 
 def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: int, author: str | None) -> None:
-    from fcslam.map_edits import region_in_map
+    from fcslam.mission.map_edits import region_in_map
 
     points = [_point("a corner", corner) for corner in corners.split()]
     if len(points) == 2:
@@ -330,7 +330,7 @@ def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: in
 def _opened(folder: Path) -> "tuple[Run, SavedMission]":
     """A run and its mission."""
     from fcslam.errors import InputError
-    from fcslam.mission_file import read_mission
+    from fcslam.mission.mission_file import read_mission
     from fcslam.runs import open_run
 
     if folder.is_file():
@@ -340,7 +340,7 @@ def _opened(folder: Path) -> "tuple[Run, SavedMission]":
 
 def _append(path: Path, content: "Change | Undo", author: str | None) -> None:
     """Append an edit, and say what to do next."""
-    from fcslam.mission_file import edit_mission
+    from fcslam.mission.mission_file import edit_mission
 
     (edit,) = edit_mission(path, [content], author or _user(), time.time())
     typer.echo(f"edit {edit.number}; to apply it: fcslam map --onto {path} -o NEW", err=True)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 if TYPE_CHECKING:
-    from fcslam.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_beside import RobotLearningPlan
     from fcslam.robot.frontend import RobotConfig
 
 LearnConfig = Annotated[
@@ -55,8 +55,8 @@ class RobotLearning(NamedTuple):
         from fcslam.config import load
         from fcslam.errors import InputError
         from fcslam.features.detector_kinds import DetectorKind
-        from fcslam.federated.learning_beside import RobotLearningPlan
-        from fcslam.federated.live_settings import RobotLearningSettings
+        from fcslam.learning.federated.learning_beside import RobotLearningPlan
+        from fcslam.learning.federated.live_settings import RobotLearningSettings
         from fcslam.records import Channel
         from fcslam.wire.http_transport import addresses
 

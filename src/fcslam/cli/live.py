@@ -20,12 +20,12 @@ from fcslam.cli.warm_up import compiled
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.bridges.parameters import NodeParameters
     from fcslam.errors import FcslamError
-    from fcslam.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_beside import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
+    from fcslam.ros.parameters import NodeParameters
     from fcslam.sources import BagOptions
 
 _SCANS_PER_LINE = 600
@@ -55,10 +55,10 @@ def map_live(
     Raises:
         InputError: the network, its topics, the server or the output cannot be used.
     """
-    from fcslam.bridges.addresses import open_network, parse_address
-    from fcslam.bridges.node import RobotNode, await_sensors
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind
+    from fcslam.ros.addresses import open_network, parse_address
+    from fcslam.ros.node import RobotNode, await_sensors
     from fcslam.runs import prepare_output
 
     place = parse_address(address)
@@ -131,7 +131,7 @@ def _learning(
         yield lambda _pose: None
         return
     from fcslam.errors import CloudError, StateError
-    from fcslam.federated.learning_beside import LearningBeside
+    from fcslam.learning.federated.learning_beside import LearningBeside
     from fcslam.live.standstill import Standstill
 
     with closing(LearningBeside(plan, robot.name, notify)) as learning:
@@ -188,11 +188,11 @@ def record(
     """Record the sensors of a live robot: everything that `fcslam map` needs."""
     from threading import Timer
 
-    from fcslam.bridges.addresses import is_address, open_network, parse_address
-    from fcslam.bridges.node import await_sensors
-    from fcslam.bridges.parameters import NodeParameters
-    from fcslam.bridges.record import record as record_messages
     from fcslam.errors import InputError
+    from fcslam.ros.addresses import is_address, open_network, parse_address
+    from fcslam.ros.node import await_sensors
+    from fcslam.ros.parameters import NodeParameters
+    from fcslam.ros.record import record as record_messages
     from fcslam.sources import BagOptions
 
     console = notices(quiet)

@@ -28,7 +28,7 @@ from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.localization import LocalizationProgress
+    from fcslam.mission.localization import LocalizationProgress
     from fcslam.runs import Run
 
 

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from fcslam.anchoring.anchors import Anchors
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lidar.pair_verification import VerifyPairs
-    from fcslam.mission import MissionConfig, Progress
-    from fcslam.mission_file import SavedMission
+    from fcslam.mission.mission import MissionConfig, Progress
+    from fcslam.mission.mission_file import SavedMission
     from fcslam.page.live_map import LiveMap
     from fcslam.records import Veto
     from fcslam.runs import Run
@@ -144,8 +144,8 @@ def map_recordings(
         from fcslam.cluster.verifying import verifying
         from fcslam.cluster.workers import Workers
         from fcslam.errors import InputError
-        from fcslam.mission import continued_config
-        from fcslam.mission_file import read_mission
+        from fcslam.mission.mission import continued_config
+        from fcslam.mission.mission_file import read_mission
         from fcslam.robot.calibrating import calibrated
         from fcslam.runs import prepare_output, read_vetoes
 
@@ -206,7 +206,7 @@ def map_sources(
         from fcslam import api
         from fcslam.cli.progress import ProgressDisplay
         from fcslam.lidar.pair_verification import verify_here
-        from fcslam.mission import NOTHING_KNOWN
+        from fcslam.mission.mission import NOTHING_KNOWN
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()

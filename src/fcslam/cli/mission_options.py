@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cloud.fusion_strategy import FusionStrategy
-from fcslam.presets import Preset
+from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
 
 _FROM_CONFIG = "that of the configuration"
 
@@ -77,7 +77,7 @@ def mission_config(
     from fcslam.cli.recordings import pose
     from fcslam.config import changed, load
     from fcslam.errors import ConfigError
-    from fcslam.mission import MissionConfig
+    from fcslam.mission.mission import MissionConfig
 
     config = default if default is not None and file is None and preset is None else MissionConfig()
     for chosen in (None if preset is None else preset.file, file):

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fcslam.simulation.options import Building
+from fcslam.lab.simulation.options import Building
 
 Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print neither progress nor notices on stderr, only errors.")

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_beside import RobotLearningPlan
     from fcslam.live.records import RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.robot.frontend import RobotConfig
@@ -191,11 +191,11 @@ def robot(
 
     With --localize, find a live robot in a finished map instead.
     """
-    from fcslam.bridges.addresses import is_address
     from fcslam.cli.live import map_live
     from fcslam.errors import InputError
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.robot import Playback, Robot
+    from fcslam.ros.addresses import is_address
     from fcslam.sources import BagOptions
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
@@ -291,7 +291,7 @@ def _learn(
     watch: "Callable[[RobotStatus], None]", robot: "Robot",
 ) -> None:  # fmt: skip
     """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
-    from fcslam.federated.learning_beside import LearningBeside
+    from fcslam.learning.federated.learning_beside import LearningBeside
 
     def tell(line: str) -> None:
         print_line(console, line)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from fcslam.bridges.parameters import NodeParameters
+    from fcslam.ros.parameters import NodeParameters
 
 _ROS = "ROS networks"
 
@@ -37,7 +37,7 @@ def node_parameters(file: Path | None, use_sim_time: bool) -> "NodeParameters":
     Raises:
         ConfigError: the file cannot be read, or a parameter is unknown or out of range.
     """
-    from fcslam.bridges.parameters import load_parameters
+    from fcslam.ros.parameters import load_parameters
 
     parameters = load_parameters(file)
     return parameters.model_copy(update={"use_sim_time": True}) if use_sim_time else parameters

@@ -12,7 +12,7 @@ from fcslam.cli.mission_options import ConfigFile, PresetName, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
-from fcslam.presets import Preset
+from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -140,7 +140,7 @@ def serve(
         gc.freeze()  # collecting these objects again and again would delay packets
         routers = [page_router(), report_router(state), *([documentation_router()] if docs else [])]
         if plan is not None:
-            from fcslam.federated.relay import learning_router
+            from fcslam.learning.federated.relay import learning_router
 
             routers.append(learning_router(state, stack.enter_context(learning_beside(plan, state))))
         app = create_app(

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from fcslam.federated.live_settings import RELEASE, RELEASES
+from fcslam.learning.federated.live_settings import RELEASE, RELEASES
 
 if TYPE_CHECKING:
-    from fcslam.federated.live_settings import FleetLearningSettings
+    from fcslam.learning.federated.live_settings import FleetLearningSettings
     from fcslam.service.http.state import ServiceState
 
 
@@ -39,7 +39,7 @@ def learning_plan(learn: bool, config: Path | None, output: Path, store: str | N
     from fcslam.cli.training_options import require_training_libraries
     from fcslam.config import load
     from fcslam.errors import ServiceError
-    from fcslam.federated.live_settings import FleetLearningSettings
+    from fcslam.learning.federated.live_settings import FleetLearningSettings
 
     if not learn:
         if config is not None:
@@ -87,7 +87,7 @@ def learning_beside(plan: FleetLearningPlan, state: "ServiceState") -> Iterator[
     with tempfile.TemporaryDirectory(prefix="fcslam-") as folder:
         listener = Path(folder) / "learning"
         command = (
-            sys.executable, "-m", "fcslam.federated.fleet_learning", "--listener", str(listener),
+            sys.executable, "-m", "fcslam.learning.federated.fleet_learning", "--listener", str(listener),
             "--settings", plan.settings.model_dump_json(), "--output", str(plan.output),
         )  # fmt: skip
         learner = Supervisor(state.missions.root, time.monotonic, announce, command)

@@ -12,13 +12,13 @@ import typer
 
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
-from fcslam.simulation.options import Building, Lighting, OdometryKind, Scanner
+from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
     from fcslam.records import RecordedItem
-    from fcslam.simulation.simulated_fleet import SimulatedFleet
 
 
 def simulate(
@@ -96,10 +96,10 @@ def simulate(
 ) -> None:
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
     from fcslam.errors import OutputError
-    from fcslam.simulation.noise import SCANNERS
-    from fcslam.simulation.odometry import KINDS
-    from fcslam.simulation.recording import prepare_fleet_folder
-    from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.lab.simulation.noise import SCANNERS
+    from fcslam.lab.simulation.odometry import KINDS
+    from fcslam.lab.simulation.recording import prepare_fleet_folder
+    from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 
     if resume and output is None:
         raise OutputError("--resume continues a simulation in its folder; give --output")
@@ -149,8 +149,8 @@ def record_fleet(
 
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import OutputError
-    from fcslam.simulation.ground_truth import write_ground_truth
-    from fcslam.simulation.recording import record_robot
+    from fcslam.lab.simulation.ground_truth import write_ground_truth
+    from fcslam.lab.simulation.recording import record_robot
     from fcslam.sources import open_source, write_bag
 
     began = time.perf_counter()

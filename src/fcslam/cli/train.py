@@ -107,10 +107,10 @@ def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "Train
 def _start_network(
     start: Path, output: Path, settings: "TrainingSettings", options: "ExecutionOptions", images: list[Path]
 ) -> "KeypointNetwork":
-    from fcslam.federated.initial_weights import prepare_initial_weights
-    from fcslam.federated.networks import weights_to_network
-    from fcslam.federated.public_images import read_public_images
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated.initial_weights import prepare_initial_weights
+    from fcslam.learning.federated.networks import weights_to_network
+    from fcslam.learning.federated.public_images import read_public_images
+    from fcslam.learning.federated.settings import FederatedSettings
 
     rounds = FederatedSettings(training=settings)
     weights = prepare_initial_weights(start, output, rounds, options, lambda *_: None, read_public_images(images))

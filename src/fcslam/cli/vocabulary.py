@@ -26,7 +26,7 @@ def vocabulary(
     import numpy as np
 
     from fcslam.errors import SourceError
-    from fcslam.mission_file import read_mission
+    from fcslam.mission.mission_file import read_mission
     from fcslam.places.words import short, train_words, write_vocabularies
     from fcslam.records import Channel, Place
 

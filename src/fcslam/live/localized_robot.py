@@ -19,8 +19,8 @@ from fcslam.geometry import se2
 from fcslam.live.inputs import Lasers, checked_pose
 from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
 from fcslam.live.tracker import LiveTracker
-from fcslam.localization import LocalizedDrive, read_map
-from fcslam.mission import MissionConfig
+from fcslam.mission.localization import LocalizedDrive, read_map
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.beside import worker_process
 from fcslam.robot.frontend import NewestScan, RobotFrontend

@@ -15,7 +15,7 @@ from fcslam.cloud.report import Track, fuse_members
 from fcslam.errors import FcslamError
 from fcslam.geometry import se2
 from fcslam.maps.fusion import fuse
-from fcslam.mission import MissionCloud, MissionConfig
+from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.records import ClosureStatus, Correction, FloatArray, frozen
 from fcslam.runs import Run
 from fcslam.runs.map_files import OccupancyMap

@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 
 from fcslam.api import StrPath, settings_of
 from fcslam.cloud.sessions import session_name
-from fcslam.driving import track_of
 from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
@@ -39,7 +38,8 @@ from fcslam.live.own_map import OwnMap
 from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
 from fcslam.live.tracker import LiveTracker
 from fcslam.maps.joint_tiles import padded
-from fcslam.mission import MissionConfig
+from fcslam.mission.driving import track_of
+from fcslam.mission.mission import MissionConfig
 from fcslam.records import (
     CameraModel,
     Correction,

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import cv2
 
 from fcslam.errors import FcslamError
-from fcslam.mission import MissionCloud
+from fcslam.mission.mission import MissionCloud
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
 from fcslam.processes import Background, Start, obey_parent, start_copy, start_method

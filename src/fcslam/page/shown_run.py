@@ -10,10 +10,10 @@ from types import TracebackType
 from typing import Self
 
 from fcslam.cloud.sessions import robot_and_epoch
-from fcslam.mission_file import opened_copy
+from fcslam.mission.mission_file import opened_copy
+from fcslam.mission.mission_store import MissionStore
 from fcslam.runs.folder import MISSION, identity, is_run_folder
 from fcslam.service.intake import SessionState
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import PacketCounts, viewed_run
 
 

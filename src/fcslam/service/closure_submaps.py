@@ -9,9 +9,9 @@ from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import SPACING_M
 from fcslam.maps.closure_picture import closure_png
 from fcslam.maps.palette import ROBOTS, robot_colors
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import FloatArray, Keyscan
 from fcslam.runs import ClosureRow, Run
-from fcslam.service.mission_store import MissionStore
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode
 

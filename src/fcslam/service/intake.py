@@ -11,8 +11,8 @@ from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import ReplyState, replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.errors import FcslamError, PacketError
+from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import Channel, DetectorFile, Place, WordPlace
-from fcslam.service.mission_store import MissionStore, StoredPacket
 from fcslam.service.token_buckets import TokenBuckets
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS

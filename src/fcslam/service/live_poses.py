@@ -4,9 +4,9 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.scan import keyscan_points
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan
 from fcslam.runs import RobotTrajectory
-from fcslam.service.mission_store import MissionStore
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode
 

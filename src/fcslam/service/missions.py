@@ -9,11 +9,11 @@ from typing import IO, Protocol
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.cloud.shared_words import SharedWords
 from fcslam.errors import InputError, ServiceError, StoreError
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.supervisor import RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors

@@ -15,6 +15,7 @@ from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
 from fcslam.maps.palette import robot_colors
 from fcslam.maps.tiles import finest_zoom
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel, ClosureStatus, Edit
 from fcslam.runs import ClosureRow, Run, separations
 from fcslam.runs.map_files import HEADER_BYTES, area_of, map_stem
@@ -27,7 +28,6 @@ from fcslam.service.http.responses import (
     SessionSummary,
 )
 from fcslam.service.live_poses import live_pose
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes
 from fcslam.wire.messages import Hello

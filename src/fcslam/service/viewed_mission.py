@@ -4,10 +4,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import Run, open_run
 from fcslam.runs.folder import identity
 from fcslam.service.intake import SessionState
-from fcslam.service.mission_store import MissionStore
 
 
 class PacketCounts(NamedTuple):

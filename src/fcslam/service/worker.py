@@ -45,13 +45,13 @@ from fcslam.cluster.workers import Workers
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
+from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.processes import Background, Start, start_copy
 from fcslam.records import Edit
 from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, SharedFiles
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
 from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS

@@ -11,6 +11,7 @@ import httpx
 import uvicorn
 
 from fcslam.cloud.settings import CloudConfig
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel
 from fcslam.service.audit_log import AuditFile, AuditLog
 from fcslam.service.http.app import create_app
@@ -19,7 +20,6 @@ from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.state import ServiceState
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.missions import Missions
 from fcslam.service.worker import Worker
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch

@@ -20,12 +20,12 @@ from fcslam.cloud.recognition import VocabularyState
 from fcslam.errors import ServiceError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.maps.palette import ROBOTS
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel, Correction, Keyscan, ReasonCode
 from fcslam.runs import open_run
 from fcslam.service import intake
 from fcslam.service.http import operations
 from fcslam.service.http import prometheus as measures
-from fcslam.service.mission_store import MissionStore
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.batches import read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
@@ -275,8 +275,8 @@ def test_a_full_disk_is_507_and_the_result_comes_when_there_is_room(mapped, monk
     with monkeypatch.context() as patched:
         patched.setattr("fcslam.service.http.decisions.LEAST_FREE_BYTES", 2**62)
         patched.setattr("fcslam.runs.Run.save", full)
-        patched.setattr("fcslam.service.mission_store.MissionStore.answer", full)
-        patched.setattr("fcslam.service.mission_store.MissionStore.progress", full)
+        patched.setattr("fcslam.mission.mission_store.MissionStore.answer", full)
+        patched.setattr("fcslam.mission.mission_store.MissionStore.progress", full)
         response = mapped.ask("POST", f"{API}/finalize", "boss")
         assert response.status_code == 507
         assert "free" in response.json()["error"]

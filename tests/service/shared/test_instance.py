@@ -6,17 +6,17 @@ import time
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.service.test_mission_store import packet
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import ServiceError, StoreError
+from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import BusyError, LeaseError
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
 from fcslam.service.shared.audit_table import AuditTable
 from fcslam.service.shared.instance import LOOK_S, REST_LOOK_S, REST_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.registry import LEASE_S, Registry
-from tests.service.test_mission_store import packet
 
 
 class Started:

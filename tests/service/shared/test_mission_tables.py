@@ -5,16 +5,16 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from tests.service.test_mission_store import correction, packet
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import StoreError
+from fcslam.mission.mission_store import TABLES, MissionStore, StoredPacket, check_mission
 from fcslam.records import Removal, Veto, frozen
-from fcslam.service.mission_store import TABLES, MissionStore, StoredPacket, check_mission
 from fcslam.service.shared.files import SharedFiles, fetch_folder, fetched
 from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables
 from fcslam.storage.postgres import Postgres
-from tests.service.test_mission_store import correction, packet
 
 
 def fill(store):

@@ -3,7 +3,7 @@
 import pytest
 
 from fcslam.errors import StoreError
-from fcslam.service.mission_store import MissionStore
+from fcslam.mission.mission_store import MissionStore
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import Registry
 from fcslam.service.shared.schema import MIGRATIONS, Migration, prepare

@@ -12,7 +12,7 @@ from fcslam.cli.output import answers, notices, print_line
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.evaluation.fleet.closures import ClosureReport
+    from fcslam.lab.evaluation.fleet.closures import ClosureReport
     from fcslam.metrics.closures import ClosureCriteria, Precision
 
 
@@ -37,8 +37,8 @@ def closures(
 ) -> None:
     """Measure precision and recall of a run's closures, by stage, against the optimised graph of the relations."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.fleet.closures import closure_metrics, evaluate_closures
-    from fcslam.evaluation.fleet.relations import write_metrics
+    from fcslam.lab.evaluation.fleet.closures import closure_metrics, evaluate_closures
+    from fcslam.lab.evaluation.fleet.relations import write_metrics
     from fcslam.metrics.closures import ClosureCriteria
 
     criteria = ClosureCriteria(bridge_s, wrong_m, wrong_deg, reach_m)
@@ -72,7 +72,7 @@ def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None
 
 def _explain_closures(console: "Console", report: "ClosureReport", criteria: "ClosureCriteria") -> None:
     """Print the reference and the definitions behind the tables."""
-    from fcslam.evaluation.fleet.closures import closure_metrics
+    from fcslam.lab.evaluation.fleet.closures import closure_metrics
     from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S
 
     value = {metric.name: metric.value for metric in closure_metrics(report)}

@@ -12,7 +12,7 @@ from fcslam.cli.training_options import TRAINING_OUTPUT, Device, compute_budget,
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from fcslam.evaluation.federated.report import ArmReport
+    from fcslam.lab.evaluation.federated.report import ArmReport
 
 
 def federated(
@@ -33,8 +33,8 @@ def federated(
     from fcslam.errors import EvaluationError
 
     require_training_libraries("flwr", extra="federated")
-    from fcslam.evaluation.federated.report import report, write_report
-    from fcslam.evaluation.federated.study import Study, StudySettings, run_study
+    from fcslam.lab.evaluation.federated.report import report, write_report
+    from fcslam.lab.evaluation.federated.study import Study, StudySettings, run_study
 
     folders = {folder.resolve().name: folder for folder in robots}
     if len(folders) < max(len(robots), 2):

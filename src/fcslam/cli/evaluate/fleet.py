@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.fleet.closures import ClosureScope
-    from fcslam.evaluation.fleet.report import FleetReport
+    from fcslam.lab.evaluation.fleet.closures import ClosureScope
+    from fcslam.lab.evaluation.fleet.report import FleetReport
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
@@ -44,9 +44,9 @@ def fleet(
 ) -> None:
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.fleet.metrics import fleet_metrics
-    from fcslam.evaluation.fleet.relations import write_metrics
-    from fcslam.evaluation.fleet.report import evaluate_fleet
+    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
+    from fcslam.lab.evaluation.fleet.relations import write_metrics
+    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
     from fcslam.metrics.closures import ClosureCriteria
 
     with ProgressDisplay(notices(quiet)) as display:
@@ -56,7 +56,7 @@ def fleet(
     if csv is not None:
         write_metrics(fleet_metrics(report), csv)
     if figure is not None:
-        from fcslam.evaluation.fleet.charts import fleet_charts
+        from fcslam.lab.evaluation.fleet.charts import fleet_charts
         from fcslam.maps.fleet_figure import write_figure
 
         with ProgressDisplay(notices(quiet)) as display:
@@ -66,7 +66,7 @@ def fleet(
 
 def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
     """Print the report as tables and, if ``explained``, the definitions behind them."""
-    from fcslam.evaluation.fleet.closures import ClosureScope
+    from fcslam.lab.evaluation.fleet.closures import ClosureScope
 
     closures = (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
@@ -106,7 +106,7 @@ def _closures(report: "FleetReport", within: "ClosureScope") -> "Table":
     """Table of the channels that closed something, and of both together if both did."""
     from rich.table import Table
 
-    from fcslam.evaluation.fleet.closure_stages import BOTH
+    from fcslam.lab.evaluation.fleet.closure_stages import BOTH
 
     table = Table(_KINDS[within], "channel", "all", "wrong", "precision", "recall", "like heading", "at 100 %")
     scores = {(status, channel): score for (kind, status, channel), score in report.closures.items() if kind is within}
@@ -151,8 +151,8 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
 
 
 def _explanations(report: "FleetReport") -> "Iterator[str]":
-    from fcslam.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
-    from fcslam.evaluation.fleet.closures import ClosureScope
+    from fcslam.lab.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
+    from fcslam.lab.evaluation.fleet.closures import ClosureScope
     from fcslam.metrics.grid import TOLERANCE_M
     from fcslam.metrics.revisits import RevisitCriteria
 
@@ -178,7 +178,7 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
 
 
 def _revisits(report: "FleetReport", within: "ClosureScope") -> str:
-    from fcslam.evaluation.fleet.closure_stages import BOTH
+    from fcslam.lab.evaluation.fleet.closure_stages import BOTH
     from fcslam.records import ClosureStatus
 
     score = report.closures[within, ClosureStatus.ACCEPTED, BOTH]

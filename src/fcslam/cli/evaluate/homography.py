@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.detectors.homography import HomographyReport, PairResult
+    from fcslam.lab.evaluation.detectors.homography import HomographyReport, PairResult
     from fcslam.metrics.bootstrap import Interval
 
 
@@ -58,11 +58,11 @@ def homography(
 ) -> None:
     """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
-    from fcslam.evaluation.detectors.figures import draw_figures
-    from fcslam.evaluation.detectors.homography import evaluate_homography
-    from fcslam.evaluation.detectors.measures import write_pairs
-    from fcslam.evaluation.detectors.scenes import find_scenes
+    from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
+    from fcslam.lab.evaluation.detectors.figures import draw_figures
+    from fcslam.lab.evaluation.detectors.homography import evaluate_homography
+    from fcslam.lab.evaluation.detectors.measures import write_pairs
+    from fcslam.lab.evaluation.detectors.scenes import find_scenes
 
     found = find_scenes(scenes)
     detectors = choose_detectors(detector or (), weights or (), features or ())
@@ -103,9 +103,9 @@ def _show(console: "Console", report: "HomographyReport", truth: HomographyGroun
 def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.detectors.homography import LARGE, SMALL
-    from fcslam.evaluation.detectors.measures import interval, mean
-    from fcslam.evaluation.detectors.scenes import SceneKind
+    from fcslam.lab.evaluation.detectors.homography import LARGE, SMALL
+    from fcslam.lab.evaluation.detectors.measures import interval, mean
+    from fcslam.lab.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="I. Repeatability", title_justify="left")
     for heading in ("", "illumination", "viewpoint", "all", "localisation error, px", "ms 320x240", "ms 640x480"):
@@ -127,9 +127,9 @@ def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
 def _homography_table(report: "HomographyReport", described: "Sequence[str]", seed: int) -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX
-    from fcslam.evaluation.detectors.measures import CORRECT_CORNERS_PX, interval, mean
-    from fcslam.evaluation.detectors.scenes import SceneKind
+    from fcslam.lab.evaluation.detectors.homography import MATCHING_NMS_PX
+    from fcslam.lab.evaluation.detectors.measures import CORRECT_CORNERS_PX, interval, mean
+    from fcslam.lab.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="II. Homography estimation", title_justify="left")
     for heading in ("", "NMS", "illumination, e=3", "viewpoint, e=3", *(f"all, e={px}" for px in CORRECT_CORNERS_PX)):
@@ -148,9 +148,9 @@ def _homography_table(report: "HomographyReport", described: "Sequence[str]", se
 def _matching_table(report: "HomographyReport", described: "Sequence[str]") -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX
-    from fcslam.evaluation.detectors.measures import mean
-    from fcslam.evaluation.detectors.scenes import SceneKind
+    from fcslam.lab.evaluation.detectors.homography import MATCHING_NMS_PX
+    from fcslam.lab.evaluation.detectors.measures import mean
+    from fcslam.lab.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="Matching", title_justify="left")
     accuracy = ("MMA@1", "MMA@3", "MMA@5", "MMA@10", "illumination MMA@3", "viewpoint MMA@3")
@@ -171,7 +171,7 @@ def _matching_table(report: "HomographyReport", described: "Sequence[str]") -> "
 def _scene_table(report: "HomographyReport") -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.detectors.measures import mean
+    from fcslam.lab.evaluation.detectors.measures import mean
 
     titles = {
         "repeatability": "repeatability",
@@ -191,7 +191,7 @@ def _scene_table(report: "HomographyReport") -> "Table":
 def _difference_table(report: "HomographyReport", seed: int) -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.detectors.measures import difference
+    from fcslam.lab.evaluation.detectors.measures import difference
 
     first, *others = report.detectors
     titles = {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.places.report import SetResult
+    from fcslam.lab.evaluation.places.report import SetResult
     from fcslam.metrics.bootstrap import Interval
     from fcslam.places.vocabulary import Strategy
 
@@ -54,8 +54,8 @@ def places(
 ) -> None:
     """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.places.figures import curves_figure, save
-    from fcslam.evaluation.places.report import write_results
+    from fcslam.lab.evaluation.places.figures import curves_figure, save
+    from fcslam.lab.evaluation.places.report import write_results
 
     strategies = _strategies(strategy or ("static", "windowed", "incremental"))
     output = output or new_folder(EVALUATIONS)
@@ -80,11 +80,11 @@ def _evaluate(
     verify: bool,
     sequence: bool,
 ) -> "list[SetResult]":
-    from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
-    from fcslam.evaluation.places.report import evaluate_set
-    from fcslam.evaluation.places.scoring import choose_scorers
-    from fcslam.evaluation.places.sequences import in_sequence, plain
-    from fcslam.evaluation.places.verification import PairVerifier
+    from fcslam.lab.evaluation.places.features import choose_features, describe_sets, describe_training
+    from fcslam.lab.evaluation.places.report import evaluate_set
+    from fcslam.lab.evaluation.places.scoring import choose_scorers
+    from fcslam.lab.evaluation.places.sequences import in_sequence, plain
+    from fcslam.lab.evaluation.places.verification import PairVerifier
     from fcslam.places.vocabulary import VocabularyConfig
 
     chosen = choose_features(features)

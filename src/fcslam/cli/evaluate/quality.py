@@ -27,8 +27,8 @@ def quality(
     from rich.table import Table
 
     from fcslam.errors import EvaluationError
-    from fcslam.evaluation.fleet.quality import certificates_of, evaluate_quality
-    from fcslam.evaluation.fleet.relations import write_metrics
+    from fcslam.lab.evaluation.fleet.quality import certificates_of, evaluate_quality
+    from fcslam.lab.evaluation.fleet.relations import write_metrics
     from fcslam.runs import open_run
 
     if bar is not None and not 0.0 < bar < float("inf"):

@@ -39,7 +39,7 @@ def relations(
     csv: Csv = None,
 ) -> None:
     """Measure a run by the relations metric of Kuemmerle et al. 2009: mean, standard deviation and maximum."""
-    from fcslam.evaluation.fleet.relations import (
+    from fcslam.lab.evaluation.fleet.relations import (
         RelationsQuestion,
         evaluate_relations,
         relation_metrics,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.places.vocabulary_growth import Growth
+    from fcslam.lab.evaluation.places.vocabulary_growth import Growth
 
 
 def vocabulary(
@@ -39,9 +39,15 @@ def vocabulary(
 
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import EvaluationError
-    from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
-    from fcslam.evaluation.places.growth_figure import write_growth
-    from fcslam.evaluation.places.vocabulary_growth import BATCH, Arrival, draw_groups, fixed_growths, grow_vocabulary
+    from fcslam.lab.evaluation.places.features import choose_features, describe_sets, describe_training
+    from fcslam.lab.evaluation.places.growth_figure import write_growth
+    from fcslam.lab.evaluation.places.vocabulary_growth import (
+        BATCH,
+        Arrival,
+        draw_groups,
+        fixed_growths,
+        grow_vocabulary,
+    )
     from fcslam.places.vocabulary import Strategy, VocabularyConfig
 
     chosen = choose_features(features)
@@ -76,7 +82,7 @@ def _table(growths: "Mapping[str, Growth]", seed: int) -> "Table":
     import numpy as np
     from rich.table import Table
 
-    from fcslam.evaluation.places.vocabulary_growth import MEASURES
+    from fcslam.lab.evaluation.places.vocabulary_growth import MEASURES
 
     table = Table("", *MEASURES, "words", "s for 40 places, median", title_justify="left")
     for name, growth in growths.items():

@@ -39,9 +39,9 @@ def join(
     """
     require_training_libraries("flwr", extra="federated")
     from fcslam.errors import PacketError, TrainingError
-    from fcslam.federated import launch
-    from fcslam.federated.client import RobotClient, secret_noise
-    from fcslam.federated.fleet_robot import RobotLink
+    from fcslam.learning.federated import launch
+    from fcslam.learning.federated.client import RobotClient, secret_noise
+    from fcslam.learning.federated.fleet_robot import RobotLink
     from fcslam.wire.checks import check_name
     from fcslam.wire.keys import read_token
 

@@ -53,8 +53,8 @@ def local(
 
     settings = federated_settings(config, quick, strategy, rounds, local_steps, seed)
     require_training_libraries("flwr", extra="federated")
-    from fcslam.federated.job import FederatedJob
-    from fcslam.federated.local import federate_locally
+    from fcslam.learning.federated.job import FederatedJob
+    from fcslam.learning.federated.local import federate_locally
 
     console = notices(quiet)
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated.settings import FederatedSettings
 
 QUICK = {"rounds": 3, "local_steps": 6, "judge_every": 1}
 QUICK_TRAINING = {"shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
@@ -47,7 +47,7 @@ def federated_settings(
         ConfigError: the file cannot be read, or a value is invalid.
     """
     from fcslam.config import load, parse
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated.settings import FederatedSettings
 
     content = (FederatedSettings() if file is None else load(FederatedSettings, file)).model_dump()
     if quick:

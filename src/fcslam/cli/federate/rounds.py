@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.federated.history import RoundReport
-    from fcslam.federated.job import ProgressCallbacks
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.federated.history import RoundReport
+    from fcslam.learning.federated.job import ProgressCallbacks
+    from fcslam.learning.federated.settings import FederatedSettings
     from fcslam.learning.trainer import TrainingProgress
 
 
@@ -35,7 +35,7 @@ def round_line(row: Mapping[str, str], rounds: int) -> str:
 
 def show_rounds(display: "ProgressDisplay", console: "Console", settings: "FederatedSettings") -> "ProgressCallbacks":
     """Show the stages before the rounds, the rounds and the local training in them; print a line for each round."""
-    from fcslam.federated.job import ProgressCallbacks
+    from fcslam.learning.federated.job import ProgressCallbacks
 
     def stage(name: str, status: "TrainingProgress") -> None:
         display.show(name, status.step, status.steps)

@@ -71,8 +71,8 @@ def serve(
 
     settings = federated_settings(config, quick, strategy, rounds, local_steps, seed)
     require_training_libraries("flwr", extra="federated")
-    from fcslam.federated import launch
-    from fcslam.federated.job import FederatedJob
+    from fcslam.learning.federated import launch
+    from fcslam.learning.federated.job import FederatedJob
     from fcslam.service.http.authentication import Authenticator, read_tokens
 
     tls = None if tls_certificate is None or tls_key is None else (tls_certificate, tls_key)

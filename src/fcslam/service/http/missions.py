@@ -14,13 +14,13 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.config import Settings
 from fcslam.errors import StoreError
+from fcslam.mission.mission_store import check_mission
 from fcslam.records import NAME
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import MissionList, content, refusals
 from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
-from fcslam.service.mission_store import check_mission
 from fcslam.service.missions import EXPORT, IMPORT
 from fcslam.storage.database import translate_errors
 

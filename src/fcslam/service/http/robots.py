@@ -6,6 +6,7 @@ from fastapi import APIRouter, Header, HTTPException, Path, Request
 from fastapi.responses import FileResponse, Response
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.mission.mission_store import MissionStore
 from fcslam.records import NAME, Channel
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import RateLimit, read_body
@@ -19,7 +20,6 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.http.state import ServiceState
 from fcslam.service.intake import IntakeReply
-from fcslam.service.mission_store import MissionStore
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fcslam.errors import ServiceError
-from fcslam.service.mission_store import SCHEMA, TABLES, VERSION
+from fcslam.mission.mission_store import SCHEMA, TABLES, VERSION
 from fcslam.service.shared.schema import schema_of
 from fcslam.storage.database import Database, translate_errors
 from fcslam.storage.postgres import Postgres, PostgresTables, PostgresTransaction

@@ -13,9 +13,9 @@ from typing import Final
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import ServiceError
+from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import MissionStore
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, check_words, locked, sweep
 from fcslam.service.shared.agents import RobotLimit, SharedAgents
 from fcslam.service.shared.detectors import SharedDetectors

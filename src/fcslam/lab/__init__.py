@@ -1,0 +1,1 @@
+"""The laboratory: simulation, evaluation and the configuration of the paper."""

@@ -1,0 +1,49 @@
+"""Poisoned clients, for studies and tests of how well a fleet tolerates them."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fcslam.learning.federated.client import ClientUpdate, FederatedClient
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights, apply_update, trained_names, update_vector
+
+Poison = Literal["flipped", "scaled", "reversed", "random", "nan"]
+SCALE = 10.0
+"""Factor of scaled and of reversed updates: large enough to dominate a mean of a few robots."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoisonedClient:
+    """Trains like another client, and falsifies its update before it leaves."""
+
+    client: FederatedClient
+    poison: Poison
+
+    @property
+    def name(self) -> str:
+        """Name of the other client."""
+        return self.client.name
+
+    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
+        """As in ``FederatedClient``."""
+        trained = self.client.train(weights, round_number, run_id, settings)
+        names = trained_names(weights, frozen_statistics=True)
+        update = update_vector(trained.weights, weights, names)
+        match self.poison:
+            case "flipped":
+                update = -update
+            case "scaled":
+                update = SCALE * update
+            case "reversed":
+                update = -SCALE * update
+            case "random":
+                update = np.random.default_rng([settings.training.seed, round_number]).permutation(update)
+            case "nan":
+                update = np.full_like(update, np.nan)
+        return ClientUpdate(apply_update(weights, update, names), trained.losses)
+
+    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """As in ``FederatedClient``."""
+        return self.client.evaluate(weights, settings)

@@ -1,0 +1,119 @@
+"""Precision and recall of a run's closures against the ground truth, by channel, stage and scope."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureScope, closure_rows, closure_sets
+from fcslam.lab.evaluation.fleet.ground_truth import KnownPoses
+from fcslam.metrics.closures import (
+    ClosureCriteria,
+    ClosureErrors,
+    Mask,
+    PoseReference,
+    Precision,
+    Recall,
+    Rows,
+    closure_errors,
+    precision,
+)
+from fcslam.metrics.relations import PoseTable
+from fcslam.metrics.revisits import RevisitCriteria, Revisits, find_revisits
+from fcslam.records import Channel, ClosureStatus, FloatArray
+from fcslam.runs import Run
+
+BOTH = "both"
+CHANNELS: Mapping[str, frozenset[Channel]] = MappingProxyType(
+    {**{str(channel): frozenset({channel}) for channel in Channel}, BOTH: frozenset(Channel)}
+)
+"""Sets of channels that are scored: each channel alone, and both together."""
+
+LIKE_HEADING_DEG = 45.0
+"""Largest difference of headings at which cameras with a common field of view see the same scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetClosureScore:
+    """Scores of one set of closures against the ground truth."""
+
+    precision: Precision
+    recall: Recall
+    """Recall of all revisits."""
+    recall_like_heading: Recall
+    """Recall of the revisits with similar headings."""
+    recall_full_precision: Recall
+    """Recall of all revisits at 100 % precision: only closures more similar than every wrong one of their channel."""
+
+
+FleetClosures = Mapping[tuple[ClosureScope, ClosureStatus, str], FleetClosureScore]
+"""Scores by scope, stage and name in ``CHANNELS``."""
+
+
+def score_closures(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> FleetClosures:
+    """Score all sets of closures. A closure is not covered if the true pose of an end is unknown."""
+    judged, sets = _judge(run, known, criteria), closure_sets(run)
+    scores = {}
+    for within in ClosureScope:
+        asked = RevisitCriteria(within_gap_s=criteria.within_gap_s)
+        across = within is ClosureScope.FLEET
+        revisits = find_revisits(known.truth, asked, across)
+        alike = find_revisits(known.truth, replace(asked, turn_deg=LIKE_HEADING_DEG), across)
+        for status in STAGES:
+            for name, channels in CHANNELS.items():
+                scores[within, status, name] = judged.score(sets[within, status], channels, revisits, alike)
+    return MappingProxyType(scores)
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """All closures with their errors; rows are those of the known poses."""
+
+    truth: PoseTable
+    criteria: ClosureCriteria
+    pairs: Rows
+    """Shape (K, 2)."""
+    errors: ClosureErrors
+    similarity: FloatArray
+    """Shape (K,)."""
+    of_channel: Mapping[Channel, Mask]
+    """Shape (K,) each."""
+
+    def score(
+        self, stage: Mask, channels: frozenset[Channel], revisits: Revisits, alike: Revisits
+    ) -> FleetClosureScore:
+        """Score the closures of some channels that ``stage``, shape (K,), selects."""
+        sets = [stage & self.of_channel[channel] for channel in channels]
+        members: Mask = np.logical_or.reduce(sets)
+        surest: Mask = np.logical_or.reduce([self._at_full_precision(channel_set) for channel_set in sets])
+        return FleetClosureScore(
+            precision(self.errors, members, self.criteria),
+            self._recall(members, revisits),
+            self._recall(members, alike),
+            self._recall(surest, revisits),
+        )
+
+    def _recall(self, members: Mask, revisits: Revisits) -> Recall:
+        correct = self.pairs[members & self.errors.correct(self.criteria)]
+        return revisits.recall(correct, self.truth, self.criteria.reach_m)
+
+    def _at_full_precision(self, members: Mask) -> Mask:
+        """Members (K,) that are more similar than every wrong member."""
+        wrong = members & self.errors.covered & ~self.errors.correct(self.criteria)
+        surer: Mask = members & (self.similarity > np.max(self.similarity[wrong], initial=-np.inf))
+        return surer
+
+
+def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
+    truth = known.truth
+    pairs = closure_rows(run, truth)
+    T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
+    every_row, one_frame = np.arange(len(truth.stamps)), np.zeros(len(truth.stamps), dtype=np.int64)
+    # The truth is known at the stamps of the closures, so the run's trajectory does not bridge any gap.
+    reference = PoseReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
+    return _Judged(
+        truth, criteria, pairs, closure_errors(pairs, T_i_j, truth, reference),
+        np.array([closure.similarity for closure in run.closures]),
+        {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in Channel},
+    )  # fmt: skip

@@ -1,0 +1,169 @@
+"""Evaluates a run folder against the ground truth: trajectories, closures, joins, the map, and the traffic."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.lab.evaluation.fleet.closure_stages import FleetClosures, score_closures
+from fcslam.lab.evaluation.fleet.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
+from fcslam.metrics.closures import ClosureCriteria, Mask
+from fcslam.metrics.grid import GridAgreement, grid_agreement
+from fcslam.metrics.relations import RelationErrors
+from fcslam.metrics.trajectory import (
+    PositionErrors,
+    TrajectoryPair,
+    align,
+    near_pairs,
+    placement_error,
+    position_errors,
+    relative_errors,
+)
+from fcslam.records import Channel, FloatArray
+from fcslam.runs import Run, open_run
+
+
+@dataclass(frozen=True, slots=True)
+class RobotScore:
+    """Scores of one robot's trajectory, and its traffic."""
+
+    robot: str
+    map_index: int
+    poses: int
+    """Laser scans in the run."""
+    covered: int
+    """Laser scans with a true pose."""
+    joint: PositionErrors
+    """ATE after alignment of the robot's whole map with the truth."""
+    alone: PositionErrors
+    """ATE after alignment of this robot's trajectory with the truth."""
+    path_length_m: float
+    """Length of the true path."""
+    duration_s: float
+    uplink_bytes: float
+    """NaN if the run does not have it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """Two robots in one map."""
+
+    robot_a: str
+    robot_b: str
+    translation_m: float
+    """Relative error of both robots, translation."""
+    rotation_deg: float
+    """Relative error of both robots, rotation."""
+
+    def is_false(self, criteria: ClosureCriteria) -> bool:
+        """Whether the relative error exceeds the thresholds of a wrong closure, or cannot be measured (NaN)."""
+        return not (self.translation_m <= criteria.wrong_m and self.rotation_deg <= criteria.wrong_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceTraffic:
+    """Traffic of places; NaN if the run does not have it."""
+
+    packets: float
+    bytes: float
+
+
+@dataclass(frozen=True, slots=True)
+class FleetReport:
+    """Scores of a run against the ground truth."""
+
+    truth: Path
+    """Folder of the ground truth."""
+    criteria: ClosureCriteria
+    robots: tuple[RobotScore, ...]
+    maps: int
+    joins: tuple[Join, ...]
+    """All pairs of robots in one map."""
+    within: RelationErrors
+    """Errors of relative poses of one robot."""
+    across: RelationErrors
+    """Errors of relative poses of different robots; pairs in different maps are unusable."""
+    closures: FleetClosures
+    agreement: GridAgreement | None
+    """Agreement of the first map with the true map; None without a true map."""
+    places: Mapping[Channel, PlaceTraffic]
+
+    @property
+    def false_joins(self) -> tuple[Join, ...]:
+        """Joins with a relative error above the thresholds, or without one."""
+        return tuple(join for join in self.joins if join.is_false(self.criteria))
+
+
+def evaluate_fleet(run: Path, truth: Path | None = None, criteria: ClosureCriteria | None = None) -> FleetReport:
+    """Evaluate the run folder ``run`` against the ground truth in a folder, by default that of ``truth_folder``.
+
+    Raises:
+        EvaluationError: the run or a robot's truth is missing or cannot be read, or they are of different recordings.
+    """
+    opened, folder, criteria = open_run(run), truth_folder(run, truth), criteria or ClosureCriteria()
+    known = known_poses(opened, folder)
+    alignments = {k: align(*_poses(known, known.estimate.maps == k)) for k in np.unique(known.estimate.maps).tolist()}
+    rng = np.random.default_rng(0)
+    figures = {name: metric.value for name, metric in opened.metrics.items()}
+    return FleetReport(
+        truth=folder,
+        criteria=criteria,
+        robots=_robot_scores(opened, known, alignments, figures),
+        maps=len(alignments),
+        joins=_joins(opened, known),
+        within=relative_errors(near_pairs(known.truth, rng, across_robots=False), known.truth, known.estimate),
+        across=relative_errors(near_pairs(known.truth, rng, across_robots=True), known.truth, known.estimate),
+        closures=score_closures(opened, known, criteria),
+        agreement=_agreement(run, folder, alignments),
+        places={channel: _place_traffic(channel, figures) for channel in Channel},
+    )
+
+
+def _poses(known: KnownPoses, rows: Mask) -> tuple[FloatArray, FloatArray]:
+    """``T_truth_base`` and ``T_map_base`` (N, 3) of the rows that ``rows`` (M,) selects."""
+    return known.truth.T_map_base[rows], known.estimate.T_map_base[rows]
+
+
+def _robot_scores(
+    run: Run, known: KnownPoses, alignments: Mapping[int, FloatArray], figures: Mapping[str, float]
+) -> tuple[RobotScore, ...]:
+    scores = []
+    for number, trajectory in enumerate(run.trajectories.values()):
+        true, estimated = _poses(known, known.truth.robots == number)
+        joint, alone = alignments[trajectory.map_index], align(true, estimated)
+        scores.append(
+            RobotScore(
+                robot=trajectory.robot,
+                map_index=trajectory.map_index,
+                poses=len(trajectory.stamps),
+                covered=len(true),
+                joint=PositionErrors.of(position_errors(joint, true, estimated)),
+                alone=PositionErrors.of(position_errors(alone, true, estimated)),
+                path_length_m=float(np.hypot(*np.diff(true[:, :2], axis=0).T).sum()),
+                duration_s=float(np.ptp(trajectory.stamps)),
+                uplink_bytes=figures.get(f"uplink_bytes_{trajectory.robot}", np.nan),
+            )
+        )
+    return tuple(scores)
+
+
+def _joins(run: Run, known: KnownPoses) -> tuple[Join, ...]:
+    tracks = [TrajectoryPair(*_poses(known, known.truth.robots == number)) for number in range(len(run.trajectories))]
+    robots = list(zip(run.trajectories.values(), tracks, strict=True))
+    return tuple(
+        Join(a.robot, b.robot, *placement_error(track_a, track_b))
+        for (a, track_a), (b, track_b) in combinations(robots, 2)
+        if a.map_index == b.map_index
+    )
+
+
+def _agreement(run: Path, folder: Path, alignments: Mapping[int, FloatArray]) -> GridAgreement | None:
+    if not (folder / TRUE_MAP).is_file():
+        return None
+    return grid_agreement(read_grid(run / "map.yaml"), read_grid(folder / TRUE_MAP), alignments[0])
+
+
+def _place_traffic(channel: Channel, figures: Mapping[str, float]) -> PlaceTraffic:
+    return PlaceTraffic(figures.get(f"{channel}_place_packets", np.nan), figures.get(f"{channel}_place_bytes", np.nan))

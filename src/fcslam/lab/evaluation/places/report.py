@@ -1,0 +1,173 @@
+"""Place recognition metrics of all scorers, before and after geometric verification."""
+
+import csv
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fcslam.errors import OutputError
+from fcslam.lab.evaluation.places.scoring import DescribedSet, Scorer
+from fcslam.lab.evaluation.places.sequences import plain
+from fcslam.lab.evaluation.places.sets import PlaceSet
+from fcslam.lab.evaluation.places.verification import PairVerifier
+from fcslam.metrics.bootstrap import Interval, mean_interval, measure_interval
+from fcslam.metrics.retrieval import (
+    PairTruth,
+    PrecisionRecall,
+    RetrievedPlaces,
+    mismatches,
+    multi_match_curve,
+    recall_at,
+    relative_significance,
+    significance,
+    single_best,
+)
+from fcslam.records import FloatArray
+
+RANKS: Final = (1, 5, 10)
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Metrics of one scorer on one question of a set."""
+
+    place_set: str
+    question: str
+    scorer: str
+    is_verified: bool
+    queries: int
+    """Queries that have a match."""
+    measures: Mapping[str, Interval]
+    """By name, with 95 % intervals by bootstrap over queries: ``recall_at_<k>``, ``average_precision`` and
+    ``recall_at_full_precision`` of the single best matches, ``average_precision_multi`` (no interval),
+    ``mismatch_rate``, ``significance``, ``relative_significance``."""
+    curve: PrecisionRecall
+    """Curve of the single best matches."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetResult:
+    """Results of all scorers on one set."""
+
+    place_set: PlaceSet
+    similarities: Mapping[str, FloatArray]
+    """Similarities by scorer, shape (Q, G), before geometric verification."""
+    verified: Mapping[str, FloatArray]
+    """Similarities by scorer, shape (Q, G), after geometric verification; empty without it."""
+    scores: tuple[Score, ...]
+
+
+def evaluate_set(
+    described: DescribedSet,
+    scorers: Mapping[str, Scorer],
+    checker: PairVerifier | None,
+    seed: int,
+    watch: Callable[[], None] = lambda: None,
+    variants: Callable[[DescribedSet, Scorer], Mapping[str, FloatArray]] = plain,
+) -> SetResult:
+    """Evaluate every scorer on every question of a set.
+
+    Args:
+        described: the set.
+        scorers: scorers by name.
+        checker: geometric verification; None: none.
+        seed: seed of the bootstrap.
+        watch: called after each scorer.
+        variants: postprocessing of a scorer's similarities, by a suffix of the scorer's name.
+    """
+    similarities: dict[str, FloatArray] = {}
+    verified: dict[str, FloatArray] = {}
+    scores: list[Score] = []
+    for scorer_name, scorer in scorers.items():
+        for variant, similarity in variants(described, scorer).items():
+            name = f"{scorer_name} {variant}".rstrip()
+            similarities[name] = similarity
+            stages = [(similarity, False)]
+            if checker is not None:
+                verified[name] = checker.verified(similarity)
+                stages.append((verified[name], True))
+            scores += _scores(described.place_set, name, stages, seed)
+        watch()
+    return SetResult(described.place_set, similarities, verified, tuple(scores))
+
+
+def _scores(place_set: PlaceSet, name: str, stages: Sequence[tuple[FloatArray, bool]], seed: int) -> Iterator[Score]:
+    """Scores of every question, before and after geometric verification."""
+    for question, truth in place_set.questions.items():
+        for similarity, is_verified in stages:
+            measures, retrieved = measure(similarity, truth, np.random.default_rng(seed))
+            asked = int(truth.answerable.sum())
+            yield Score(place_set.name, question, name, is_verified, asked, measures, retrieved.curve())
+
+
+def measure(
+    similarity: FloatArray, truth: PairTruth, rng: np.random.Generator
+) -> tuple[dict[str, Interval], RetrievedPlaces]:
+    """All measures of a similarity matrix (Q, G) under the names of ``Score``, and the single best matches."""
+    retrieved = single_best(similarity, truth)
+    count = len(similarity)
+    per_query = {
+        **{f"recall_at_{k}": recall_at(similarity, truth, k) for k in RANKS},
+        "mismatch_rate": mismatches(similarity, truth),
+        "significance": significance(similarity, truth),
+        "relative_significance": relative_significance(similarity, truth),
+    }
+    measures = {name: mean_interval(values, rng) for name, values in per_query.items()}
+    measures["average_precision"] = measure_interval(lambda rows: retrieved.curve(rows).average_precision, count, rng)
+    measures["recall_at_full_precision"] = measure_interval(
+        lambda rows: retrieved.curve(rows).recall_at_full_precision, count, rng
+    )
+    multi = multi_match_curve(similarity, truth).average_precision
+    measures["average_precision_multi"] = Interval(multi, np.nan, np.nan)
+    return measures, retrieved
+
+
+def write_results(folder: Path, results: Sequence[SetResult]) -> None:
+    """Write ``places.csv``, and for each set and scorer ``<set>/<scorer>/similarity.npy``, ``verified.npy`` and
+    ``curve_<question>.csv``; ``<set>/queries.txt`` and ``gallery.txt`` name rows and columns.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_table(folder / "places.csv", results)
+        for result in results:
+            _write_set(folder / result.place_set.name, result)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot write the results ({error}); choose another folder") from error
+
+
+def _write_table(path: Path, results: Sequence[SetResult]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["set", "question", "scorer", "stage", "queries", "measure", "value", "low", "high"])
+        for score in (score for result in results for score in result.scores):
+            stage = "verified" if score.is_verified else "similarity"
+            for name, value in score.measures.items():
+                numbers = ("" if np.isnan(number) else f"{number:.6g}" for number in value)
+                writer.writerow([score.place_set, score.question, score.scorer, stage, score.queries, name, *numbers])
+
+
+def _write_set(folder: Path, result: SetResult) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, paths in (("queries", result.place_set.queries), ("gallery", result.place_set.gallery)):
+        (folder / f"{name}.txt").write_text("".join(f"{path}\n" for path in paths), encoding="utf-8")
+    for scorer, similarity in result.similarities.items():
+        own = folder / scorer.replace(" ", "_")
+        own.mkdir(exist_ok=True)
+        np.save(own / "similarity.npy", similarity, allow_pickle=False)
+        if scorer in result.verified:
+            np.save(own / "verified.npy", result.verified[scorer], allow_pickle=False)
+        for score in result.scores:
+            if score.scorer == scorer:
+                stage = "_verified" if score.is_verified else ""
+                _write_curve(own / f"curve_{score.question.replace(' ', '_')}{stage}.csv", score.curve)
+
+
+def _write_curve(path: Path, curve: PrecisionRecall) -> None:
+    table = np.column_stack((curve.thresholds, curve.precision, curve.recall))
+    np.savetxt(path, table, "%.6g", ",", header="threshold,precision,recall", comments="")

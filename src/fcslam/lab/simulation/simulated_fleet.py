@@ -1,0 +1,399 @@
+"""A simulated fleet with LiDARs and cameras in one furnished building: routes, sensor records and true poses.
+
+One seed decides everything. The building, its appearance, the furniture and the goals of the fleet depend on the seed
+alone. The route, odometry and noise of a robot, and the furniture that moved before it, depend on the seed and the
+robot's number. So another robot changes nothing for the others, and cameras change nothing for the LiDARs.
+"""
+
+import math
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.errors import SimulationError
+from fcslam.lab.simulation.decoration import Decoration, decorate
+from fcslam.lab.simulation.floorplan import FloorPlan, doors_after, draw_floor_plan, move_furniture, with_closed_doors
+from fcslam.lab.simulation.lighting import light_of
+from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, scan_beams, simulate_ranges
+from fcslam.lab.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
+from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
+from fcslam.lab.simulation.outdoor_rays import OutdoorRayCaster
+from fcslam.lab.simulation.ramp import draw_ramp
+from fcslam.lab.simulation.route import TURN_RATE_RAD_S, Schedule, draw_goals, plan_route, schedule
+from fcslam.lab.simulation.scene import bare_model, furnished_model
+from fcslam.lab.simulation.sensors import Camera, RayCaster
+from fcslam.lab.simulation.terrain import SLOPE
+from fcslam.lab.simulation.walk import draw_starts, plan_walk
+from fcslam.lab.simulation.yard import draw_yard, move_cars
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    FloatArray,
+    GroundTruth,
+    LaserModel,
+    LaserScan,
+    Odometry,
+    RecordedItem,
+    Transform,
+    frozen,
+)
+from fcslam.sources.motion import moving_sweep
+from fcslam.sources.pose import UNKNOWN_POSE
+
+FIRST_STAMP = 1000.0
+STAMP_SHIFT_S = 0.001
+"""Offset between the stamps of two robots, so that a stamp identifies its robot."""
+LANE_PER_ROBOT_M = 2.0
+"""Least length of corridor for each robot. Robots do not see each other, but a crowded corridor is not realistic."""
+IMAGE_DELAY_S = 0.03
+"""Time from the first scan to the first image; cameras and LiDARs are not triggered together."""
+
+_T_BASE_LASER = (0.05, 0.0, 0.0)
+_AHEAD = (-0.5, 0.5, -0.5, 0.5)
+"""Quaternion (x, y, z, w) of an optical frame that looks along x of the base."""
+
+
+class CameraSettings(Settings):
+    """The simulated camera, which looks straight ahead."""
+
+    width: int = Field(default=320, ge=16, le=2048, description="width of an image [px]")
+    height: int = Field(default=240, ge=16, le=2048, description="height of an image [px]")
+    field_of_view_rad: float = Field(default=1.35, gt=0.1, lt=2.8, description="horizontal field of view [rad]")
+    rate_hz: float = Field(default=5.0, gt=0.0, description="image rate [Hz]")
+    ahead_m: float = Field(default=0.1, description="position of the camera ahead of the robot's base [m]")
+    above_m: float = Field(default=0.6, gt=0.0, lt=2.0, description="height of the camera above the floor [m]")
+    noise: float = Field(default=2.0, ge=0.0, description="standard deviation of the pixel noise [grey levels of 255]")
+    jpeg_quality: int = Field(default=90, ge=1, le=100, description="JPEG quality of the images, as in OpenCV")
+
+    def model(self) -> CameraModel:
+        """Intrinsics and mounting."""
+        focal = 0.5 * self.width / math.tan(0.5 * self.field_of_view_rad)
+        middle = (0.5 * (self.width - 1), 0.5 * (self.height - 1))
+        mounting = Transform((self.ahead_m, 0.0, self.above_m), _AHEAD)
+        return CameraModel(self.width, self.height, focal, focal, *middle, mounting)
+
+
+class SimulationSettings(Settings):
+    """A simulated fleet."""
+
+    building: Building = Field(
+        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor, yard or ramp"
+    )
+    robots: int = Field(default=3, ge=1, description="number of robots")
+    path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
+    lighting: tuple[Lighting, ...] = Field(
+        default=(Lighting.DAY,), min_length=1, description="lighting of each robot in turn: day, evening or lamp-off"
+    )
+    moved_furniture: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the furniture in rooms that moves before the second and each further robot; "
+        "in a yard, share of the parked cars that drive away",
+    )
+    lasting_changes: bool = Field(
+        default=False,
+        description="what moved stays there for later robots, and furniture moves only in rooms that the robot then "
+        "visits, so that every change is seen; else each robot finds the first state changed",
+    )
+    closed_doors: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the doors that a robot drives by, but not through, which are closed",
+    )
+    turn_rate_rad_s: float = Field(
+        default=TURN_RATE_RAD_S, gt=0.0, le=6.0, description="rate at which the robots turn [rad/s]"
+    )
+    slope: float = Field(
+        default=SLOPE,
+        ge=0.0,
+        le=0.3,
+        description="root mean square slope of a yard in each direction, or steepest slope of a ramp",
+    )
+    bumps: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the ground of a yard or ramp that tilts a robot for one or two scans",
+    )
+    lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
+    drift: OdometryNoiseSettings | None = Field(
+        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: there is none"
+    )
+    camera: CameraSettings | None = CameraSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRobot:
+    """One robot with its route. Its sensor records are computed on demand."""
+
+    name: str
+    lasers: tuple[LaserModel, ...]
+    """Several lasers scan in turn."""
+    camera: CameraModel | None
+    stamps: FloatArray
+    """Stamps of the scans of all lasers, shape (N,), seconds."""
+    T_building_base: FloatArray
+    """True poses at these stamps, shape (N, 3)."""
+    T_odom_base: FloatArray
+    """Wheel odometry at these stamps, shape (N, 3); NaN without odometry."""
+    readings: Readings | None
+    """Wheel odometry as it is read; None without odometry. A LiDAR that does not spin has one reading at each scan."""
+    image_stamps: FloatArray
+    """Stamps of its images, shape (M,), seconds; empty without a camera."""
+    plan: FloorPlan
+    """The building with the furniture at the time of this robot."""
+    lighting: Lighting
+    settings: SimulationSettings
+    decoration: Decoration | None
+    route: Schedule
+    first_stamp: float
+    seed: int
+    number: int
+    """Counts the fleet's robots from 0."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first scan to the last."""
+        return float(self.stamps[-1] - self.stamps[0])
+
+    @property
+    def odometry(self) -> Readings:
+        """The readings that are records of their own: those of a robot whose LiDAR spins."""
+        if self.readings is None or not self.settings.lidar.spin:
+            return Readings(np.empty(0), np.empty((0, 3)))
+        return self.readings
+
+    def items(
+        self, first_scan: int = 0, first_image: int = 0, first_odometry: int = 0
+    ) -> Generator[RecordedItem, None, None]:
+        """Scans, images and odometry in the order of time; a scan or an image is followed by the true pose.
+
+        Scans before number ``first_scan``, images before ``first_image`` and readings of the odometry before
+        ``first_odometry`` are skipped; true poses are not.
+
+        Raises:
+            SimulationError: MuJoCo or, with a camera, a GL library is missing.
+        """
+        odometry = self.odometry
+        stamps = np.concatenate((self.stamps, self.image_stamps, odometry.stamps))
+        scans, count, end = self.scans(first_scan), len(self.stamps), len(self.stamps) + len(self.image_stamps)
+        with closing(self._images(first_image)) as images:
+            for k in np.argsort(stamps, kind="stable"):
+                if k >= end:
+                    if k >= end + first_odometry:
+                        yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
+                    continue
+                if first_scan <= k < count:
+                    yield next(scans)
+                elif k >= count + first_image:
+                    yield next(images)
+                yield self._truth(float(stamps[k]))
+
+    def _truth(self, stamp: float) -> GroundTruth:
+        return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
+
+    def scans(self, first: int = 0) -> Iterator[LaserScan]:
+        """Scans from number ``first`` on; every call yields the same.
+
+        Raises:
+            SimulationError: MuJoCo is missing.
+        """
+        caster, settings = ray_caster(self.plan), self.settings.lidar
+        for k in range(first, len(self.stamps)):
+            rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
+            number, index = divmod(k, len(self.lasers))
+            laser = self.lasers[index].with_beams(scan_beams(settings.kind, self.lasers[index], number, rng))
+            sweep = settings.sweep(laser.beams)
+            if sweep is not None:
+                times_s = np.linspace(sweep.first_s, sweep.last_s, laser.beam_count)
+                poses = self.route.at(stamp - self.first_stamp + times_s)
+                if self.readings is not None:
+                    sweep = moving_sweep(sweep, stamp, self.readings.around(stamp, stamp + sweep.duration_s))
+            met = caster.scan(poses, laser, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(poses, laser)
+            ranges = simulate_ranges(met, laser, settings, rng)
+            yield LaserScan(stamp, frozen(ranges, np.float32), laser, self.T_odom_base[k], sweep)
+
+    def _images(self, first: int) -> Generator[CameraImage, None, None]:
+        settings = self.settings.camera
+        if self.camera is None or self.decoration is None or settings is None:
+            return
+        light = light_of(self.plan, self.lighting, self._generator(_RandomStream.LAMPS))
+        fov_y_rad = 2.0 * math.atan(0.5 * self.camera.height / self.camera.fy)
+        model = furnished_model(self.plan, self.decoration, light, (settings.width, settings.height), fov_y_rad)
+        poses = self.route.at(self.image_stamps - self.first_stamp)
+        odometry = None if self.readings is None else self.readings.at(self.image_stamps)
+        shape = (settings.height, settings.width, 1)
+        with Camera(model, self.camera, light) as camera:
+            for k in range(first, len(self.image_stamps)):
+                noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
+                encoded = _jpeg(camera.take(poses[k]) + settings.noise * noise, settings.jpeg_quality)
+                T_odom_base = None if odometry is None else odometry[k]
+                yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
+
+    def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
+        """A generator for each record, so that a recording can be resumed at any record."""
+        return _generator(self.seed, purpose, self.number, record)
+
+
+class _RandomStream(IntEnum):
+    """Purposes of random numbers. Each has its own generator, so that none affects another."""
+
+    BUILDING = 0
+    LOOKS = 1
+    GOALS = 2
+    ROBOTS = 3
+    """Moved furniture, route and odometry of a robot."""
+    LAMPS = 4
+    SCANS = 5
+    IMAGES = 6
+    DOORS = 7
+
+
+def _generator(seed: int, purpose: _RandomStream, robot: int = 0, record: int = 0) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, robot, record)))
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedFleet:
+    """A building and the robots that drive in it."""
+
+    plan: FloorPlan
+    robots: tuple[SimulatedRobot, ...]
+
+
+def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
+    """Draw a building and plan the route of each robot; the same seed gives the same fleet.
+
+    Raises:
+        SimulationError: the building is too small for this many robots, or has too little free space.
+    """
+    outdoors = settings.building.is_outdoors
+    if settings.closed_doors and settings.camera:
+        raise SimulationError("closed doors are simulated for LiDARs only; leave the cameras off")
+    if outdoors and settings.camera:
+        raise SimulationError(
+            f"a {settings.building} is simulated for LiDARs only; leave the cameras off (--no-camera)"
+        )
+    building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
+    plan = _draw_plan(settings, building)
+    _check_room(plan, settings)
+    if outdoors:
+        goals = draw_starts(plan, settings.robots, goals_rng)
+    else:
+        goals = draw_goals(plan, settings.robots, settings.path_length_m, goals_rng)
+    decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
+    robots: list[SimulatedRobot] = []
+    left, closed = plan, frozenset[int]()
+    for number in range(settings.robots):
+        rng = _generator(seed, _RandomStream.ROBOTS, number)
+        found = _moved(left, goals[number], settings, rng) if number else plan
+        robot = _robot(found, decoration, number, goals[number], settings, seed, rng)
+        if settings.closed_doors:
+            doors_rng, route = _generator(seed, _RandomStream.DOORS, number), robot.T_building_base[:, :2]
+            closed = doors_after(found, closed, settings.closed_doors, route, doors_rng)
+            robot = replace(robot, plan=with_closed_doors(found, closed))
+        robots.append(robot)
+        left = found if settings.lasting_changes else plan
+    return SimulatedFleet(plan, tuple(robots))
+
+
+def _draw_plan(settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
+    match settings.building:
+        case Building.YARD:
+            return draw_yard(rng, settings.slope, settings.bumps)
+        case Building.RAMP:
+            return draw_ramp(rng, settings.slope, settings.bumps)
+        case building:
+            return draw_floor_plan(rng, building)
+
+
+def _moved(plan: FloorPlan, goals: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
+    """The plan as a further robot finds it."""
+    if plan.terrain is not None:
+        return move_cars(plan, settings.moved_furniture, rng)
+    return move_furniture(plan, settings.moved_furniture, rng, goals if settings.lasting_changes else None)
+
+
+def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
+    lanes_m = sum(float(np.linalg.norm(end - start)) for start, end in plan.lanes)
+    most = int(lanes_m / LANE_PER_ROBOT_M)
+    if settings.robots > most:
+        raise SimulationError(
+            f"building '{settings.building}': {lanes_m:.0f} m of corridors are too small for {settings.robots} robots; "
+            f"simulate at most {most}, or take a larger building"
+        )
+
+
+def _robot(
+    plan: FloorPlan,
+    decoration: Decoration | None,
+    number: int,
+    goals: FloatArray,
+    settings: SimulationSettings,
+    seed: int,
+    rng: np.random.Generator,
+) -> SimulatedRobot:
+    find_way = plan_route if plan.terrain is None else plan_walk
+    route = schedule(find_way(plan, goals, settings.path_length_m, rng), settings.turn_rate_rad_s)
+    if settings.lidar.spin:
+        route = route.eased()
+    lasers = settings.lidar.models(_T_BASE_LASER)
+    times = np.arange(0.0, route.duration_s, 1.0 / (settings.lidar.rate_hz * len(lasers)))
+    poses, camera = route.at(times), settings.camera
+    first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
+    stamps: FloatArray = frozen(np.round(first_stamp + times, 6))
+    readings = _readings(route, times, first_stamp, settings, rng)
+    image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
+    return SimulatedRobot(
+        name=f"robot_{number + 1}",
+        lasers=lasers,
+        camera=camera.model() if camera else None,
+        stamps=stamps,
+        T_building_base=frozen(poses),
+        T_odom_base=frozen(np.tile(UNKNOWN_POSE, (len(stamps), 1))) if readings is None else readings.at(stamps),
+        readings=readings,
+        image_stamps=frozen(np.round(first_stamp + image_times, 6)),
+        plan=plan,
+        lighting=settings.lighting[number % len(settings.lighting)],
+        settings=settings,
+        decoration=decoration,
+        route=route,
+        first_stamp=first_stamp,
+        seed=seed,
+        number=number,
+    )
+
+
+def _readings(
+    route: Schedule, times: FloatArray, first_stamp: float, settings: SimulationSettings, rng: np.random.Generator
+) -> Readings | None:
+    """The odometry of a robot that scans at ``times`` (N,)."""
+    if settings.drift is None:
+        return None
+    if settings.lidar.spin:
+        times = np.arange(0.0, times[-1] + 1.0 / settings.lidar.rate_hz + 1.0 / READING_RATE_HZ, 1.0 / READING_RATE_HZ)
+    return read_odometry(np.round(first_stamp + times, 6), route.at(times), settings.drift, rng)
+
+
+def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
+    """Return the ray caster for a building or a yard.
+
+    Raises:
+        SimulationError: MuJoCo is missing, which buildings need.
+    """
+    return RayCaster(bare_model(plan)) if plan.terrain is None else OutdoorRayCaster(plan)
+
+
+def _jpeg(pixels: FloatArray, quality: int) -> bytes:
+    import cv2
+
+    image = np.clip(pixels, 0.0, 255.0).astype(np.uint8)
+    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(encoded)

@@ -1,0 +1,121 @@
+"""The files of a finished federated run: the detector as ONNX files, its model card, and a picture of the rounds."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from fcslam.config import dump
+from fcslam.errors import OutputError, TrainingError
+from fcslam.features.detector import GreyImage
+from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
+from fcslam.learning.federated.checkpoint import CoordinatorState
+from fcslam.learning.federated.history import LOSS, ROUNDS_FILE, Row
+from fcslam.learning.federated.networks import weights_to_network
+from fcslam.learning.federated.settings import FederatedSettings
+
+DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md", "rounds.png"
+SHOWN_METRICS: Final = {
+    "repeatability": "keypoints found again within 3 px",
+    "mma_3px": "matches within 3 px, by bits",
+    "revisit_recall": "points that two images share and that match",
+    "places_found": "places found again at full precision",
+}
+SHOWN_LOSSES: Final = ("detector", "contrastive", "triplet")
+MEGABYTE: Final = 1e6
+
+
+def write_federated_artifacts(
+    state: CoordinatorState, folder: Path, settings: FederatedSettings, calibration: Sequence[GreyImage], judged_on: str
+) -> list[Path]:
+    """Write the detector in float32 and int8, the picture and the card; returns their paths.
+
+    Args:
+        state: its best weights are exported.
+        folder: of the run; contains the table of rounds.
+        settings: of the run.
+        calibration: images that give int8 its ranges.
+        judged_on: the images on which versions were evaluated, in words.
+
+    Raises:
+        OutputError: a file cannot be written.
+        TrainingError: the table of rounds is broken.
+    """
+    network = weights_to_network(state.best, settings.training.encoder)
+    export_onnx(network, folder / DETECTOR)
+    quantise_onnx(folder / DETECTOR, folder / INT8, calibration)
+    rows = _rows(folder / ROUNDS_FILE)
+    try:
+        draw_rounds(rows, folder / PICTURE)
+        (folder / CARD).write_text(_card(detector_version(network), state, settings, rows, judged_on), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot be written ({error}); free disk space and run the command again"
+        ) from error
+    return [folder / name for name in (DETECTOR, INT8, PICTURE, CARD)]
+
+
+def draw_rounds(rows: Sequence[Row], path: Path) -> None:
+    """Draw losses, metrics with the released versions marked, and the megabytes sent so far, over the rounds."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    losses, shares, traffic = figure.subplots(1, 3)
+    rounds = [int(row["round"]) for row in rows]
+    for name in SHOWN_LOSSES:
+        losses.plot(rounds, _column(rows, LOSS + name), label=name)
+    for name in SHOWN_METRICS:
+        shares.plot(rounds, _column(rows, name), label=name.replace("_", " "))
+    for number, row in zip(rounds, rows, strict=True):
+        if row["released"] == "1":
+            shares.axvline(number, color="0.8", linewidth=0.8, zorder=0)
+    for name, label in (("bytes_down", "to the robots"), ("bytes_up", "from the robots")):
+        sent = _column(rows, name)
+        traffic.plot(rounds, [sum(sent[: index + 1]) / MEGABYTE for index in range(len(sent))], label=label)
+    shares.set_ylim(0.0, 1.0)
+    titles = ("losses, mean of the robots", "evaluation; grey: released", "weights sent so far [MB]")
+    for panel, title in zip((losses, shares, traffic), titles, strict=True):
+        panel.set_title(title)
+        panel.set_xlabel("round")
+        panel.grid(alpha=0.3)
+        panel.legend(frameon=False)
+    figure.savefig(path, dpi=120)
+
+
+def _rows(path: Path) -> list[Row]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except (OSError, csv.Error) as error:
+        raise TrainingError(f"{path}: is not a table of rounds ({error})") from error
+
+
+def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
+    return [float(row.get(name) or "nan") for row in rows]
+
+
+def _card(
+    version: str, state: CoordinatorState, settings: FederatedSettings, rows: Sequence[Row], judged_on: str
+) -> str:
+    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
+    best = next((row for row in rows if int(row["round"]) == state.best_round), {})
+    sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
+    private = f"epsilon {rows[-1]['epsilon']} at delta {settings.privacy.delta:g}" if rows else "nothing was sent"
+    lines = [
+        f"# Detector {version}",
+        "",
+        f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
+        f"{state.best_round}. How often each was asked: {asked or 'never'}.",
+        "",
+        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB. Privacy of all that a robot has seen: "
+        f"{private}.",
+        "",
+        f"| {judged_on} | |",
+        "|---|---|",
+        *(f"| {text} | {float(best[name]):.3f} |" for name, text in SHOWN_METRICS.items() if best.get(name)),
+        "",
+        "Settings:",
+        "",
+        *(f"    {line}" for line in dump(settings).splitlines()),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,164 @@
+"""The coordinator's checkpoint: everything that federated training needs to continue."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fcslam.errors import TrainingError
+from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from fcslam.learning.federated.evaluation import Evaluator, PublicImages
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights, weights_error
+
+CHECKPOINT_FILE: Final = "checkpoint.npz"
+STAGE: Final = "federated"
+CHANGEABLE: Final = frozenset({"rounds", "deadline_s", "minimum_robots"})
+"""Settings whose values may differ when a run is continued: they do not change the rounds that are done."""
+_PUBLIC_IMAGES_KEY: Final = ""
+"""Stands for ``PublicImages`` among the robots' names in the file; no robot's name is empty."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoordinatorState:
+    """The state of federated training after a round."""
+
+    rounds_done: int
+    weights: Weights
+    """The next round starts from these."""
+    average: Weights
+    """Moving average of the rounds' weights; it is evaluated and released."""
+    best: Weights
+    """The released weights."""
+    best_scores: Mapping[Evaluator, float]
+    """Scores of the released weights in [0, 1], by everyone who evaluated them."""
+    best_round: int
+    """The round that made them; 0 if they are the initial weights."""
+    strategy_state: Mapping[str, NDArray[Any]]
+    """Arrays that the aggregation carries from round to round."""
+    times_asked: Mapping[str, int]
+    """How often each robot was asked to train: an upper bound of the updates that have left it."""
+    origin: str
+    """Detector version of the initial weights."""
+    update_length: float = 0.0
+    """Median norm of the updates of the last round, by which those of the next one are screened; 0 before the first."""
+
+    @classmethod
+    def at_start(cls, initial: Weights, version: str, scores: Mapping[Evaluator, float]) -> Self:
+        """The state before the first round, from the initial weights, their version and their scores."""
+        return cls(0, initial, initial, initial, scores, 0, {}, {}, version)
+
+
+def run_id(settings: FederatedSettings, origin: str) -> str:
+    """Identifies a run by its settings and the version of its initial weights: 16 hexadecimal digits.
+
+    Settings in ``CHANGEABLE`` do not count, so the number stays when a run is continued.
+    """
+    return hashlib.sha256(json.dumps([_fixed(settings.model_dump(mode="json")), origin]).encode()).hexdigest()[:16]
+
+
+def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings) -> None:
+    """Replace the checkpoint atomically.
+
+    Raises:
+        OutputError: the file cannot be written; the last checkpoint stays.
+    """
+    numbers = {
+        "best_scores": {_key(evaluator): score for evaluator, score in state.best_scores.items()},
+        "best_round": state.best_round,
+        "asked": dict(state.times_asked),
+        "origin": state.origin,
+        "update_length": state.update_length,
+    }
+    tensors = {
+        f"{group}/{name}": torch.from_numpy(np.asarray(array, order="C"))
+        for group, arrays in (
+            ("weights", state.weights),
+            ("average", state.average),
+            ("best", state.best),
+            ("memory", state.strategy_state),
+        )
+        for name, array in arrays.items()
+    }
+    header = {"settings": settings.model_dump(mode="json"), **numbers}
+    write_checkpoint(path, Checkpoint(STAGE, state.rounds_done, header, tensors))
+
+
+def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin: str) -> CoordinatorState | None:
+    """Read a checkpoint of this run.
+
+    Args:
+        path: file of the checkpoint.
+        settings: of this run.
+        initial: weights that this run starts from.
+        origin: detector version of ``initial``.
+
+    Returns:
+        The state, or None if there is no file.
+
+    Raises:
+        TrainingError: the file is broken, or belongs to a run with other settings, weights or network.
+    """
+    if not path.exists():
+        return None
+    checkpoint = read_checkpoint(path)
+    if checkpoint.stage != STAGE:
+        raise TrainingError(f"{path}: is not a checkpoint of federated training; give another --output")
+    groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "average": {}, "best": {}, "memory": {}}
+    try:
+        for key, tensor in checkpoint.tensors.items():
+            group, _, name = key.partition("/")
+            groups[group][name] = tensor.numpy()
+        header = checkpoint.settings
+        fixed = _fixed(header["settings"])
+        state = CoordinatorState(
+            checkpoint.step,
+            groups["weights"],
+            groups["average"],
+            groups["best"],
+            {_evaluator(key): float(score) for key, score in header["best_scores"].items()},
+            int(header["best_round"]),
+            groups["memory"],
+            {str(robot): int(rounds) for robot, rounds in header["asked"].items()},
+            str(header["origin"]),
+            float(header.get("update_length", 0.0)),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise TrainingError(
+            f"{path}: is not a checkpoint of this version of fcslam ({error}); give another --output"
+        ) from error
+    asked = _fixed(settings.model_dump(mode="json"))
+    if odd := sorted(asked.keys() ^ fixed.keys()):
+        raise TrainingError(f"{path}: comes from another version of fcslam ({odd[0]}); give another --output")
+    if others := sorted(name for name in asked if asked[name] != fixed[name]):
+        raise TrainingError(
+            f"{path}: belongs to a run with other settings ({', '.join(others)}); give the same or another --output"
+        )
+    for group in ("weights", "average", "best"):
+        reason = weights_error(groups[group], initial)
+        if reason is not None:
+            raise TrainingError(f"{path}: its {group} do not fit this network ({reason})")
+    if state.origin != origin:
+        raise TrainingError(
+            f"{path}: belongs to a run that began from {state.origin}, not from {origin}; give another --output"
+        )
+    return state
+
+
+def _key(evaluator: Evaluator) -> str:
+    return _PUBLIC_IMAGES_KEY if isinstance(evaluator, PublicImages) else evaluator
+
+
+def _evaluator(key: str) -> Evaluator:
+    return PublicImages() if key == _PUBLIC_IMAGES_KEY else str(key)
+
+
+def _fixed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that must stay when a run is continued."""
+    return {name: value for name, value in settings.items() if name not in CHANGEABLE}

@@ -1,0 +1,194 @@
+"""A robot as a federated client: it trains on its own images from the global weights, and evaluates weights on some."""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fcslam.errors import TrainingError
+from fcslam.learning.code_training import CodeInputs, train_codes
+from fcslam.learning.federated.client_state import legacy_weights, load_optimiser_state, save_optimiser_state
+from fcslam.learning.federated.evaluation import SCORE_METRICS
+from fcslam.learning.federated.held_out import HeldOutPairs, Judgement, judge
+from fcslam.learning.federated.networks import network_to_weights, weights_to_network
+from fcslam.learning.federated.privacy import privatise_update
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights, trained_names
+from fcslam.learning.images import find_images
+from fcslam.learning.local_training import LocalTrainingPlan, local_training
+from fcslam.learning.point_training import train_points
+from fcslam.learning.revisit_batches import RevisitExamples
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
+from fcslam.learning.trainer import TrainingProgress, validation_pairs
+from fcslam.learning.validation import validate
+
+NOISE_NEEDS_PUBLIC_IMAGES: Final = (
+    "with noise for privacy, no metrics of a robot's own images may leave it; give --public images"
+)
+
+NoiseSource = Callable[[int], np.random.Generator]
+"""Gives the generator of a round's noise: from the system's entropy on real robots, seeded in simulations."""
+
+
+class ClientUpdate(NamedTuple):
+    """The result of a client's training in a round."""
+
+    weights: dict[str, NDArray[np.float32]]
+    losses: dict[str, float]
+    """Means over the steps; empty with privacy noise, because the losses carry none."""
+
+
+class FederatedClient(Protocol):
+    """A participant in federated training."""
+
+    @property
+    def name(self) -> str:
+        """Name of the robot, unique in the fleet."""
+
+    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
+        """Train for a round, counted from 0, of the run with this number."""
+
+    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """Metrics of the weights by name."""
+
+
+@runtime_checkable
+class JudgingClient(Protocol):
+    """A participant that holds out pairs of keyframes."""
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> Judgement:
+        """A report on these pairs with the weights."""
+
+
+@dataclass(slots=True)
+class RobotClient:
+    """A client with its own images."""
+
+    name: str
+    folder: Path
+    """Contains the images."""
+    cache: Path
+    """Folder for what must survive a round: labels, the optimiser's state, and the weights of the legacy detector."""
+    noise: NoiseSource
+    device: str = "cpu"
+    on_step: Callable[[str, int], None] = lambda _robot, _steps: None
+    """Called with the name and the number of steps done in a round."""
+    images: TrainingImages | None = None
+    """The images with their labels; None until they are read."""
+    images_settings: TrainingSettings | None = None
+    """Settings with which the images were read; None if they were given."""
+    revisits: RevisitExamples = field(default_factory=RevisitExamples)
+    """Points that were seen again, on which ``codes`` and ``heads`` are trained."""
+    inputs: CodeInputs = field(default_factory=CodeInputs)
+    """Inputs from the images of ``revisits``."""
+    held_out: HeldOutPairs = field(default_factory=HeldOutPairs)
+    """Pairs of keyframes that are never trained on."""
+
+    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
+        """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
+
+        Args:
+            weights: global weights of the round.
+            round_number: counted from 0.
+            run_id: identifies the run, for the state in the cache.
+            settings: of the run.
+
+        Raises:
+            TrainingError: there are too few usable images, the weights belong to another network, training diverged,
+                or the cache cannot be used.
+        """
+        encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
+        start = weights_to_network(weights, encoder).state_dict()
+        plan = LocalTrainingPlan(
+            first_step=round_number * settings.local_steps,
+            steps=settings.local_steps,
+            proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
+            compatible=settings.compatible,
+            frozen_statistics=frozen,
+        )
+        training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
+        needs_former = plan.compatible > 0.0 or settings.on_revisits
+        former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
+        legacy = None if former is None else weights_to_network(former, encoder).state_dict()
+        device, on_step = torch.device(self.device), partial(self.on_step, self.name)
+        moments = load_optimiser_state(self.cache, run_id, round_number)
+        if settings.on_revisits:
+            trained = train_codes(
+                start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
+            )
+            if settings.trained == "heads" and self.revisits.voted:
+                codes, moments = trained.network.state_dict(), trained.optimiser_state
+                points = train_points(codes, self.revisits, training, plan, device, on_step, legacy, moments)
+                trained = points._replace(losses=trained.losses | points.losses)
+        else:
+            images = self._labelled_images(weights, settings).train
+            trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)
+        save_optimiser_state(self.cache, run_id, round_number, trained.optimiser_state)
+        new, names = network_to_weights(trained.network), trained_names(weights, frozen)
+        update = privatise_update(new, weights, names, settings.privacy, self.noise(round_number))
+        return ClientUpdate(update, {} if settings.privacy.noise_multiplier else trained.losses)
+
+    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out.
+
+        Raises:
+            TrainingError: the settings ask for privacy noise, which metrics do not carry; or as in ``train``.
+        """
+        if settings.privacy.noise_multiplier:
+            raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
+        network = weights_to_network(weights, settings.training.encoder).to(self.device)
+        held_out = self._labelled_images(weights, settings).held_out
+        found = validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
+        # A detector that finds nothing has no metrics; it counts as one that finds nothing again.
+        return {name: found[name] if np.isfinite(found[name]) else 0.0 for name in SCORE_METRICS}
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> Judgement:
+        """A report on the pairs of keyframes that the robot holds out, with the weights, shape (P, 2).
+
+        Raises:
+            TrainingError: the settings ask for privacy noise, which such reports do not carry; or the weights belong to
+                another network.
+        """
+        if settings.privacy.noise_multiplier:
+            raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
+        device = torch.device(self.device)
+        network = weights_to_network(weights, settings.training.encoder).to(device)
+        judgement: Judgement = judge(network, self.held_out, device)
+        return judgement
+
+    def _labelled_images(self, weights: Weights, settings: FederatedSettings) -> TrainingImages:
+        """The images, labelled by the first weights that the robot ever received; the labels stay."""
+        is_outdated = self.images_settings not in (None, settings.training)
+        if self.images is None or is_outdated:
+            device = torch.device(self.device)
+            labeller = keypoint_response(weights_to_network(weights, settings.training.encoder).to(device), device)
+            files = find_images([self.folder])
+            self.images = read_labelled_images(files, self.cache, settings.training, labeller, None, _ignore_progress)
+            self.images_settings = settings.training
+        return self.images
+
+
+def robot_seed(robot: str, seed: int) -> int:
+    """The seed of a robot, so that two robots draw different views."""
+    return int(np.random.default_rng([seed, zlib.crc32(robot.encode())]).integers(2**31))
+
+
+def seeded_noise(robot: str, seed: int) -> NoiseSource:
+    """Noise that can be repeated, and so protects nobody: for robots that are simulated in one process."""
+    return lambda round_number: np.random.default_rng([robot_seed(robot, seed), round_number])
+
+
+def secret_noise(_round_number: int) -> np.random.Generator:
+    """Noise from the system's entropy, which cannot be repeated."""
+    return np.random.default_rng()
+
+
+def _ignore_progress(_stage: str, _progress: TrainingProgress) -> None:
+    pass

@@ -1,0 +1,59 @@
+"""Wraps a federated client into Flower's ``ClientApp``."""
+
+from collections.abc import Callable
+from typing import Final
+
+from fcslam.errors import FcslamError
+from fcslam.learning.federated.client import FederatedClient, JudgingClient
+from fcslam.learning.federated.codec import weights_to_record
+from fcslam.learning.federated.flower import ClientApp, Context, Error, Message
+from fcslam.learning.federated.messages import PAIRS_KEY, client_reply, identity_reply, read_request
+
+CLIENT_ERROR: Final = 1000
+"""Code of an error that a client explains; Flower's own codes are smaller."""
+
+Handler = Callable[[Message, FederatedClient], Message]
+
+
+def build_client_app(client_of: Callable[[Context], FederatedClient]) -> ClientApp:
+    """The app that answers queries for the name, training requests and evaluation requests.
+
+    Args:
+        client_of: gives the client that a Flower context stands for.
+    """
+    app = ClientApp()
+
+    def handled(handler: Handler) -> Callable[[Message, Context], Message]:
+        def handle(message: Message, context: Context) -> Message:
+            try:
+                return handler(message, client_of(context))
+            except FcslamError as error:
+                return Message(Error(CLIENT_ERROR, " ".join(str(error).split())), reply_to=message)
+
+        return handle
+
+    app.query()(handled(_identify))
+    app.train()(handled(_train))
+    app.evaluate()(handled(_evaluate))
+    return app
+
+
+def _identify(message: Message, client: FederatedClient) -> Message:
+    return Message(identity_reply(client.name), reply_to=message)
+
+
+def _train(message: Message, client: FederatedClient) -> Message:
+    request = read_request(message.content)
+    update = client.train(request.weights, request.round_number, request.run_id, request.settings)
+    arrays = weights_to_record(update.weights)
+    return Message(client_reply(client.name, request.version, update.losses, arrays), reply_to=message)
+
+
+def _evaluate(message: Message, client: FederatedClient) -> Message:
+    request = read_request(message.content)
+    if request.settings.on_revisits and isinstance(client, JudgingClient):
+        rows = client.judge(request.weights, request.settings)
+        arrays = weights_to_record({PAIRS_KEY: rows})
+        return Message(client_reply(client.name, request.version, {}, arrays), reply_to=message)
+    metrics = client.evaluate(request.weights, request.settings)
+    return Message(client_reply(client.name, request.version, metrics), reply_to=message)

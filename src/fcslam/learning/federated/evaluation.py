@@ -1,0 +1,90 @@
+"""Compares a version of the detector with the best one so far, by every evaluator that measured both."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fcslam.learning.federated.gate import GateDecision
+from fcslam.learning.federated.held_out import COLUMNS
+from fcslam.learning.federated.weights import Weights
+
+SCORE_METRICS: Final = ("repeatability", "mma_3px")
+LOWEST_SCORE: Final = -1.0
+"""Score of a version with an unknown metric: lower than that of any version whose metrics are known."""
+
+Metrics = Mapping[str, float]
+"""Values by name; those in ``SCORE_METRICS`` are shares in [0, 1]."""
+EvaluateFn = Callable[[Weights], Metrics]
+"""Evaluation by the coordinator itself, on public images; Flower's ``evaluate_fn``."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublicImages:
+    """The evaluator that is not a robot: the coordinator, on public images."""
+
+
+Evaluator = str | PublicImages
+"""The evaluator of a version: a robot, by its name, on images that it held out, or the coordinator."""
+
+
+def combined_score(metrics: Metrics) -> float:
+    """The score by which versions are compared: the mean of repeatability and MMA, in [0, 1]."""
+    values = [metrics.get(name, np.nan) for name in SCORE_METRICS]
+    return float(np.mean(values)) if np.isfinite(values).all() else LOWEST_SCORE
+
+
+def valid_metrics(metrics: Metrics) -> dict[str, float]:
+    """The metrics of a robot's evaluation that count: both shares, or none if one is missing or outside [0, 1]."""
+    found = {name: metrics[name] for name in SCORE_METRICS if 0.0 <= metrics.get(name, np.nan) <= 1.0}
+    return found if len(found) == len(SCORE_METRICS) else {}
+
+
+@dataclass(frozen=True, slots=True)
+class VersionComparison:
+    """A version beside the best one so far."""
+
+    by_evaluator: Mapping[Evaluator, Metrics]
+    """Metrics of the version; empty if it was not evaluated in this round."""
+    best: Mapping[Evaluator, float]
+    """Scores of the best version, by everyone who ever evaluated it."""
+    gate: GateDecision | None = None
+    """The decision of the gate on pairs that robots hold out, if there is one; then nothing else was evaluated."""
+
+    @property
+    def scores(self) -> dict[Evaluator, float]:
+        """Scores of the version by evaluator."""
+        return {evaluator: combined_score(metrics) for evaluator, metrics in self.by_evaluator.items()}
+
+    @property
+    def score(self) -> float:
+        """Median of the scores, or the share of shared keypoints that match; NaN if the version was not evaluated."""
+        if self.gate is not None:
+            return self.gate.values[COLUMNS[0]]
+        return float(np.median(list(self.scores.values()))) if self.by_evaluator else math.nan
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Median of each metric over the evaluators, or means over held-out pairs with the gains of the version."""
+        if self.gate is not None:
+            gains = {f"{name}_gain": gain.mean for name, gain in self.gate.gains.items()}
+            return {**self.gate.values, **gains, "pairs": float(self.gate.pairs)}
+        rows = self.by_evaluator.values()
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
+
+    @property
+    def gain(self) -> float | None:
+        """Gain over the best version: median over the evaluators of both versions; None if there are none.
+
+        Robots hold out different images, so their scores differ in level. Only differences at the same robot are
+        compared: robots that join or leave do not change the gain. The median ignores a minority of false scores.
+        """
+        if self.gate is not None:
+            gain = self.gate.gains[COLUMNS[0]].mean
+            return gain if math.isfinite(gain) else None
+        scores = self.scores
+        gains = [score - self.best[evaluator] for evaluator, score in scores.items() if evaluator in self.best]
+        return float(np.median(gains)) if gains else None

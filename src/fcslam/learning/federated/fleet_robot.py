@@ -1,0 +1,205 @@
+"""A robot of a fleet on several machines: it fetches requests, lets its own app answer them, and brings the replies.
+
+The app is part of fcslam as it is installed on the robot. A server can send weights and settings, and no program.
+"""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Final, TypeVar
+from urllib.parse import quote
+
+import httpx
+
+from fcslam.errors import TrainingError, UnavailableError
+from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER
+from fcslam.learning.federated.flower import (
+    FIRST_NODE,
+    RUN_ID,
+    ClientApp,
+    Context,
+    Message,
+    MessageType,
+    RecordDict,
+    error_reply,
+    message_to_bytes,
+    request_from_bytes,
+    use_own_identity,
+)
+from fcslam.learning.federated.replies import printable_line
+from fcslam.wire.http_transport import HttpClient
+
+ALIVE_S: Final = 15.0
+"""Time between two signs of life; a quarter of that after which a robot counts as gone."""
+ANSWER_S: Final = 60.0
+RETRY_S: Final = 3.0
+"""Time between two attempts to reach the server."""
+MAX_REQUEST_BYTES: Final = 256 * 2**20
+"""A larger request of the server is not read: weights take a few megabytes."""
+
+_T = TypeVar("_T")
+
+
+class RobotLink(HttpClient):
+    """The connection of a robot with the service that it learns at.
+
+    Args:
+        url, token, ca, own: as in ``HttpClient``.
+        robot: name of the robot.
+    """
+
+    def __init__(
+        self, url: str, robot: str, token: str | None = None, ca: Path | None = None,
+        own: tuple[Path, Path] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(url, token, ca, own)
+        self._path = f"robots/{quote(robot, safe='')}/learning/"
+        self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
+
+    def __enter__(self) -> "RobotLink":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def fetch(self) -> tuple[int, bytes] | None:
+        """A request with its number; None if there is none now.
+
+        Raises:
+            TrainingError: the server does not accept the robot.
+            ConnectionError: the server cannot be reached, or is not a server of a fleet.
+        """
+        status, headers, body = self._post("next")
+        if status == httpx.codes.NO_CONTENT:
+            return None
+        number = headers.get(NUMBER_HEADER, "")
+        if status != httpx.codes.OK or not number.isdecimal():
+            raise ConnectionError(f"the server answers with status {status}")
+        return int(number), body
+
+    def reply(self, number: int, body: bytes) -> str | None:
+        """Bring a reply; returns the reason why the server does not want it, or None.
+
+        Raises:
+            TrainingError, ConnectionError: as in ``fetch``.
+        """
+        status, _, answer = self._post(f"reply/{number}", body)
+        return None if status == httpx.codes.NO_CONTENT else answer.decode(errors="replace") or f"status {status}"
+
+    def taught(self) -> bytes:
+        """A batch of packets with the codes that the fleet gives to this robot's places; empty without any.
+
+        Raises:
+            TrainingError, ConnectionError: as in ``fetch``.
+        """
+        status, _, body = self._post("taught")
+        if status not in (httpx.codes.OK, httpx.codes.NO_CONTENT):
+            raise ConnectionError(f"the server answers with status {status}")
+        return body
+
+    def show_alive(self) -> None:
+        """Show the server that the robot is still there.
+
+        Raises:
+            TrainingError, ConnectionError: as in ``fetch``.
+        """
+        self._post("alive")
+
+    def _post(self, operation: str, body: bytes = b"") -> tuple[int, httpx.Headers, bytes]:
+        content = bytearray()
+        try:
+            with self._explained(), self._client.stream("POST", self._path + operation, content=body) as response:
+                for part in response.iter_bytes():
+                    content += part
+                    if len(content) > MAX_REQUEST_BYTES:
+                        raise ConnectionError(f"the server sends more than {MAX_REQUEST_BYTES} bytes")
+        except UnavailableError as error:
+            raise ConnectionError(str(error)) from error
+        if response.status_code in (httpx.codes.UNAUTHORIZED, httpx.codes.FORBIDDEN):
+            raise TrainingError(f"the server does not accept this robot: {content.decode(errors='replace')}")
+        return response.status_code, response.headers, bytes(content)
+
+
+def serve_requests(
+    link: RobotLink,
+    app: ClientApp,
+    context: Context,
+    on_notice: Callable[[str], None],
+    sleep: Callable[[float], None] = time.sleep,
+) -> None:
+    """Answer the server's requests until the robot is interrupted. Waits for a server that is not there, or gone.
+
+    Args:
+        link: to the server.
+        app: answers the requests.
+        context: of the app.
+        on_notice: called with one line for a request that was refused, and while the server is not there.
+        sleep: waits for a number of seconds.
+
+    Raises:
+        TrainingError: the server does not accept the robot.
+    """
+
+    while True:
+        found = _retried(link.fetch, on_notice, sleep)
+        if found is None:
+            continue
+        number, data = found
+        with _signs_of_life(link):
+            reply = answer(app, context, data, on_notice)
+        reason = _retried(partial(link.reply, number, reply), on_notice, sleep)
+        if reason is not None:
+            on_notice(f"the server does not take a reply: {reason}")
+
+
+def answer(app: ClientApp, context: Context, data: bytes, on_notice: Callable[[str], None]) -> bytes:
+    """The serialised reply of the robot's own app to a serialised request, or an error in its place."""
+    try:
+        request = request_from_bytes(data)
+    except ValueError as error:
+        on_notice(f"refused: {error}")
+        # The request has no metadata that a reply could take, so the reply is one to an empty request.
+        return message_to_bytes(error_reply(str(error), Message(RecordDict(), RUN_ID, MessageType.QUERY)))
+    try:
+        reply = app(request, context)
+    except Exception as error:  # a failure ends one request and not the robot
+        reply = error_reply(f"{type(error).__name__}: {error}", request)
+    if reply.has_error():
+        on_notice(f"refused: a request to {request.metadata.message_type}: {printable_line(reply.error.reason or '')}")
+    return message_to_bytes(reply)
+
+
+def robot_context() -> Context:
+    """The context of an app that keeps nothing in it."""
+    use_own_identity()
+    return Context(RUN_ID, FIRST_NODE, {}, RecordDict(), {})
+
+
+def _retried(operation: Callable[[], _T], on_notice: Callable[[str], None], sleep: Callable[[float], None]) -> _T:
+    while True:
+        try:
+            return operation()
+        except ConnectionError as error:
+            on_notice(f"waiting: {error}")
+            sleep(RETRY_S)
+
+
+@contextlib.contextmanager
+def _signs_of_life(link: RobotLink) -> Iterator[None]:
+    """Show the server from a thread that the robot is there, because work on a request takes long."""
+    ended = threading.Event()
+
+    def show() -> None:
+        while not ended.wait(ALIVE_S):
+            with contextlib.suppress(ConnectionError, TrainingError):
+                link.show_alive()
+
+    thread = threading.Thread(target=show, name="signs of life", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()

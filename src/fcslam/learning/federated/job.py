@@ -1,0 +1,122 @@
+"""A federated training job on the server, from the initial weights to the exported detector, over any transport."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from fcslam.config import dump
+from fcslam.errors import OutputError, TrainingError
+from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.artifacts import DETECTOR, write_federated_artifacts
+from fcslam.learning.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+from fcslam.learning.federated.flower import RobotGrid
+from fcslam.learning.federated.history import RoundReport
+from fcslam.learning.federated.initial_weights import prepare_initial_weights
+from fcslam.learning.federated.live_settings import GateSettings
+from fcslam.learning.federated.networks import weights_to_network, weights_version
+from fcslam.learning.federated.public_images import calibration_images, public_evaluation, read_public_images
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.strategies import StrategyFactory
+from fcslam.learning.federated.weights import Weights
+from fcslam.learning.stages import StageCallback
+from fcslam.learning.trainer import ExecutionOptions
+
+CONFIG_FILE: Final = "config.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class FederatedJob:
+    """The job of the server."""
+
+    output: Path
+    """Folder of the run; a run in it is continued."""
+    settings: FederatedSettings
+    start: Path | None = None
+    """Checkpoint or exported detector to start from; None for a detector trained on synthetic shapes."""
+    public: Sequence[Path] = ()
+    """Folders of images that the server may read; without any, the robots evaluate."""
+    strategy: StrategyFactory | None = None
+    """Makes a strategy of your own; None: the one that the settings name."""
+
+    gate: GateSettings | None = None
+    """Decides on releases by pairs that robots hold out; None: every version that is not worse is released."""
+    fallback: Callable[[str], Weights | None] = lambda _version: None
+    """As in ``CoordinatorHooks``."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProgressCallbacks:
+    """Functions that are called as training advances."""
+
+    stage: StageCallback = lambda _stage, _progress: None
+    """With the stage before the rounds, and its progress."""
+    steps: Callable[[str, int], None] = lambda _robot, _steps: None
+    """With a robot's name and the steps that it has done in the round."""
+    rounds: Callable[[RoundReport], None] = lambda _report: None
+    """With the report of a round."""
+    released: Callable[[Weights], None] = lambda _weights: None
+    """With the weights of a released version; its detector is written. A start that continues a run calls it again."""
+
+
+def run_job(
+    job: FederatedJob,
+    options: ExecutionOptions,
+    callbacks: ProgressCallbacks,
+    grid: RobotGrid,
+    wait: Callable[[str], None] | None = None,
+) -> list[Path]:
+    """Run a job, or continue it.
+
+    Args:
+        job: what to do.
+        options: where and how to compute.
+        callbacks: receive the progress.
+        grid: carries the messages to the robots.
+        wait: as in ``CoordinatorHooks``.
+
+    Returns:
+        The files for the user: the detector in float32 and int8, the picture of the rounds, and the model card.
+
+    Raises:
+        TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
+        OutputError: a file cannot be written.
+    """
+    if job.settings.privacy.noise_multiplier and not job.public:
+        raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
+    images = read_public_images(job.public)
+    _write_config(job, job.output / CONFIG_FILE)
+    initial = prepare_initial_weights(job.start, job.output, job.settings, options, callbacks.stage, images)
+    encoder = job.settings.training.encoder
+
+    def on_release(weights: Weights) -> None:
+        export_onnx(weights_to_network(weights, encoder), job.output / DETECTOR)
+        callbacks.released(weights)
+
+    version = partial(weights_version, encoder=encoder)
+    evaluate = public_evaluation(images, encoder, options.device)
+    hooks = CoordinatorHooks(
+        version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.fallback, job.strategy
+    )
+    state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
+    _write_config(job, job.output / CONFIG_FILE, again=True)
+    judged_on = (
+        "on pairs of public images"
+        if images
+        else "on images of the robots, 4 % held out or one trained on; median of the robots"
+    )
+    if job.gate is not None:
+        judged_on = "on revisits that no robot trained on, mean"
+    return write_federated_artifacts(state, job.output, job.settings, calibration_images(images), judged_on)
+
+
+def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:
+    """Write the settings at the end, and at the start unless an earlier start has written them."""
+    try:
+        job.output.mkdir(parents=True, exist_ok=True)
+        if again or not path.exists():
+            path.write_text(dump(job.settings), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{job.output}: cannot be used as the output folder ({error})") from error

@@ -1,0 +1,110 @@
+"""Settings of a fleet that learns while it maps."""
+
+import math
+from typing import Final
+
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.learning.federated.settings import FederatedSettings, Normalisation, TrainedLayers
+from fcslam.learning.settings import TrainingSettings
+from fcslam.records import FloatArray
+
+RELEASE: Final = "release"
+"""The event by which the process of a learning fleet names the version that robots are to use, by its number."""
+RELEASES: Final = "releases"
+"""Folder of the versions, below the output folder of the rounds."""
+
+
+class HeldOutSettings(Settings):
+    """Keyframes that a robot never trains on."""
+
+    every: int = Field(
+        default=4, ge=2, le=20, description="one in this many squares of the robot's map is held out from training"
+    )
+    side_m: float = Field(default=4.0, gt=0.0, description="side of these squares [m]")
+
+    def is_held_out(self, T_own_base: FloatArray) -> bool:
+        """Whether a new keyframe at this pose in the robot's own map, shape (3,), is held out."""
+        column, row = (math.floor(float(each) / self.side_m) for each in T_own_base[:2])
+        # Neither a row nor a column of squares is held out as a whole, or not at all.
+        return (column + (self.every // 2) * row) % self.every == 0
+
+
+class GateSettings(Settings):
+    """When a version of the detector is released, and when it is taken back."""
+
+    fewest_pairs: int = Field(
+        default=200,
+        ge=1,
+        description="fewest held-out pairs of the fleet on which a version is judged; with fewer, nothing is released. "
+        "Below 200 is for tests only: the intervals of so few pairs say little",
+    )
+    margin: float = Field(
+        default=0.05,
+        ge=0.0,
+        le=1.0,
+        description="largest loss of places found again that the interval may leave possible, as a share",
+    )
+    fewest_places: int = Field(
+        default=50,
+        ge=1,
+        description="fewest pairs of places, described by both versions, on which a released version is judged again",
+    )
+
+
+class RobotLearningSettings(Settings):
+    """A robot that learns while it stands still."""
+
+    cpu_s: float = Field(default=3600.0, gt=0.0, description="CPU time that learning may take after a start [s]")
+    time_s: float = Field(
+        default=14_400.0, gt=0.0, description="time after the drive for which a recorded robot stays to learn [s]"
+    )
+    most_keyframes: int = Field(default=400, ge=2, description="newest keyframes that are compared with one another")
+    held_out: HeldOutSettings = Field(
+        default_factory=HeldOutSettings, description="keyframes that the robot never trains on"
+    )
+
+
+class LiveTraining(TrainingSettings):
+    """Training settings with the rate of the study."""
+
+    learning_rate: float = Field(default=1e-3, gt=0.0, description="learning rate after the warm-up, its highest value")
+
+
+class LiveRounds(FederatedSettings):
+    """Federated settings whose defaults are the recipe of the study of closures as teachers."""
+
+    rounds: int = Field(default=60, ge=1, description="number of rounds of local training and aggregation")
+    minimum_robots: int = Field(default=2, ge=1, description="fewest updates for which a round counts")
+    deadline_s: float = Field(
+        default=600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
+    )
+    normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
+    trained: TrainedLayers = Field(
+        default="codes",
+        description="layers that robots train: codes, those of the descriptors; or heads, also those of the keypoints",
+    )
+    compatible: float = Field(
+        default=4.0,
+        ge=0.0,
+        description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
+        "weights give them, so that they stay compatible and less is forgotten; 0 for off",
+    )
+    training: LiveTraining = Field(
+        default_factory=LiveTraining,
+        description="training on each robot; its steps are replaced by rounds times local_steps",
+    )
+
+
+class FleetLearningSettings(Settings):
+    """A service whose fleet learns while it maps."""
+
+    federated: LiveRounds = Field(
+        default_factory=LiveRounds, description="rounds of training; other keys are those of the federated settings"
+    )
+    gate: GateSettings = Field(default_factory=GateSettings, description="release of versions")
+    teach_every_s: float = Field(
+        default=30.0, gt=0.0, description="time between two computations of taught codes, and of the judgement on a "
+        "released version [s]"
+    )  # fmt: skip

@@ -1,0 +1,55 @@
+"""Federated training of a whole fleet in one process. Only Flower's messages pass between robots and coordinator."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from fcslam.errors import TrainingError
+from fcslam.learning.federated.client import RobotClient, seeded_noise
+from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.flower import Context, InProcessGrid
+from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
+from fcslam.learning.trainer import ExecutionOptions
+
+
+def federate_locally(
+    folders: Sequence[Path], job: FederatedJob, options: ExecutionOptions, callbacks: ProgressCallbacks
+) -> list[Path]:
+    """Run or continue federated training.
+
+    Args:
+        folders: the images of each robot; a robot has the name of its folder.
+        job: what to do.
+        options: where and how to compute.
+        callbacks: receive the progress.
+
+    Returns:
+        The files for the user, see ``run_job``.
+
+    Raises:
+        TrainingError: two folders have the same name, a folder is unusable, no robot can train, or the output folder
+            belongs to another run.
+        OutputError: a file cannot be written.
+    """
+    names = [folder.resolve().name for folder in folders]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise TrainingError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
+    for folder in folders:
+        if not folder.is_dir():
+            raise TrainingError(f"{folder}: is not a folder; give one folder of images for each robot")
+    clients = [
+        RobotClient(
+            name,
+            folder,
+            job.output / "robots" / name,
+            seeded_noise(name, job.settings.training.seed),
+            options.device,
+            callbacks.steps,
+        )
+        for name, folder in zip(names, folders, strict=True)
+    ]
+
+    def client_of(context: Context) -> RobotClient:
+        return clients[int(context.node_config["partition-id"])]
+
+    return run_job(job, options, callbacks, InProcessGrid(build_client_app(client_of), len(clients)))

@@ -1,0 +1,112 @@
+"""The messages between the coordinator and the robots, as Flower's records: each writer beside its reader."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from fcslam.errors import TrainingError
+from fcslam.learning.federated.codec import record_to_weights
+from fcslam.learning.federated.flower import ArrayRecord, ConfigRecord, MetricRecord, RecordDict
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights
+
+ARRAYS_KEY, CONFIG_KEY, METRICS_KEY = "arrays", "config", "metrics"
+"""Names of the records in a message."""
+PAIRS_KEY: Final = "pairs"
+"""Name of the array in which a robot reports on the pairs that it holds out."""
+EXAMPLES_KEY: Final = "num-examples"
+"""Flower's name for the weight of an update in a mean."""
+MAX_NAME_LENGTH: Final = 64
+MAX_METRICS: Final = 32
+"""A reply with more metrics than this is refused: fcslam's clients send fewer than ten."""
+LARGEST_METRIC: Final = 1e6
+"""Losses and metrics are of the order of 1. A larger one, or one that is not a number, would spoil a mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClientRequest:
+    """A request to train or to evaluate, as a robot receives it."""
+
+    weights: Weights
+    version: str
+    """Detector version of the weights."""
+    round_number: int
+    """From 0."""
+    run_id: str
+    """Identifies the run to clients that keep state over its rounds."""
+    settings: FederatedSettings
+
+
+def request_config(version: str, round_number: int, run_id: str, settings: FederatedSettings) -> ConfigRecord:
+    """The part of a request that is sent beside the weights."""
+    return ConfigRecord(
+        {"version": version, "round": round_number, "run": run_id, "settings": settings.model_dump_json()}
+    )
+
+
+def read_request(content: RecordDict) -> ClientRequest:
+    """Read a request on the robot.
+
+    Raises:
+        TrainingError: the content is not a request of this version of fcslam.
+    """
+    try:
+        config = content[CONFIG_KEY]
+        settings = FederatedSettings.model_validate_json(config["settings"])
+        version, number, run_id = str(config["version"]), int(config["round"]), str(config["run"])
+        return ClientRequest(record_to_weights(content[ARRAYS_KEY]), version, number, run_id, settings)
+    except (KeyError, TypeError, ValueError) as error:
+        raise TrainingError(
+            f"the server's request cannot be read ({error}); install the same version of fcslam on both machines"
+        ) from error
+
+
+def identity_reply(robot: str) -> RecordDict:
+    """The reply to a query for the robot's name."""
+    return client_reply(robot, "", {})  # it is about no weights, so it has no version
+
+
+def client_reply(
+    robot: str, version: str, metrics: Mapping[str, float], arrays: ArrayRecord | None = None
+) -> RecordDict:
+    """A robot's reply to a request that came with weights of this version."""
+    records = {
+        CONFIG_KEY: ConfigRecord({"robot": robot, "version": version}),
+        METRICS_KEY: MetricRecord(dict(metrics)),
+    }
+    return RecordDict(records if arrays is None else records | {ARRAYS_KEY: arrays})
+
+
+def reply_sender(content: RecordDict) -> tuple[str, str]:
+    """The robot's name in a reply, and the version of the weights that the reply is about.
+
+    Raises:
+        ValueError: the reply does not name its sender, or the name is too long or not printable.
+    """
+    try:
+        config = content[CONFIG_KEY]
+        robot, version = config["robot"], config["version"]
+    except (KeyError, TypeError) as error:
+        raise ValueError("an answer without a name") from error
+    if not (isinstance(robot, str) and 0 < len(robot) <= MAX_NAME_LENGTH and robot.isprintable()):
+        raise ValueError("an answer without a usable name")
+    return robot, str(version)
+
+
+def reply_metrics(content: RecordDict) -> dict[str, float]:
+    """The metrics in a reply.
+
+    Raises:
+        ValueError: the reply has no metrics, too many of them, some whose names are not identifiers, or some that are
+            not plausible numbers.
+    """
+    record = content[METRICS_KEY]
+    if not isinstance(record, MetricRecord):
+        raise ValueError(f"a {type(record).__name__} in place of a {MetricRecord.__name__}")
+    metrics = {str(name): float(value) for name, value in record.items() if isinstance(value, int | float)}
+    if len(metrics) > MAX_METRICS or not all(name.isidentifier() and len(name) <= MAX_NAME_LENGTH for name in metrics):
+        raise ValueError("figures that nobody asked for")
+    odd = next((name for name, value in metrics.items() if not abs(value) <= LARGEST_METRIC), None)
+    if odd is not None:
+        raise ValueError(f"{odd} is {metrics[odd]:g}")
+    return metrics

@@ -1,0 +1,56 @@
+"""Public images: the only ones that the server may read. It evaluates detectors and calibrates int8 on them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fcslam.errors import TrainingError
+from fcslam.features.detector import GreyImage
+from fcslam.learning.export import CALIBRATION_IMAGES
+from fcslam.learning.federated.evaluation import EvaluateFn, Metrics
+from fcslam.learning.federated.networks import weights_to_network
+from fcslam.learning.federated.weights import Weights
+from fcslam.learning.images import find_images, is_usable, read_image
+from fcslam.learning.labels import Labels
+from fcslam.learning.pairs import TrainingExample
+from fcslam.learning.settings import Encoder
+from fcslam.learning.stages import SyntheticShapes
+from fcslam.learning.trainer import validation_pairs
+from fcslam.learning.validation import validate
+
+
+def read_public_images(roots: Sequence[Path]) -> list[GreyImage]:
+    """Usable images below the folders; none without folders.
+
+    Raises:
+        TrainingError: a folder does not exist, or holds no usable image.
+    """
+    if not roots:
+        return []
+    images = [image for file in find_images(roots) if (image := read_image(file.path)) is not None]
+    usable = [image for image in images if is_usable(image)]
+    if not usable:
+        raise TrainingError(f"{roots[0]}: no image there is large enough and has enough corners to evaluate detectors")
+    return usable
+
+
+def public_evaluation(images: Sequence[GreyImage], encoder: Encoder, device: str) -> EvaluateFn | None:
+    """Evaluation of weights on pairs of views of these images, always the same pairs; None without images."""
+    if not images:
+        return None
+    unlabelled = Labels(np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
+    pairs = validation_pairs([TrainingExample(image, unlabelled) for image in images])
+
+    def evaluate(weights: Weights) -> Metrics:
+        return validate(weights_to_network(weights, encoder).to(device), pairs, torch.device(device), shifts=False)
+
+    return evaluate
+
+
+def calibration_images(public: Sequence[GreyImage]) -> list[GreyImage]:
+    """Images that give int8 its ranges and batch normalisation its statistics: public ones, or synthetic shapes."""
+    if public:
+        return list(public[:: max(len(public) // CALIBRATION_IMAGES, 1)])[:CALIBRATION_IMAGES]
+    return [example.image for example in SyntheticShapes(2, CALIBRATION_IMAGES)[:]]

@@ -1,0 +1,39 @@
+"""The routes of a service whose robots learn: requests of its robots go to the process in which the fleet learns."""
+
+from pathlib import Path
+from typing import Final
+
+import httpx
+from fastapi import APIRouter, HTTPException, Request, Response
+
+from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER, PATH
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.robots import Name
+from fcslam.service.http.state import ServiceState
+
+ANSWER_S: Final = 60.0
+
+
+def learning_router(state: ServiceState, listener: Path) -> APIRouter:
+    """Routes for robots that learn, which have the tokens and limits of the service.
+
+    Args:
+        state: of the service.
+        listener: Unix socket of the process in which the fleet learns; only the user of the service can open it.
+    """
+    router = APIRouter(include_in_schema=False)
+    limits = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
+
+    @router.post(f"{PATH}/{{operation:path}}", dependencies=state.require(Role.ROBOT))
+    async def learn(request: Request, robot: Name, operation: str) -> Response:
+        transport = httpx.AsyncHTTPTransport(uds=str(listener))
+        address = f"http://learning{PATH.format(robot=robot)}/{operation}"
+        try:
+            async with httpx.AsyncClient(transport=transport, timeout=limits) as client:
+                answer = await client.post(address, content=request.stream())
+        except httpx.HTTPError as error:
+            raise HTTPException(503, "the fleet does not learn now; try again", {"Retry-After": "5"}) from error
+        headers = {name: answer.headers[name] for name in (NUMBER_HEADER, "content-type") if name in answer.headers}
+        return Response(answer.content, answer.status_code, headers)
+
+    return router

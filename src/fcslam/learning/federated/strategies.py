@@ -1,0 +1,155 @@
+"""Aggregation: Flower's strategies, momentum between rounds, and the state of both that must survive a restart."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.errors import TrainingError
+from fcslam.learning.federated.codec import record_to_weights, weights_to_record
+from fcslam.learning.federated.flower import (
+    FedAdam,
+    FedAvg,
+    FedMedian,
+    FedProx,
+    FedTrimmedAvg,
+    Krum,
+    Message,
+    MetricRecord,
+    RecordDict,
+    restore_moments,
+    strategy_moments,
+)
+from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, EXAMPLES_KEY, METRICS_KEY
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.weights import Weights, trained_names, weights_error
+
+_MOMENTUM: Final = "momentum"
+
+StrategyFactory = Callable[..., FedAvg]
+"""A subclass of Flower's FedAvg, or a function that makes one from FedAvg's keyword arguments. A checkpoint keeps the
+state of a strategy only if it is that of FedAdam."""
+
+
+class Aggregator:
+    """One of Flower's strategies with momentum between rounds.
+
+    Args:
+        settings: choose the strategy and the momentum.
+        state: the ``state`` of an earlier aggregator to continue; empty for a new run.
+        strategy: makes a strategy in place of the one that the settings name.
+    """
+
+    def __init__(
+        self, settings: FederatedSettings, state: Mapping[str, NDArray[Any]], strategy: StrategyFactory | None = None
+    ) -> None:
+        self.strategy = create_strategy(settings, strategy)
+        restore_moments(self.strategy, {name: _group(state, name) for name in strategy_moments(self.strategy)})
+        self._largest_momentum = settings.server_momentum
+        # FedAdam has its own momentum. Krum selects one robot's update, which is too noisy to be followed further.
+        without = settings.strategy in ("fedadam", "krum") or settings.server_momentum == 0.0
+        self._momentum = None if without else _group(state, _MOMENTUM)
+
+    @property
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Arrays with which another aggregator continues as this one would, by name."""
+        groups = {**strategy_moments(self.strategy), _MOMENTUM: self._momentum or {}}
+        return {
+            f"{group}/{name}": np.asarray(array) for group, arrays in groups.items() for name, array in arrays.items()
+        }
+
+    def aggregate(self, round_number: int, updates: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
+        """The next global weights.
+
+        Args:
+            round_number: from 1, as Flower counts.
+            updates: the robots' replies, with the weights in them; these have passed screening.
+            old: the weights from which the robots trained.
+
+        Raises:
+            TrainingError: the strategy gives weights that are not finite or do not fit the network.
+        """
+        messages = []
+        for message, weights in updates:
+            # Every robot did the same number of steps, so every update has the same weight, whatever the robot says.
+            metrics = MetricRecord({EXAMPLES_KEY: 1.0})
+            # Serialised again, so that the strategy reads exactly the arrays that were screened.
+            message.content = RecordDict({ARRAYS_KEY: weights_to_record(weights), METRICS_KEY: metrics})
+            messages.append(message)
+        record, _ = self.strategy.aggregate_train(round_number, messages)
+        aggregated = {name: np.asarray(array, np.float32) for name, array in record_to_weights(record).items()}
+        reason, following = weights_error(aggregated, old), aggregated
+        if reason is None and self._momentum is not None:
+            # Limited to the way that the robots would have gone if they had trained one after another.
+            share = min(self._largest_momentum, 1.0 - 1.0 / len(updates))
+            following, self._momentum = apply_server_momentum(aggregated, old, self._momentum, share)
+            reason = weights_error(following, old)
+        if reason is not None:
+            raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
+        return {name: following[name] for name in old}
+
+
+def apply_server_momentum(
+    aggregated: Weights, old: Weights, momentum: Mapping[str, NDArray[np.float32]], share: float
+) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]]:
+    """Continue beyond the aggregated weights by Nesterov's momentum, as in Douillard et al. 2023 (DiLoCo).
+
+    A mean of updates is less noisy than each of them, so it can be followed further. With u = ``aggregated`` - ``old``:
+    m <- share m + u, w <- w + u + share m. Batch statistics are taken as aggregated: they are measured and not trained,
+    and variances must not become negative.
+
+    Args:
+        aggregated: mean of the robots' weights.
+        old: weights from which the robots trained.
+        momentum: of the last round; empty before the first.
+        share: of the momentum that is kept, in [0, 1).
+
+    Returns:
+        The next weights, and the momentum for the next round.
+    """
+    following, next_momentum = {name: aggregated[name] for name in old}, {}
+    for name in trained_names(old, frozen_statistics=True):
+        update = aggregated[name] - old[name]
+        next_momentum[name] = np.asarray(update + share * momentum[name] if momentum else update, np.float32)
+        following[name] = np.asarray(aggregated[name] + share * next_momentum[name], np.float32)
+    return following, next_momentum
+
+
+def create_strategy(settings: FederatedSettings, factory: StrategyFactory | None = None) -> FedAvg:
+    """Flower's strategy for these settings, or that of ``factory``.
+
+    It asks all nodes that it is shown; the coordinator selects them.
+    """
+    everyone: dict[str, Any] = {
+        "fraction_train": 1.0,
+        "min_train_nodes": 1,
+        "min_evaluate_nodes": 1,
+        "min_available_nodes": 1,
+        "weighted_by_key": EXAMPLES_KEY,
+        "arrayrecord_key": ARRAYS_KEY,
+        "configrecord_key": CONFIG_KEY,
+    }
+    return (factory or _named(settings))(**everyone)
+
+
+def _named(settings: FederatedSettings) -> StrategyFactory:
+    """The strategy that the settings name."""
+    match settings.strategy:
+        case "fedavg":
+            return partial(FedAvg)
+        case "fedprox":
+            return partial(FedProx, proximal_mu=settings.proximal)
+        case "fedadam":
+            return partial(FedAdam, eta=settings.server_rate)
+        case "fedmedian":
+            return partial(FedMedian)
+        case "fedtrimmedavg":
+            return partial(FedTrimmedAvg, beta=settings.trimmed)
+        case "krum":
+            return partial(Krum, num_malicious_nodes=settings.malicious)
+
+
+def _group(state: Mapping[str, NDArray[Any]], group: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(f"{group}/"): array for name, array in state.items() if name.startswith(f"{group}/")}

@@ -1,0 +1,278 @@
+"""Localisation of one recorded robot in a finished map: a recording and a map in, believed poses out.
+
+sources -> robot (LiDAR tracking) -> localisation in the map -> run folder
+"""
+
+import csv
+from array import array
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fcslam.config import dump, one_line, parse_yaml
+from fcslam.errors import EvaluationError, SourceError
+from fcslam.geometry import se2
+from fcslam.lidar.frozen_map import frozen_map
+from fcslam.lidar.occupancy import Casting, draw_over
+from fcslam.maps.drawing import map_png
+from fcslam.mission.mission import MissionConfig, continued_config, run_mission
+from fcslam.mission.mission_file import read_mission
+from fcslam.records import FloatArray, LaserScan, frozen
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
+from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
+from fcslam.runs.folder import MISSION, ROBOTS
+from fcslam.runs.map_files import map_stem, map_yaml, parse_map, pgm_bytes
+from fcslam.runs.ros_map import parse_ros_map
+from fcslam.runs.tables import read_robots
+from fcslam.sources import Source
+from fcslam.untrusted import read_bytes
+
+MAP_YAML: Final = "map.yaml"
+"""The first map of a run folder."""
+REPORTED_SCANS: Final = 50
+"""Scans between two reports of progress."""
+UPDATE_STEP_M: Final = 0.1
+"""Least distance between two scans that are drawn into a finished map."""
+LARGEST_FILE: Final = 1 << 30
+"""Larger map files are refused, bytes."""
+_ROW: Final = 8
+"""Numbers of one scan: stamp, pose, standard deviations, quality."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationProgress:
+    """Progress of a localisation."""
+
+    scans: int
+    is_localized: bool
+    quality: float
+    """Quality of the newest pose; 0 where the robot is not localised."""
+
+
+def read_map(path: Path, floor: str = "") -> OccupancyMap:
+    """Read the first map of a floor from a run folder, a mission file or a map of ROS. fcslam maps the packets of a
+    mission file. A map of ROS is a YAML file of map_server and the image that it names.
+
+    Args:
+        path: the folder or file.
+        floor: the floor; name it where the run has several, because they may look the same.
+
+    Raises:
+        SourceError: there is no map, or it cannot be read.
+    """
+    if path.suffix == Path(MISSION).suffix:
+        return _mission_map(path, floor)
+    if (path / ROBOTS).is_file():
+        number, floor = _map_on(floor, _floors(path), path)
+        return replace(_read_map_file(path / f"{map_stem(number)}.yaml"), floor=floor)
+    if floor:
+        raise SourceError(f"{path}: only run folders and mission files know floors; leave the floor out")
+    return _read_map_file(path / MAP_YAML if path.is_dir() else path)
+
+
+def _floors(folder: Path) -> dict[int, str]:
+    """Floor of each map of a run folder."""
+    try:
+        return dict(read_robots(folder / ROBOTS).values())
+    except (OSError, ValueError, csv.Error) as error:
+        raise SourceError(f"{folder}: a broken run folder ({one_line(str(error))})") from error
+
+
+def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str]:
+    """Number and floor of the first map on a floor; without ``floor``, on the only one."""
+    known = set(floors.values())
+    listed = ", ".join(its or "one without a name" for its in sorted(known))
+    if not floor and len(known) > 1:
+        raise SourceError(f"{path}: has maps of several floors ({listed}); name that of the robot (--floor)")
+    if floor and floor not in known:
+        raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {listed}")
+    number = min((k for k, its in floors.items() if its == floor or not floor), default=0)
+    return number, floors.get(number, "")
+
+
+def _read_map_file(description: Path) -> OccupancyMap:
+    try:
+        text = _content(description).decode("utf-8")
+        image = parse_yaml(text)["image"]
+        if not isinstance(image, str):
+            raise TypeError(image)
+        return parse_ros_map(str(description), _content(_image_of(description, image)), text)
+    except OSError as error:
+        raise SourceError(
+            f"{one_line(str(error.filename))}: no map can be read ({error.strerror}); give a run folder or a map.yaml"
+        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"{description}: names no image; give a run folder or the YAML file of a map") from error
+    except EvaluationError as error:
+        raise SourceError(str(error)) from error
+
+
+def _image_of(description: Path, image: str) -> Path:
+    """Where the image of a map lies; map_saver writes the whole path, which is wrong after the map was moved."""
+    named = description.parent / Path(image).expanduser()
+    beside = description.parent / named.name
+    return beside if beside.is_file() and not named.is_file() else named
+
+
+def run_localization(
+    source: Source,
+    occupancy: OccupancyMap,
+    config: MissionConfig,
+    initial: FloatArray | None = None,
+    progress: Callable[[LocalizationProgress], None] = lambda _: None,
+    update: bool = False,
+) -> Run:
+    """Localise a robot in a map, which does not change meanwhile.
+
+    Args:
+        source: the robot's recording.
+        occupancy: the map.
+        config: the settings of the robot.
+        initial: about where the recording starts in the map, (x, y, theta), shape (3,); None: anywhere.
+        progress: called every ``REPORTED_SCANS`` scans.
+        update: draw what the scans saw afterwards into the map of the run, where ``contradicting_scans`` of them
+            contradict it. The map before is beside it, as ``map_before``.
+
+    Returns:
+        The believed poses as trajectory, and every pose with standard deviations and quality.
+
+    Raises:
+        SourceError: the map or the recording cannot be used.
+    """
+    localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
+    robot = RobotFrontend(source.name, config.robot, localizer)
+    drive = LocalizedDrive()
+    scans: dict[float, LaserScan] = {}
+    for record in source.records():
+        if update and isinstance(record, LaserScan):
+            scans[record.stamp] = record
+        # 1. Track the scan; the localizer follows with the keyscans.
+        robot.process(record)
+        # 2. Place the new scans in the map.
+        before = len(drive)
+        _place(robot, localizer.estimate, drive)
+        if len(drive) // REPORTED_SCANS > before // REPORTED_SCANS:
+            progress(LocalizationProgress(len(drive), localizer.estimate is not None, drive.quality))
+    losses = localizer.losses  # without the end of the recording
+    robot.finish()
+    _place(robot, localizer.estimate, drive)
+    run = drive.run(source.name, occupancy, config, localizer.fixes, losses)
+    return _updated(run, occupancy, scans, drive.poses(source.name), config) if update else run
+
+
+def _updated(
+    run: Run, occupancy: OccupancyMap, scans: Mapping[float, LaserScan], poses: LocalizedPoses, config: MissionConfig
+) -> Run:
+    """The run with the scans drawn into its map; a scan counts if the robot moved since the one before it."""
+    seen: list[Casting] = []
+    for stamp, pose, is_localized in zip(poses.stamps.tolist(), poses.T_map_base, poses.is_localized, strict=True):
+        if not is_localized or stamp not in scans:
+            continue
+        if seen and np.hypot(*(pose - seen[-1].T_map_base)[:2]) < UPDATE_STEP_M:
+            continue
+        seen.append(Casting(scans[stamp].ranges_m, scans[stamp].laser, pose, scans[stamp].sweep))
+    updated = draw_over(occupancy, seen, config.map)
+    files = {
+        "map.pgm": pgm_bytes(updated),
+        MAP_YAML: map_yaml(updated, "map.pgm").encode(),
+        "map.png": map_png(updated, {poses.robot: poses.believed().T_map_base}, ()),
+        "map_before.pgm": pgm_bytes(occupancy),
+        "map_before.yaml": map_yaml(occupancy, "map_before.pgm").encode(),
+    }
+    return replace(run, map_files=files)
+
+
+class LocalizedDrive:
+    """The poses of one robot in a finished map, scan by scan. It grows by 64 bytes a scan."""
+
+    def __init__(self) -> None:
+        self._rows = array("d")
+        self._first_m = np.nan
+
+    def __len__(self) -> int:
+        return len(self._rows) // _ROW
+
+    @property
+    def quality(self) -> float:
+        """Quality of the newest pose; 0 without one."""
+        return self._rows[-1] if self._rows else 0.0
+
+    def add(self, stamp: float, travel_m: float, T_odom_base: FloatArray, estimate: MapEstimate | None) -> None:
+        """Append the next scan.
+
+        Args:
+            stamp: seconds.
+            travel_m: path length so far.
+            T_odom_base: its pose in the session's ``odom``, shape (3,), metres and radians.
+            estimate: where that lies in the map; None: the robot is not localised.
+        """
+        if estimate is None:
+            self._rows.extend((stamp, *6 * (np.nan,), 0.0))
+            return
+        if np.isnan(self._first_m):
+            self._first_m = travel_m
+        T_map_base = se2.compose(estimate.T_map_odom, T_odom_base)
+        self._rows.extend((stamp, *T_map_base, *np.sqrt(np.diag(estimate.covariance)), estimate.quality))
+
+    def poses(self, robot: str) -> LocalizedPoses:
+        """The poses so far of a robot of this name."""
+        rows = np.array(self._rows).reshape(-1, _ROW)
+        stamps, T_map_base, sigma, quality = rows[:, 0], rows[:, 1:4], rows[:, 4:7], rows[:, 7]
+        return LocalizedPoses(robot, frozen(stamps), frozen(T_map_base), frozen(sigma), frozen(quality))
+
+    def run(self, robot: str, occupancy: OccupancyMap, config: MissionConfig, fixes: int, losses: int) -> Run:
+        """The run folder of the drive: believed poses, every scan, and the map.
+
+        Args:
+            robot: name of the robot.
+            occupancy: the map.
+            config: the settings of the robot.
+            fixes: how often it was found.
+            losses: how often it was localised and then was not.
+        """
+        poses = self.poses(robot)
+        believed = poses.believed()
+        metrics = (
+            Metric("scans", len(self), "1"),
+            Metric("localized_share", float(poses.is_localized.mean()) if len(self) else 0.0, "1"),
+            Metric("first_fix_after", self._first_m, "m"),
+            Metric("fixes", fixes, "1"),
+            Metric("losses", losses, "1"),
+        )
+        return Run(
+            trajectories={robot: replace(believed, floor=occupancy.floor)},
+            metrics={metric.name: metric for metric in metrics},
+            config_yaml=dump(config),
+            map_files={
+                "map.pgm": pgm_bytes(occupancy),
+                MAP_YAML: map_yaml(occupancy, "map.pgm").encode(),
+                "map.png": map_png(occupancy, {robot: believed.T_map_base}, ()),
+            },
+            localized={robot: poses},
+        )
+
+
+def _place(robot: RobotFrontend, estimate: MapEstimate | None, drive: LocalizedDrive) -> None:
+    """Add the scans that were tracked since the last call, at the newest estimate."""
+    track = robot.scan_poses
+    for number in range(len(drive) - sum(len(track) for track in robot.tracks[:-1]), len(track)):
+        drive.add(track[number].stamp, robot.travel_m, track.in_odom(track[number]), estimate)
+
+
+def _mission_map(path: Path, floor: str) -> OccupancyMap:
+    saved = read_mission(path)
+    run = run_mission((), continued_config(saved), onto=saved)
+    floors = {trajectory.map_index: trajectory.floor for trajectory in run.trajectories.values()}
+    number, floor = _map_on(floor, floors, path)
+    files, stem = run.map_files, map_stem(number)
+    if f"{stem}.yaml" not in files:
+        raise SourceError(f"{path}: the mission has no map; no robot has sent a keyscan")
+    return replace(parse_map(str(path), files[f"{stem}.pgm"], files[f"{stem}.yaml"].decode()), floor=floor)
+
+
+def _content(path: Path) -> bytes:
+    return read_bytes(path, most=LARGEST_FILE)

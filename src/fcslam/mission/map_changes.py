@@ -1,0 +1,189 @@
+"""Changes in a mission's building: from a run folder to grids, a picture and a table of changed regions.
+
+The poses are those of the run; the ranges are those of its mission file.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, date, datetime, time
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fcslam.cloud.sessions import in_session
+from fcslam.errors import OutputError, SourceError
+from fcslam.maps.changes import APPEARED, DISAPPEARED, Changes, compare
+from fcslam.maps.fusion import Period, fuse_periods, periods_of
+from fcslam.mission.mission_file import SavedMission, read_mission
+from fcslam.records import FloatArray, Keyscan, LaserModel
+from fcslam.runs import Run, open_run
+from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
+from fcslam.storage.files import replacing_folder
+from fcslam.wire.messages import Hello
+
+TABLE: Final = "changes.csv"
+PICTURE: Final = "changes.png"
+COLUMNS: Final = ("change", "area_m2", "x", "y", "sessions")
+STAMP_TOLERANCE_S: Final = 1e-6
+"""Trajectories hold stamps with nine digits after the decimal point."""
+
+
+class _Seen(NamedTuple):
+    """Keyscans of one map of a run."""
+
+    keyscans: list[Keyscan]
+    T_map_base: FloatArray  # (N, 3)
+    lasers: Mapping[str, Sequence[LaserModel]]
+
+
+def find_changes(folder: Path, since: str | None = None, until: str | None = None, map_index: int = 0) -> Changes:
+    """Return the changes in a map of a run between two times.
+
+    Args:
+        folder: a run folder with a mission file.
+        since: the end of a session, a stamp, or a date or time of ISO 8601, in UTC if it has no zone; a date means the
+            end of the day. None: the oldest period.
+        until: as ``since``; None: the newest period.
+        map_index: number of the map.
+
+    Raises:
+        EvaluationError: ``folder`` is not a run folder, or it is broken.
+        SourceError: it has no mission file or no such map, its robots sent words only, or a time is unknown or before
+            the first period.
+    """
+    run = open_run(folder)
+    seen = _seen(run, read_mission(folder), map_index, folder)
+    periods = periods_of(seen.keyscans)
+    first = 0 if since is None else _period_at("since", since, periods)
+    last = len(periods) - 1 if until is None else _period_at("until", until, periods)
+    if first >= last:
+        raise SourceError(
+            f"nothing to compare: no session between {_named(periods[first])} and {_named(periods[last])}; "
+            f"the map has {len(periods)} period{'s' * (len(periods) != 1)}: {'; '.join(map(_named, periods))}"
+        )
+    config = read_mission(folder).config.map
+    kept = {session for period in periods[: last + 1] for session in period.sessions}
+    rows = [k for k, keyscan in enumerate(seen.keyscans) if keyscan.id.robot in kept]
+    keyscans = [seen.keyscans[k] for k in rows]
+    maps: list[OccupancyMap] = []
+    for number, fused in enumerate(
+        fuse_periods(keyscans, seen.T_map_base[rows], seen.lasers, config, periods[: last + 1])
+    ):
+        if number >= first:
+            maps.append(fused)
+    return compare(maps, periods[first : last + 1])
+
+
+def save_changes(changes: Changes, folder: Path, force: bool = False) -> None:
+    """Write the changes into a new folder, whole or not at all.
+
+    ``appeared`` and ``disappeared`` are maps for ROS map_server: occupied cells changed, free ones did not.
+
+    Raises:
+        OutputError: something else is there, changes are there and ``force`` is not given, or writing fails.
+    """
+    check_output(folder, force)
+    try:
+        folder.resolve().parent.mkdir(parents=True, exist_ok=True)
+        with replacing_folder(folder.resolve()) as place:
+            for kind, mask in ((APPEARED, changes.appeared), (DISAPPEARED, changes.disappeared)):
+                layer = changes.layer(mask)
+                (place / f"{kind}.pgm").write_bytes(pgm_bytes(layer))
+                (place / f"{kind}.yaml").write_text(map_yaml(layer, f"{kind}.pgm"), encoding="utf-8")
+            (place / PICTURE).write_bytes(changes.png())
+            (place / TABLE).write_text(_table(changes), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot write the changes ({error})") from error
+
+
+def check_output(folder: Path, force: bool = False) -> None:
+    """Check, before the work, that changes can be written to ``folder``.
+
+    Raises:
+        OutputError: something else is there, or changes are there and ``force`` is not given.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not (folder / TABLE).is_file():
+        raise OutputError(f"{folder}: exists and holds no changes; name a new folder")
+    if not force:
+        raise OutputError(f"{folder}: already holds changes; name a new folder or give --force to replace them")
+
+
+def _table(changes: Changes) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for region in changes.regions:
+        numbers = f"{region.area_m2:.4f}", f"{region.x:.3f}", f"{region.y:.3f}"
+        writer.writerow((region.kind, *numbers, " ".join(region.sessions)))
+    return text.getvalue()
+
+
+def _seen(run: Run, mission: SavedMission, map_index: int, folder: Path) -> _Seen:
+    """The keyscans of the run's map and their poses; sessions that are not in it are left out."""
+    members = {name: robot for name, robot in run.trajectories.items() if robot.map_index == map_index}
+    if not members:
+        raise SourceError(f"{folder}: has no map {map_index}; the first one is 0")
+    lasers: dict[str, Sequence[LaserModel]] = {}
+    keyscans: list[Keyscan] = []
+    poses: list[FloatArray] = []
+    for sent in mission.packets.values():
+        for sized in sent:
+            packet = in_session(sized.packet)
+            if packet.robot not in members:
+                continue
+            if isinstance(packet.body, Hello):
+                lasers[packet.robot] = packet.body.lasers
+            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
+                keyscans.append(packet.body)
+    if not keyscans:
+        raise SourceError(f"{folder}: no robot of map {map_index} sent ranges (robot.sends: words); nothing to compare")
+    stamps = {name: np.argsort(robot.stamps, kind="stable") for name, robot in members.items()}
+    for keyscan in keyscans:
+        robot, order = members[keyscan.id.robot], stamps[keyscan.id.robot]
+        sorted_stamps = robot.stamps[order]
+        k = min(int(np.searchsorted(sorted_stamps, keyscan.stamp - STAMP_TOLERANCE_S)), len(order) - 1)
+        if k < 0 or abs(sorted_stamps[k] - keyscan.stamp) > STAMP_TOLERANCE_S:
+            raise SourceError(f"{folder}: the trajectory of {keyscan.id.robot} has no pose at {keyscan.stamp:.6f} s")
+        poses.append(robot.T_map_base[order[k]])
+    return _Seen(keyscans, np.array(poses).reshape(-1, 3), lasers)
+
+
+def _period_at(option: str, text: str, periods: Sequence[Period]) -> int:
+    """Number of the newest period that had ended at a time, or of the period of a session."""
+    for number, period in enumerate(periods):
+        if text in period.sessions:
+            return number
+    stamp = _stamp(option, text)
+    ended = [number for number, period in enumerate(periods) if period.last_s <= stamp]
+    if not ended:
+        raise SourceError(f"--{option} {text}: no session had ended by then; the first is {_named(periods[0])}")
+    return ended[-1]
+
+
+def _stamp(option: str, text: str) -> float:
+    """Seconds of a stamp, or since 1970 of a date or time."""
+    try:
+        stamp = float(text)
+        if math.isfinite(stamp):
+            return stamp
+    except ValueError:
+        pass
+    try:
+        moment = datetime.combine(date.fromisoformat(text), time.max)
+    except ValueError:
+        try:
+            moment = datetime.fromisoformat(text)
+        except ValueError as error:
+            raise SourceError(
+                f"--{option} {text[:100]!r}: neither a session nor a stamp in seconds nor a date as 2026-11-23"
+            ) from error
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _named(period: Period) -> str:
+    return f"{', '.join(period.sessions)} (stamps {period.first_s:.1f} to {period.last_s:.1f})"

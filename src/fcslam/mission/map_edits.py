@@ -1,0 +1,108 @@
+"""Edits that are drawn in a finished map: they are tied to the mission's keyscans, so that they move with the map."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from fcslam.cloud.edits import check_polygon
+from fcslam.errors import EditError
+from fcslam.geometry import se2
+from fcslam.geometry.alignment import n_point_alignment
+from fcslam.mission.mission_file import SavedMission
+from fcslam.records import FloatArray, MapRegion, Pin, Placement, RegionUse, Veto
+from fcslam.runs import Run
+
+
+def check_closure(run: Run, decision: Veto | Pin) -> None:
+    """Check that a run has the closure about which a user decides.
+
+    Raises:
+        EditError: it has not.
+    """
+    if decision.stamps is None:
+        return
+    named = Veto(decision.robot_i, decision.robot_j, decision.stamps)
+    if not any(named.forbids(c.robot_i, c.stamp_i, c.robot_j, c.stamp_j) for c in run.closures):
+        (at_i, at_j), (i, j) = decision.stamps, (decision.robot_i, decision.robot_j)
+        raise EditError(
+            f"there is no closure {i} {at_i:.6f} {j} {at_j:.6f}; copy both ends from a line of closures.csv"
+        )
+
+
+def region_in_map(
+    run: Run, mission: SavedMission, map_index: int, use: RegionUse, name: str, polygon: Sequence[tuple[float, float]]
+) -> MapRegion:
+    """A region, tied to the keyscan that is nearest to its centre.
+
+    Args:
+        run: the finished run.
+        mission: its mission.
+        map_index: number of the map in which the polygon is drawn.
+        use: what the region is for.
+        name: what it is called.
+        polygon: corners (x, y) in ``map``, metres.
+
+    Raises:
+        EditError: the run has no such map, or the polygon has no inside.
+    """
+    check_polygon(polygon)
+    corners = np.array(polygon, dtype=np.float64)
+    keyscans = list(_keyscans(run, mission, map_index))
+    centre = corners.mean(axis=0)
+    session, stamp, T_map_base = min(keyscans, key=lambda keyscan: float(np.hypot(*(keyscan[2][:2] - centre))))
+    in_base = se2.transform(se2.inverse(T_map_base), corners).tolist()
+    return MapRegion(use, name, session, stamp, tuple((x, y) for x, y in in_base))
+
+
+def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatArray) -> Placement:
+    """The placement that moves a map by a motion.
+
+    Args:
+        run: the finished run.
+        mission: its mission.
+        map_index: number of the map.
+        T_new_map: the present frame in the new one, shape (3,), metres and radians.
+
+    Raises:
+        EditError: the run has no such map.
+    """
+    session, stamp, T_map_base = next(_keyscans(run, mission, map_index))
+    x, y, theta = se2.compose(T_new_map, T_map_base).tolist()
+    return Placement(session, stamp, (x, y, theta))
+
+
+def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tuple[float, float]]) -> FloatArray:
+    """The motion that moves points of a map nearest to where they shall be, in the least-squares sense.
+
+    Args:
+        points: two or more points (x, y) in ``map``, metres.
+        targets: where each shall be, metres.
+
+    Returns:
+        The present frame in the new one, shape (3,), metres and radians.
+
+    Raises:
+        EditError: there are fewer than two different points.
+    """
+    T_new_map = n_point_alignment(np.array(targets).reshape(-1, 2), np.array(points).reshape(-1, 2))
+    if not np.isfinite(T_new_map).all():
+        raise EditError("the points fix no rotation; give two or more that lie apart")
+    return T_new_map
+
+
+def _keyscans(run: Run, mission: SavedMission, map_index: int) -> Iterator[tuple[str, float, FloatArray]]:
+    """Session, stamp and T_map_base of the keyscans of a map.
+
+    Raises:
+        EditError: the run has no such map.
+    """
+    sessions = [t for t in run.trajectories.values() if t.map_index == map_index]
+    if not sessions:
+        known = sorted({trajectory.map_index for trajectory in run.trajectories.values()})
+        raise EditError(f"there is no map {map_index}; there are {', '.join(map(str, known))}")
+    for trajectory in sessions:
+        track = mission.tracks.get(trajectory.robot)
+        every = np.ones(len(trajectory.stamps), bool)
+        rows = every if track is None or len(track.stamps) != len(every) else ~track.T_keyscan_base.any(axis=1)
+        for stamp, pose in zip(trajectory.stamps[rows].tolist(), trajectory.T_map_base[rows], strict=True):
+            yield trajectory.robot, stamp, pose

@@ -1,0 +1,380 @@
+"""A mission: recordings in, robots, cloud, one map out. The paper's figure 1 on one screen.
+
+sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> fusion) -> run folder
+"""
+
+import heapq
+import itertools
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from fcslam.anchoring.anchors import Anchored, Anchors, anchored
+from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.edits import in_force
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.packet_log import PacketNumber
+from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
+from fcslam.cloud.result import FleetResult
+from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
+from fcslam.cloud.settings import CloudConfig, FleetConfig
+from fcslam.config import Settings, dump
+from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
+from fcslam.metrics.jumps import JumpLimits
+from fcslam.mission.driving import Drive, Leg, continued, on_floor, one_by_one
+from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
+from fcslam.mission.mission_store import StoredPacket
+from fcslam.places.matcher import MatchDecision
+from fcslam.records import Channel, Edit, GnssFix, Placement, Veto
+from fcslam.robot.frontend import RobotConfig
+from fcslam.robot.words import Sends
+from fcslam.runs import Metric, Run, check_names
+from fcslam.sources import Source
+from fcslam.sources.faults import Faults
+from fcslam.storage.state_file import State
+from fcslam.wire.checks import check_floor, check_name
+from fcslam.wire.ledger import Counter, Ledger, Traffic
+from fcslam.wire.messages import Packet, PacketKind
+from fcslam.wire.packets import Label, SizedPacket, decode, measure
+
+_log = logging.getLogger(__name__)
+
+NOTHING_KNOWN = Anchors()
+
+AUTHOR = "fcslam map"
+"""The author of vetoes that are given with the recordings."""
+
+
+class MissionConfig(Settings):
+    """All settings; the defaults serve all recordings."""
+
+    seed: int = Field(default=0, ge=0, description="seed of the random generator; the same seed gives the same run")
+    robot: RobotConfig = Field(default=RobotConfig(), description="settings of the robots")
+    fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the cloud")
+    map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
+    jumps: JumpLimits = Field(default=JumpLimits(), description="limits of motion beyond which `fcslam map` warns")
+
+    @model_validator(mode="after")
+    def _words_do_not_show_geometry(self) -> Self:
+        if self.robot.sends is Sends.WORDS and self.fleet.matcher.decision is not MatchDecision.SIMILARITY:
+            raise ValueError(
+                "robot.sends words leaves no ranges to verify places with; set fleet.matcher.decision to similarity "
+                "and fleet.fusion to two_point, or give --preset paper"
+            )
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Progress of a mission."""
+
+    scans: int
+    keyscans: int
+    recorded_s: float
+    """Recorded time so far, summed over the robots, in seconds."""
+    closures: dict[str, int]
+    fusing: bool = False
+    """Whether all packets are sent, and the cloud decides and fuses."""
+    faults: Mapping[str, Faults] = field(default_factory=dict)
+    """Faults of the recordings that were read to their end, by robot."""
+
+
+Watch = Callable[[Progress], None]
+
+
+Live = Callable[["MissionCloud"], None]
+"""Called after every packet; it may look at the cloud, and changes nothing."""
+
+
+def continued_config(earlier: SavedMission | None) -> MissionConfig:
+    """The default configuration, with the cloud's settings of an earlier mission if there is one."""
+    if earlier is None:
+        return MissionConfig()
+    return MissionConfig(seed=earlier.config.seed, fleet=earlier.config.fleet, map=earlier.config.map)
+
+
+def run_mission(
+    sources: Sequence[Source],
+    config: MissionConfig,
+    watch: Watch = lambda _: None,
+    vetoes: Sequence[Veto] = (),
+    drive: Drive = one_by_one,
+    onto: SavedMission | None = None,
+    live: Live = lambda _: None,
+    floors: Mapping[str, str] = MappingProxyType({}),
+    verify_pairs: VerifyPairs = verify_here,
+    anchors: Anchors = NOTHING_KNOWN,
+) -> Run:
+    """Map recordings together, one robot each.
+
+    Args:
+        sources: the recordings.
+        config: all settings.
+        watch: called with the progress.
+        vetoes: closures that must not count.
+        drive: runs the robots.
+        onto: an earlier mission that goes on; its packets take effect again, and the result is that of all recordings
+            at once. A robot of it that has a recording again begins a new session.
+        live: called with the cloud after every packet.
+        floors: floor of each recording that has one, by its robot's name; places of different floors are never
+            compared.
+        verify_pairs: verifies pairs of submaps, here or elsewhere; the run is the same.
+        anchors: what is known about the building; it places the maps, and joins none.
+
+    Raises:
+        SourceError: two recordings have one name, or one cannot be read.
+        ConfigError: a veto, a floor or a start names a robot that is not there, or a floor is not valid.
+        OutputError: a robot's name cannot be a file name.
+    """
+    onto = onto or EMPTY
+    _check_robots(sources)
+    recordings = [source.name for source in sources]
+    known = [*onto.robots, *recordings]
+    _check_known("a veto", (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)), known)
+    _check_known("a start", config.fleet.starts, known)
+    _check_known("a floor", floors, recordings)
+    _check_floors(floors)
+    cloud = MissionCloud(config, onto, vetoes, verify_pairs)
+    meter = _Meter(watch, cloud, known)
+    with drive(sources, config.robot) as robots:
+        new = [
+            on_floor(continued(legs, onto.epochs(source.name)), floors.get(source.name, ""))
+            for legs, source in zip(robots, sources, strict=True)
+        ]
+        streams = [_packets(legs, meter) for legs in new]
+        first, streams = _first(streams)
+        if cloud.resume(onto, first):
+            meter.take_over(onto)
+        else:
+            streams += [_packets(legs, meter) for legs in onto.legs()]
+        for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
+            cloud.apply(sent)
+            live(cloud)
+    meter.report(fusing=True)
+    return cloud.run(meter.tracks, meter.scans, meter.recorded_s, anchors, meter.fixes)
+
+
+class MissionCloud:
+    """The cloud of a mission within one process; it counts what is sent."""
+
+    def __init__(
+        self, config: MissionConfig, onto: SavedMission = EMPTY, vetoes: Sequence[Veto] = (),
+        verify_pairs: VerifyPairs = verify_here,
+    ) -> None:  # fmt: skip
+        """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
+        self.config = config
+        self._verify_pairs = verify_pairs
+        self._cloud = Cloud(config.fleet, config.seed, verify_pairs)
+        self._traffic = Counter()
+        self._packets: list[StoredPacket] = []
+        self._refused = onto.refused
+        numbers = itertools.count(len(onto.edits) + 1)
+        self._edits = (*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in vetoes))
+        self._cloud.fleet.edit(in_force(self._edits))
+        for packet in onto.refused:
+            self._cloud.refuse(packet.robot, packet.epoch, packet.sequence)
+
+    @property
+    def fleet(self) -> Fleet:
+        """The fleet, for vetoes and counts."""
+        return self._cloud.fleet
+
+    def resume(self, onto: SavedMission, first: SizedPacket | None) -> bool:
+        """Take over the state after all packets of an earlier mission, so that they need not be applied again.
+
+        Args:
+            onto: the mission that this cloud began with.
+            first: the first packet of the new ones; None: there are none.
+
+        Returns:
+            Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
+        """
+        packets = sorted(onto.stored, key=lambda packet: packet.order)
+        is_later = not packets or first is None or first.packet.order > packets[-1].order
+        if onto.state is None or not is_later or self._edits != onto.edits or self._settings != onto.config:
+            return False
+        try:
+            config, state = self.config, onto.state["cloud"]
+            numbered = {PacketNumber(session_name(p.robot, p.epoch), p.sequence): p for p in packets}
+            cloud = Cloud.restored(
+                config.fleet, config.seed, state, {number: packet.time for number, packet in numbered.items()},
+                lambda number: decode(numbered[number].data), self._verify_pairs,
+            )  # fmt: skip
+            traffic = {
+                Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
+                for robot, kind, channel, count, size in onto.state["traffic"]
+            }
+        except Exception as error:  # a mission must never depend on the state of an earlier one
+            _log.warning("all packets take effect again, as the state of the mission cannot be used: %s", error)
+            return False
+        self._cloud, self._packets, self._traffic = cloud, packets, Counter(Ledger(traffic, Traffic()))
+        return True
+
+    def apply(self, sent: SizedPacket) -> list[Packet]:
+        """Apply the next packet of a robot; returns the replies to it.
+
+        Raises:
+            FcslamError: the cloud refuses it.
+        """
+        try:
+            replies = self._cloud.apply(sent.packet)
+        except PacketError as error:
+            raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
+        self._packets.append(as_stored(sent))
+        for packet in (sent, *map(measure, replies)):
+            self._traffic.accept(packet.label, packet.size)
+        return replies
+
+    def run_so_far(self) -> Run:
+        """The map so far, as the service shows it live: without new decisions, and of the keyscans alone."""
+        result = self.fleet.estimate()
+        tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+        metrics = traffic_metrics(self._traffic.ledger(), tracks)
+        return run_of(result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False)
+
+    def run(
+        self, tracks: Mapping[str, Track], scans: int, recorded_s: float, anchors: Anchors = NOTHING_KNOWN,
+        fixes: Mapping[str, Sequence[GnssFix]] = MappingProxyType({}),
+    ) -> Run:  # fmt: skip
+        """The result of all packets so far.
+
+        Args:
+            tracks: the scans of the sessions, in their order. Other sessions come first, with their keyscans alone.
+            scans: number of scans.
+            recorded_s: length of the recordings together, seconds.
+            anchors: what is known about the building.
+            fixes: positions by satellites, by robot.
+        """
+        result = self._cloud.finalize()
+        unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
+        mapped = {robot.robot for robot in result.robots}
+        tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
+        counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
+        metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
+        mission = mission_bytes(self._settings, self._edits, self._packets, self._refused, tracks)
+        placing = self._placed(result, tracks, anchors, fixes)
+        run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
+        run = replace(run, map_files={**run.map_files, **placing.files})
+        return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
+
+    def _placed(
+        self, result: FleetResult, tracks: Mapping[str, Track], anchors: Anchors,
+        fixes: Mapping[str, Sequence[GnssFix]],
+    ) -> Anchored:  # fmt: skip
+        if anchors == NOTHING_KNOWN and not any(fixes.values()):
+            return Anchored(result)
+        by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
+        placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
+        own = {robot.robot: fixes.get(robot_of(robot.robot), ()) for robot in result.robots}
+        return anchored(result, anchors, own, tracks, placed, lambda members: fuse_members(members, self.config.map))
+
+    @property
+    def _settings(self) -> CloudConfig:
+        return CloudConfig(seed=self.config.seed, fleet=self.config.fleet, map=self.config.map)
+
+    def _state(self) -> State:
+        ledger = self._traffic.ledger()
+        traffic = [[*label, total.count, total.bytes] for label, total in ledger.accepted.items()]
+        return {"cloud": self._cloud.state(), "traffic": traffic}
+
+
+def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
+    """The packets that one robot sends over its recording."""
+    for leg in legs:
+        meter.count(leg)
+        yield from leg.packets
+
+
+def _first(streams: Sequence[Iterator[SizedPacket]]) -> tuple[SizedPacket | None, list[Iterator[SizedPacket]]]:
+    """The first packet of all streams, each of which is in order, and the same streams again."""
+    heads = [next(stream, None) for stream in streams]
+    there = [(head, stream) for head, stream in zip(heads, streams, strict=True) if head is not None]
+    first = min((head for head, _ in there), key=lambda head: head.packet.order, default=None)
+    return first, [itertools.chain((head,), stream) for head, stream in there]
+
+
+class _Meter:
+    """Counts scans, keyscans and recorded time, and reports the progress."""
+
+    def __init__(self, watch: Watch, cloud: MissionCloud, robots: Sequence[str]) -> None:
+        self._watch = watch
+        self._cloud = cloud
+        self._span: dict[str, tuple[float, float]] = {}
+        self._faults: dict[str, Faults] = {}
+        self.scans = self.keyscans = 0
+        self._tracks: dict[str, dict[str, Track]] = {robot: {} for robot in robots}
+        """By robot and session, of the robots that are done."""
+        self.fixes: dict[str, tuple[GnssFix, ...]] = {}
+        """By robot, of the robots that are done."""
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """The scans of the robots that are done, by session; robots and their sessions in order."""
+        by_robot = (sorted(robot.items(), key=lambda item: robot_and_epoch(item[0])) for robot in self._tracks.values())
+        return dict(itertools.chain.from_iterable(by_robot))
+
+    @property
+    def recorded_s(self) -> float:
+        """Time between the first and the last scan, of all robots together."""
+        return sum(last - first for first, last in self._span.values())
+
+    def count(self, leg: Leg) -> None:
+        """One more leg of a robot."""
+        if leg.stamps:
+            first, last = self._span.get(leg.robot, (leg.stamps[0], leg.stamps[0]))
+            self._span[leg.robot] = min(first, *leg.stamps), max(last, *leg.stamps)
+        self.scans += len(leg.stamps)
+        self.keyscans += leg.keyscans
+        if leg.faults is None:
+            self.report()
+        else:
+            self._tracks[leg.robot] |= leg.tracks
+            self.fixes[leg.robot] = self.fixes.get(leg.robot, ()) + leg.fixes
+            self._faults[leg.robot] = leg.faults
+
+    def take_over(self, onto: SavedMission) -> None:
+        """Count an earlier mission whose packets need not be applied again."""
+        for leg in onto.driven():
+            self.count(leg)
+        self.keyscans += sum(packet.kind is PacketKind.KEYSCAN for packet in onto.stored)
+
+    def report(self, fusing: bool = False) -> None:
+        """Report the progress now."""
+        closures = self._cloud.fleet.closure_counts()
+        self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing, self._faults.copy()))
+
+
+def _check_robots(sources: Sequence[Source]) -> None:
+    names = [source.name for source in sources]
+    for name in names:
+        if names.count(name) > 1:
+            raise SourceError(
+                f"two recordings are called '{name}'; a robot is named by its file, so name one: NAME=LOG"
+            )
+        try:
+            check_name(name, "robot")
+            check_robot(name)
+        except PacketError as error:
+            raise SourceError(f"{error}; a robot is named by its file, so rename it, or give NAME=LOG") from error
+    check_names(names)
+
+
+def _check_floors(floors: Mapping[str, str]) -> None:
+    for floor in floors.values():
+        try:
+            check_floor(floor)
+        except PacketError as error:
+            raise ConfigError(str(error)) from error
+
+
+def _check_known(what: str, names: Iterable[str], robots: Sequence[str]) -> None:
+    for name in names:
+        if robot_of(name) not in robots:
+            raise ConfigError(f"{what} names '{name}', but the robots are {', '.join(robots)}")

@@ -1,0 +1,267 @@
+"""The mission file: packets, edits and configuration of a mission in one file. The service exports the same format.
+
+A mission that goes on needs no recording of earlier robots: their packets take effect again.
+"""
+
+import fcntl
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import blake2b
+from itertools import chain
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from fcslam.cloud.edits import check_edit
+from fcslam.cloud.report import Track
+from fcslam.cloud.sessions import robot_and_epoch, session_name
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import InputError, PacketError, SourceError, StoreError
+from fcslam.mission.driving import Leg
+from fcslam.mission.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
+from fcslam.records import Change, Edit, Undo
+from fcslam.runs.folder import MISSION, STATE
+from fcslam.sources.faults import Faults
+from fcslam.storage.database import translate_errors
+from fcslam.storage.files import replacing
+from fcslam.storage.own_files import read_own
+from fcslam.storage.state_file import State, code_version, parse_state, state_bytes
+from fcslam.untrusted import LimitError, check_unpacked, open_file, read_bytes
+from fcslam.wire.packets import SizedPacket, decode, unpacked_size
+
+_log = logging.getLogger(__name__)
+
+_AT_ONCE: Final = 1000
+"""Packets that are read at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMission:
+    """The content of a mission file."""
+
+    config: CloudConfig
+    edits: tuple[Edit, ...]
+    stored: tuple[StoredPacket, ...]
+    """The packets as they are stored, in the order of their arrival; without refused ones."""
+    refused: tuple[StoredPacket, ...]
+    """Packets without effect; their numbers are used up."""
+    tracks: Mapping[str, Track]
+    """The scans of each session whose scans are known, by its name."""
+    state: State | None = None
+    """The state of the cloud after all packets, if this user's program left one beside the file."""
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Robots with a packet, in the order of their first one."""
+        return tuple(dict.fromkeys(packet.robot for packet in self.stored))
+
+    @cached_property
+    def packets(self) -> Mapping[str, tuple[SizedPacket, ...]]:
+        """The packets of each robot in the order of their times, decoded when somebody asks for them.
+
+        Raises:
+            PacketError: one cannot be read.
+        """
+        sent: dict[str, list[SizedPacket]] = {robot: [] for robot in self.robots}
+        for stored in self.stored:
+            sent[stored.robot].append(SizedPacket(decode(stored.data), stored.data))
+        return {robot: tuple(sorted(its, key=lambda sized: sized.packet.order)) for robot, its in sent.items()}
+
+    @property
+    def in_order(self) -> list[SizedPacket]:
+        """All packets in canonical order."""
+        return sorted(chain.from_iterable(self.packets.values()), key=lambda sized: sized.packet.order)
+
+    def epochs(self, robot: str) -> int:
+        """How many sessions the robot had, counted with those without a packet."""
+        return 1 + max((packet.epoch for packet in self.stored if packet.robot == robot), default=-1)
+
+    def legs(self) -> list[Iterator[Leg]]:
+        """Yield the legs of each robot, as ``driving`` gives them for recordings."""
+        return [iter((replace(leg, packets=self.packets[leg.robot]),)) for leg in self.driven()]
+
+    def driven(self) -> list[Leg]:
+        """The way of each robot, without its packets."""
+        return [self._way(robot) for robot in self.robots]
+
+    def _way(self, robot: str) -> Leg:
+        tracks = {name: track for name, track in self.tracks.items() if robot_and_epoch(name)[0] == robot}
+        stamps = tuple(stamp for track in tracks.values() for stamp in track.stamps.tolist())
+        return Leg(robot, (), stamps, tracks, Faults({}))
+
+
+EMPTY: Final = SavedMission(CloudConfig(), (), (), (), {})
+"""A mission before its first packet."""
+
+
+def read_mission(path: Path) -> SavedMission:
+    """Read a mission file; it is not changed.
+
+    Raises:
+        SourceError: there is none, it is damaged or of another version, or a packet in it cannot be read.
+    """
+    path = mission_path(path)
+    try:
+        with opened_copy(path) as store:
+            mission = replace(_read(store), state=_state_beside(path))
+        if mission.state is None:
+            check_unpacked(
+                sum(len(packet.data) for packet in mission.stored),
+                sum(unpacked_size(packet.data) for packet in mission.stored),
+            )
+            _ = mission.packets  # beside a state that fits the file, this program has decoded them all before
+        return mission
+    except (PacketError, LimitError) as error:
+        raise SourceError(f"{path}: {error}") from error
+    except StoreError as error:
+        raise SourceError(str(error)) from error
+
+
+@contextmanager
+def opened_copy(path: Path | None) -> Iterator[MissionStore]:
+    """Open a copy of a mission file, which itself is not changed; None: a mission before its first packet.
+
+    Raises:
+        StoreError: the file is damaged or of another version, or cannot be read.
+    """
+    with TemporaryDirectory() as place:  # opening the file for reading would leave files beside it
+        copy = Path(place) / MISSION
+        if path is not None:
+            check_mission(path)
+            with translate_errors(path), open_file(path) as file, copy.open("wb") as copied:
+                shutil.copyfileobj(file, copied)
+        with closing(MissionStore(copy)) as store:
+            yield store
+
+
+def mission_state_bytes(mission: bytes, state: State) -> bytes:
+    """The state of the cloud that made a mission file, for ``Run.state``."""
+    return state_bytes(_fits(mission), state)
+
+
+def _state_beside(path: Path) -> State | None:
+    """The state that fits this program and the mission file at ``path``; None if there is none."""
+    place = path.with_name(STATE)
+    if path.name != MISSION or not place.exists():
+        return None
+    data = read_own(place)
+    if data is None:
+        _log.info("%s: is not of this user, or was changed; all packets take effect again", place)
+        return None
+    try:
+        return parse_state(place, data, _fits(read_bytes(path)))
+    except InputError as error:
+        _log.info("%s; all packets take effect again", error)
+        return None
+
+
+def _fits(mission: bytes) -> str:
+    return f"{code_version()} {blake2b(mission, digest_size=16).hexdigest()}"
+
+
+def mission_bytes(
+    config: CloudConfig,
+    edits: Sequence[Edit],
+    packets: Sequence[StoredPacket],
+    refused: Sequence[StoredPacket],
+    tracks: Mapping[str, Track],
+) -> bytes:
+    """The mission file of a mission.
+
+    Args:
+        config: settings of the cloud.
+        edits: all edits, in their order.
+        packets: the packets in the order in which they took effect.
+        refused: packets without effect.
+        tracks: the scans of each session, by its name.
+    """
+    with TemporaryDirectory() as place:
+        with opened_copy(None) as store:
+            store.configure(config)
+            store.put([*packets, *refused], 0.0)
+            for edit in edits:
+                store.edit(edit.content, edit.author, edit.time_s)
+            for name, track in tracks.items():
+                store.put_track(*robot_and_epoch(name), track)
+            store.export(Path(place) / MISSION)
+        return (Path(place) / MISSION).read_bytes()
+
+
+def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, time_s: float) -> list[Edit]:
+    """Append edits to a mission file, all or none. Two people may edit at once: one waits for the other.
+
+    Args:
+        path: the file, or the run folder that holds it.
+        contents: what to append.
+        author: who edits.
+        time_s: now, seconds since 1970.
+
+    Raises:
+        SourceError: as ``read_mission``, or the file cannot be written.
+        EditError: an edit names a session or a time that the mission does not have, or what cannot be undone.
+    """
+    path = mission_path(path)
+    try:
+        with _exclusively(path), opened_copy(path) as store:
+            edits = []
+            for content in contents:  # in the copy: one may rest on those before it
+                check_edit(content)
+                store.check_named(content)
+                edits.append(store.edit(content, author, time_s))
+            with TemporaryDirectory() as place, replacing(path) as unfinished:
+                store.export(Path(place) / MISSION)  # an export has an unfinished file of its own beside it
+                shutil.copyfile(Path(place) / MISSION, unfinished)
+        return edits
+    except StoreError as error:
+        raise SourceError(str(error)) from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be edited ({error}); the file is as before") from error
+
+
+def mission_path(path: Path) -> Path:
+    """The mission file that a user names by itself or by its run folder.
+
+    Raises:
+        SourceError: there is none.
+    """
+    path = path / MISSION if path.is_dir() else path
+    if not path.is_file():
+        raise SourceError(f"{path}: no mission file; `fcslam map` writes one into each run folder")
+    return path
+
+
+@contextmanager
+def _exclusively(path: Path) -> Iterator[None]:
+    """Wait until nobody else edits the file."""
+    while True:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):  # nobody replaced it meanwhile
+                yield
+                return
+
+
+def as_stored(sized: SizedPacket) -> StoredPacket:
+    """A packet as a mission file stores it."""
+    packet, label = sized.packet, sized.label
+    return StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, sized.data)
+
+
+def _read(store: MissionStore) -> SavedMission:
+    packets: list[StoredPacket] = []
+    last = 0
+    while arrived := store.arrivals(last, _AT_ONCE):
+        packets += (stored for _, stored in arrived)
+        last, _ = arrived[-1]
+    return SavedMission(
+        config=CloudConfig.model_validate_json(store.fact(CONFIG) or "{}"),
+        edits=tuple(store.edits()),
+        stored=tuple(packet for packet in packets if packet.refusal is None),
+        refused=tuple(packet for packet in packets if packet.refusal is not None),
+        tracks={session_name(robot, epoch): track for (robot, epoch), track in store.tracks().items()},
+    )

@@ -1,0 +1,466 @@
+"""A live robot on a ROS network: reads its sensors, maps, and publishes map and pose.
+
+The thread that calls ``run`` reads messages. A second thread publishes ``map -> odom`` at a fixed rate. A third one
+publishes the map, the path and diagnostics, and a fourth one obeys commands. So none of them delays the pose of a scan.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from fcslam.config import one_line
+from fcslam.errors import FcslamError, NetworkError
+from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
+from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
+from fcslam.ros.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
+from fcslam.ros.outputs import MAP, OWN_MAP, POSE, OutputNames, Outputs, nanoseconds
+from fcslam.ros.parameters import NodeParameters
+from fcslam.ros.sensors import LiveSensors, Notify
+from fcslam.ros.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
+from fcslam.ros.transform_stream import TransformStream
+from fcslam.runs import RobotTrajectory
+from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.transforms import planar, transform_of
+from fcslam.storage.files import write_file
+
+if TYPE_CHECKING:
+    from fcslam.live.fleet_view import FleetView
+    from fcslam.live.records import RobotPose
+
+STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
+SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
+_LONGEST_INBOX = 20_000
+"""Most messages that wait to be read; beyond, newer ones are lost."""
+_COMMANDS_WAITING = 8
+"""Most commands that wait; anybody on the network may send them."""
+_LINES_TOLD = 1000
+"""Largest number of different lines that are printed; the names in some come from the network."""
+_POLL_S = 0.1
+_FLEET_PERIOD_S = 0.2
+"""Time between two messages with the poses of the fleet."""
+_SETTLES_FOR_ODOMETRY = 4
+_SILENCE_S = 2.0
+"""A longer pause of the scans is reported."""
+_DEPTHS = {**dict.fromkeys((*SCANS, COMPRESSED_IMAGE, IMAGE), 10), **dict.fromkeys(LASER_SCANS, 100), CAMERA_INFO: 1}
+_DEPTH = 1000
+"""Messages that the middleware keeps for this process; of odometry and tf there are many."""
+
+
+class LiveRobot(Protocol):
+    """The robot that maps; ``fcslam.Robot`` is one."""
+
+    name: str
+
+    def add(self, record: SensorRecord) -> "RobotPose | None":
+        """The next record; returns the pose of a scan."""
+
+    @property
+    def fleet(self) -> "FleetView | None":
+        """What the robot knows of its fleet; None without a server."""
+
+    def map(self) -> OccupancyMap:
+        """The map now: with a fleet, that of all its robots."""
+
+    def joint_map(self) -> OccupancyMap | None:
+        """The map of the fleet; None before there is one, and without a fleet."""
+
+    def own_map(self) -> OccupancyMap:
+        """The map of what this robot saw."""
+
+    def trajectory(self) -> RobotTrajectory:
+        """The poses of all scans now."""
+
+    def closures(self) -> FloatArray:
+        """Both ends of each closure, shape (N, 2, 2), metres in ``map``."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    topic: str
+    payload: bytes
+    received_ns: int
+
+
+def await_sensors(
+    network: RosNetwork, namespace: str, options: BagOptions, timeout_s: float, settle_s: float = 1.0
+) -> SensorTopics:
+    """The topics of the robot's sensors, once they are there; ``settle_s`` later, so that all of them are.
+
+    Odometry may also come from tf, which is there early on most robots. So its topic is given more time to appear.
+
+    Raises:
+        NetworkError: a topic is missing, or of another type.
+    """
+    end_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            if choose_sensor_topics(network.endpoints(), namespace, options).odometry is None:
+                time.sleep(_SETTLES_FOR_ODOMETRY * settle_s)
+            time.sleep(settle_s)
+            return choose_sensor_topics(network.endpoints(), namespace, options)
+        except NetworkError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(_POLL_S)
+
+
+class RobotNode:
+    """One robot between a ROS network and its map."""
+
+    def __init__(
+        self,
+        network: RosNetwork,
+        namespace: str,
+        topics: SensorTopics,
+        options: BagOptions,
+        robot: LiveRobot,
+        parameters: NodeParameters,
+        notify: Notify,
+        suggest_pose: Callable[[FloatArray], None] | None = None,
+        change_floor: Callable[[str], None] | None = None,
+    ) -> None:
+        """Begin to receive and to publish.
+
+        ``suggest_pose`` takes initial poses, if the robot is one in a finished map. ``change_floor`` takes floors, if
+        it maps.
+
+        Raises:
+            NetworkError: another node publishes what this one would.
+        """
+        self._network, self._namespace, self._topics = network, namespace, topics
+        self._robot, self._parameters, self._notify = robot, parameters, notify
+        self._suggest_pose, self._change_floor = suggest_pose, change_floor
+        self._codec = MessageCodec(network.ros1)
+        self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
+        self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
+        self._stop = threading.Event()
+        self._told: set[str] = set()
+        self.scans = self._lost_messages = 0
+        self._pose: RobotPose | None = None
+        self._state: tuple[bool, float] | None = None
+        """Whether the robot knows its pose in the map, and since which stamp."""
+        self._clock = RosClock(parameters.use_sim_time)
+        self._refuse_namesake()
+        names = OutputNames(map_frame=parameters.map_frame, tf=topics.transforms[0])
+        self._outputs = Outputs(network, namespace, names)
+        self._transforms = TransformStream(
+            nanoseconds(parameters.transform_bound), nanoseconds(parameters.transform_timeout)
+        )
+        self.sensors = LiveSensors(topics, namespace, options, network.ros1, self._tell_once)
+        self._restarts = 0
+        self._subscribe()
+
+    def run(self, watch: "Callable[[int, RobotPose | None], None]" = lambda _scans, _pose: None) -> None:
+        """Map until ``stop``; after each record, ``watch`` gets the number of scans and the pose of the last one.
+
+        Raises:
+            NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
+        """
+        threads = [
+            threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
+            threading.Thread(target=self._publish_maps, name="maps", daemon=True),
+            threading.Thread(target=self._publish_fleet, name="fleet topics", daemon=True),
+            threading.Thread(target=self._obey, name="commands", daemon=True),
+        ]
+        for thread in threads:
+            thread.start()
+        began_s = heard_s = time.monotonic()
+        is_silent = False
+        try:
+            while not self._stop.is_set():
+                message = self._next()
+                now_s = time.monotonic()
+                before = self.scans
+                records = (
+                    self.sensors.wait(now_s)
+                    if message is None
+                    else self.sensors.add(message.topic, message.payload, now_s, message.received_ns)
+                )
+                for record in records:
+                    self._map(record)
+                    watch(self.scans, self._pose)
+                if message is not None and message.topic in self._topics.scans:
+                    if is_silent:
+                        self._notify(f"scans arrive again after {now_s - heard_s:.0f} s")
+                    heard_s, is_silent = now_s, False
+                elif not is_silent and now_s > heard_s + _SILENCE_S and before:
+                    self._notify(f"no scan for {_SILENCE_S:.0f} s; the robot waits for the network or the driver")
+                    is_silent = True
+                if not self._clock.is_running and now_s > began_s + self._parameters.topic_timeout:
+                    self._tell_once(
+                        "use_sim_time is set and nobody publishes /clock, so map -> odom is published once for each "
+                        "scan; start the simulator, play the bag with --clock, or leave use_sim_time out"
+                    )
+        finally:
+            self._stop.set()
+            for thread in threads:
+                thread.join()
+        for record in self.sensors.finish():
+            self._map(record)
+
+    def stop(self) -> None:
+        """End ``run`` soon. Any thread may call this."""
+        self._stop.set()
+
+    def publish_map(self) -> None:
+        """Publish the map, the path and the closures as they are now; the robot's own map only if there is a scan.
+
+        Raises:
+            FcslamError: the map is gone.
+        """
+        is_finished_map = self._suggest_pose is not None
+        if self._pose is None and not is_finished_map:
+            return
+        stamp_ns = self._clock.now_ns() if self._pose is None else nanoseconds(self._pose.stamp)
+        own = self._robot.own_map()
+        if self._robot.fleet is None:
+            is_new = self._outputs.map(stamp_ns, own)
+        else:
+            is_new = self._outputs.map(stamp_ns, own, OWN_MAP)
+            if not self._publish_joint_map():
+                self._outputs.map(stamp_ns, own)
+        if is_new or is_finished_map:
+            trajectory = self._robot.trajectory()
+            self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
+            self._outputs.closures(stamp_ns, self._robot.closures())
+
+    def _publish_joint_map(self) -> bool:
+        """Publish the joint map as it is now: whole if its extent changed, else the area that did. False: there is none
+        yet."""
+        joint = self._robot.joint_map()
+        if joint is None or self._pose is None:
+            return False
+        self._outputs.map(nanoseconds(self._pose.stamp), joint, only_changes=True)
+        return True
+
+    def _publish_fleet(self) -> None:
+        """Publish where the robots of the fleet are, at a fixed rate, and what changed in the robot's map, once."""
+        news = 0
+        while not self._stop.wait(_FLEET_PERIOD_S):
+            fleet = self._robot.fleet
+            if fleet is None:
+                return
+            now_ns = self._clock.now_ns()
+            self._outputs.fleet(now_ns, fleet.robots(), fleet.separations(), fleet.map_index)
+            for line in fleet.news[news:]:
+                news += 1
+                self._outputs.event(now_ns, self._robot.name, line)
+
+    def _next(self) -> _Message | None:
+        try:
+            return self._inbox.get(timeout=_POLL_S)
+        except queue.Empty:
+            return None
+
+    def _map(self, record: SensorRecord) -> None:
+        pose = self._robot.add(record)
+        if self.sensors.restarts != self._restarts:
+            self._restarts = self.sensors.restarts
+            self._transforms.restart()
+        if not isinstance(record, LaserScan) or pose is None:
+            return
+        self.scans += 1
+        self._pose = pose
+        stamp_ns = nanoseconds(pose.stamp)
+        if self._state is None or self._state[0] != pose.is_localized:
+            self._state = pose.is_localized, pose.stamp
+        if np.isnan(pose.T_map_base[0]):
+            self._transforms.pause()
+            return
+        moved = pose.T_map_base if self.sensors.is_without_odometry else pose.T_map_odom
+        if moved is not None:
+            self._transforms.add(stamp_ns, self._clock.now_ns(), moved)
+        self._outputs.pose(stamp_ns, pose.T_map_base, pose.covariance)
+
+    def _publish_transforms(self) -> None:
+        period_s = self._parameters.transform_publish_period
+        due_s = time.monotonic()
+        while not self._stop.wait(max(0.0, due_s - time.monotonic())):
+            transform = self._transforms.due(self._clock.now_ns())
+            if transform is not None:
+                child = self.sensors.base_frame if self.sensors.is_without_odometry else self.sensors.odom_frame
+                self._outputs.transform(transform.stamp_ns, child, transform.T_map_odom)
+            due_s = max(due_s + period_s, time.monotonic() - period_s)
+
+    def _publish_maps(self) -> None:
+        """Publish diagnostics every second and the map every interval."""
+        due_s = 0.0
+        drawn = 0 if self._suggest_pose is None else -1  # a finished map is there before the first scan
+        while not self._stop.wait(1.0):
+            self.watch_network()
+            self._diagnose()
+            is_due = time.monotonic() >= due_s and self.scans != drawn
+            try:
+                if not is_due:
+                    if self._robot.fleet is not None:  # what the others see comes in between
+                        self._publish_joint_map()
+                    continue
+                drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
+                self.publish_map()
+            except Exception as error:  # this thread also tells the state of the robot, so it must not end
+                self._tell_once(f"a map cannot be published: {error or type(error).__name__}")
+
+    def _diagnose(self) -> None:
+        pose, state = self._pose, self._state
+        well = "mapping"
+        if pose is None or state is None:
+            trouble = "no scan yet"
+        elif self._suggest_pose is None:
+            trouble = "" if pose.is_localized else "lost: the scans contradict the map"
+        else:
+            since = f"for {max(0.0, pose.stamp - state[1]):.0f} s"
+            trouble, well = "" if state[0] else f"not localised {since}", f"localised {since}"
+        values: dict[str, object] = {"scans": self.scans, "messages lost": self._lost_messages}
+        if pose is not None:
+            values |= {"quality": f"{pose.quality:.3f}", "map": pose.map_index, "stamp": f"{pose.stamp:.3f}"}
+        faults = self.sensors.audit.faults()
+        values |= {"faults": str(faults)} if faults else {}
+        self._outputs.diagnostics(self._clock.now_ns(), self._robot.name, trouble, values, well)
+
+    def _subscribe(self) -> None:
+        offered = [point for point in self._network.endpoints() if point.publishes]
+        for topic, kind in self._topics.kinds.items():
+            # Ask for reliable messages where all publishers offer them: then none is lost.
+            reliable = all(point.quality.reliable for point in offered if point.topic == topic)
+            latched = topic.rsplit("/", 1)[-1] == TF_STATIC
+            quality = Quality(reliable or latched, latched, _DEPTHS.get(kind, _DEPTH))
+            self._network.subscribe(topic, kind, quality, self._deliver(topic))
+        commands: list[tuple[str, str, Callable[[bytes], object]]] = [
+            (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
+            (FINISH, EMPTY, lambda _: self.stop()),
+            (INITIAL_POSE, POSE, self._take_pose),
+            (FLOOR, STRING, self._take_floor),
+        ]
+        for name, kind, command in commands:
+            self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
+        self._network.serve(resolved(self._namespace, SAVE_MAP), lambda: self._ask(self._save_map))
+        self._network.serve(resolved(self._namespace, FINISH), lambda: self._ask(self._finish))
+        if self._clock.simulated:
+            self._network.subscribe(
+                CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
+            )
+
+    def _deliver(self, topic: str) -> Callable[[bytes], None]:
+        def deliver(payload: bytes) -> None:
+            if self._inbox.qsize() < _LONGEST_INBOX:
+                self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
+                return
+            self._lost_messages += 1
+            self._tell_once("messages come faster than this computer can map; some are lost")
+
+        return deliver
+
+    def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
+        """Obey a command later."""
+        asked: Future[Answer] = Future()
+        try:
+            self._commands.put_nowait((command, asked))
+        except queue.Full:
+            asked.set_result(Answer(False, f"{_COMMANDS_WAITING} commands wait already; ask again later"))
+        return asked
+
+    def _obey(self) -> None:
+        while not self._stop.is_set():
+            try:
+                command, asked = self._commands.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            asked.set_result(command())
+        while not self._commands.empty():
+            self._commands.get()[1].set_result(Answer(False, "the drive has ended"))
+
+    def _finish(self) -> Answer:
+        self.stop()
+        return Answer(True, "the drive ends")
+
+    def _save_map(self, payload: bytes | None = None) -> Answer:
+        """Write the files of map_server to this process's folder; the message is their name, else the robot's."""
+        try:
+            name = self._robot.name if payload is None else self._codec.decode(payload, STRING).data or self._robot.name
+            if not NAME.fullmatch(name):  # anybody on the network may send it
+                raise ValueError(f"{name!r} is not a name; give letters, digits and . _ -, without a folder")
+            occupancy = self._robot.map()
+            write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
+            write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))
+        except (ValueError, OSError, FcslamError) as error:
+            answer = Answer(False, f"the map cannot be saved: {error}")
+        else:
+            answer = Answer(True, f"map saved: {Path(f'{name}.yaml').absolute()}")
+        self._notify(answer.message)
+        return answer
+
+    def _take_pose(self, payload: bytes) -> None:
+        """Try a pose that somebody gives, as by RViz's "2D Pose Estimate"."""
+        if self._suggest_pose is None:
+            self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")
+            return
+        try:
+            message = self._codec.decode(payload, POSE)
+            frame = message.header.frame_id.lstrip("/")
+            if frame != self._parameters.map_frame:
+                raise ValueError(f"it is in frame {one_line(repr(frame))}; give it in {self._parameters.map_frame!r}")
+            at, turn = message.pose.pose.position, message.pose.pose.orientation
+            x, y, theta = planar(transform_of((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)))
+            self._suggest_pose(np.array((x, y, theta)))
+        except (ValueError, FcslamError) as error:  # anybody on the network may send it
+            self._notify(f"an initial pose is refused: {error}")
+            return
+        self._notify(f"initial pose ({x:.2f} m, {y:.2f} m, {theta:.2f} rad): it counts once the walls confirm it")
+
+    def _take_floor(self, payload: bytes) -> None:
+        """Begin a session on another floor, as a lift's controller says."""
+        if self._change_floor is None:
+            self._tell_once("a floor is ignored: the robot localises in one finished map")
+            return
+        try:
+            self._change_floor(self._codec.decode(payload, STRING).data)
+        except (ValueError, FcslamError) as error:  # anybody on the network may send it
+            self._tell_once(f"a floor is refused: {one_line(str(error))}")
+
+    def _refuse_namesake(self) -> None:
+        taken = resolved(self._namespace, MAP)
+        if any(point.publishes and not point.own and point.topic == taken for point in self._network.endpoints()):
+            raise NetworkError(
+                f"another node publishes {taken}: a second robot of this name, or a map_server; stop it, or give each "
+                "robot a namespace of its own"
+            )
+
+    def watch_network(self) -> None:
+        """Tell once which peers get nothing, and whether another robot has this name."""
+        endpoints = self._network.endpoints()
+        own = [point for point in endpoints if point.own]
+        for point in endpoints:
+            if point.own:
+                continue
+            for mine in own:
+                if mine.topic == point.topic:
+                    self._tell_once(_mismatch(mine, point))
+        taken = resolved(self._namespace, MAP)
+        if any(point.publishes and not point.own and point.topic == taken for point in endpoints):
+            self._tell_once(f"another node publishes {taken} now, too; two robots must not have one name")
+
+    def _tell_once(self, line: str) -> None:
+        if line and line not in self._told and len(self._told) < _LINES_TOLD:
+            self._told.add(line)
+            self._notify(line)
+
+
+def _mismatch(mine: Endpoint, other: Endpoint) -> str:
+    """Why one of two endpoints of a topic does not get the messages of the other; empty if it does."""
+    if mine.kind != other.kind:
+        return f"{mine.topic}: another node takes it as {other.kind}, and not as {mine.kind}"
+    if mine.publishes == other.publishes:
+        return ""
+    offered, requested = (mine, other) if mine.publishes else (other, mine)
+    conflict = qos_conflict(offered.quality, requested.quality)
+    return f"{mine.topic}: a subscription {conflict}, so it gets nothing; change its QoS" * bool(conflict)

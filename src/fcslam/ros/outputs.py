@@ -1,0 +1,357 @@
+"""The outputs of a robot to the ROS network: map, pose, path, closures, tf and diagnostics.
+
+Frames follow REP 105. The robot publishes ``map -> odom``; the driver of the base publishes ``odom -> base``.
+"""
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.records import FloatArray
+from fcslam.ros.network import Publish, Quality, RosNetwork
+from fcslam.ros.topics import resolved
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
+from fcslam.sources.bags.codec import GRID_UPDATE, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.transforms import in_space
+
+if TYPE_CHECKING:
+    from fcslam.live.fleet_view import Teammate
+
+GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
+MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
+
+POSES, POSE_STAMPED = "geometry_msgs/PoseArray", "geometry_msgs/PoseStamped"
+
+MAP: Final = "map"
+"""Topic of the map in the robot's namespace."""
+OWN_MAP: Final = "own_map"
+"""Topic of what a robot of a fleet saw itself."""
+FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
+MOST_TEAMMATES: Final = 64
+"""Robots with a topic of their own; the others are in ``fleet/poses`` only."""
+LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
+STREAMED: Final = Quality(reliable=True, depth=10)
+TRANSFORMED: Final = Quality(reliable=True, depth=100)
+
+GRID_VALUES: Final = {Occupancy.UNKNOWN: -1, Occupancy.FREE: 0, Occupancy.OCCUPIED: 100}
+SMALL_MAP_CELLS: Final = 1_000_000
+"""Largest number of cells of a map that is published whole at every change."""
+PATH_STEP_M: Final = 0.1
+"""Least distance between two poses of the published path."""
+LONGEST_PATH: Final = 5000
+"""Most poses of the published path, about; a longer path has longer steps."""
+LINE_WIDTH_M: Final = 0.05
+_OK, _WARN = 0, 1
+_LINE_LIST, _ADD = 5, 0
+
+
+@dataclass(frozen=True, slots=True)
+class OutputNames:
+    """Topics and frames of what a robot publishes; topics without a leading slash are in its namespace."""
+
+    map_frame: str = "map"
+    tf: str = "/tf"
+    diagnostics: str = "/diagnostics"
+
+
+class Grid(NamedTuple):
+    """An occupancy grid as ROS has it."""
+
+    values: NDArray[np.int8]
+    """-1 unknown, 0 free, 100 occupied; shape (H, W), from the lowest y."""
+    resolution_m: float
+    origin_xy: tuple[float, float]
+
+
+class Region(NamedTuple):
+    """Cells of a grid."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(slots=True)
+class _GridTopic:
+    """A map and the updates of it."""
+
+    publish: Publish
+    update: Publish
+    whole: Grid | None = None
+    """The newest map that was published whole."""
+    newest: Grid | None = None
+    """The newest map that subscribers have."""
+
+
+class Outputs:
+    """The publishers of one robot. Any thread may call."""
+
+    def __init__(self, network: RosNetwork, namespace: str, names: OutputNames) -> None:
+        def publisher(name: str, kind: str, quality: Quality) -> Publish:
+            return network.publisher(resolved(namespace, name), kind, quality)
+
+        self._codec = MessageCodec(network.ros1)
+        self._names = names
+        self._lock = threading.Lock()
+        self._publisher = publisher
+        self._grids: dict[str, _GridTopic] = {}
+        self._teammates: dict[str, Publish] = {}
+        self._fleet: tuple[Publish, Publish] | None = None
+        self._grid_topic(MAP)
+        self._pose = publisher("pose", POSE, STREAMED)
+        self._path = publisher("path", PATH, LATCHED)
+        self._closures = publisher("closures", MARKERS, LATCHED)
+        self._tf = publisher(names.tf, TRANSFORMS, TRANSFORMED)
+        self._diagnostics = publisher(names.diagnostics, DIAGNOSTICS, STREAMED)
+
+    def transform(self, stamp_ns: int, odom_frame: str, T_map_odom: FloatArray) -> None:
+        """Publish ``map -> odom`` for this stamp."""
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        self._send(self._tf, TRANSFORMS, self._codec.transforms(header, odom_frame, in_space(T_map_odom)))
+
+    def pose(self, stamp_ns: int, T_map_base: FloatArray, covariance: FloatArray) -> None:
+        """Publish the pose of a scan with its covariance (3, 3) over (x, y, theta)."""
+        make = self._codec.make
+        whole = np.zeros((6, 6))
+        planar = np.ix_((0, 1, 5), (0, 1, 5))
+        whole[planar] = covariance
+        posed = make(
+            "geometry_msgs/PoseWithCovariance", pose=self._codec.pose(in_space(T_map_base)), covariance=whole.ravel()
+        )
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        self._send(self._pose, POSE, make(POSE, header=header, pose=posed))
+
+    def path(self, stamp_ns: int, stamps: FloatArray, T_map_base: FloatArray) -> None:
+        """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of at least ``PATH_STEP_M``."""
+        header, make = self._codec.header, self._codec.make
+        frame = self._names.map_frame
+        poses = [
+            make(
+                "geometry_msgs/PoseStamped",
+                header=header(nanoseconds(stamps[at]), frame),
+                pose=self._codec.pose(in_space(T_map_base[at])),
+            )
+            for at in _steps(T_map_base)
+        ]
+        self._send(self._path, PATH, make(PATH, header=header(stamp_ns, frame), poses=poses))
+
+    def closures(self, stamp_ns: int, ends_xy: FloatArray) -> None:
+        """Publish the accepted closures as lines between two places (N, 2, 2), metres in ``map``."""
+        make, vector = self._codec.make, self._codec.vector
+        duration = make("builtin_interfaces/Duration", sec=0, nanosec=0)
+        mesh = {} if self._codec.ros1 else self._new_fields(make)
+        marker = make(
+            "visualization_msgs/Marker",
+            header=self._codec.header(stamp_ns, self._names.map_frame),
+            ns="closures",
+            id=0,
+            type=_LINE_LIST,
+            action=_ADD,
+            pose=self._codec.pose(in_space(np.zeros(3))),
+            scale=vector("Vector3", LINE_WIDTH_M),
+            color=make("std_msgs/ColorRGBA", r=0.1, g=0.6, b=0.2, a=0.8),
+            lifetime=duration,
+            frame_locked=False,
+            points=[vector("Point", x, y) for x, y in ends_xy.reshape(-1, 2).tolist()],
+            colors=[],
+            text="",
+            mesh_resource="",
+            mesh_use_embedded_materials=False,
+            **mesh,
+        )
+        self._send(self._closures, MARKERS, make(MARKERS, markers=[marker]))
+
+    def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
+        """Publish a map if it changed; returns whether it did.
+
+        A small map goes out whole, unless ``only_changes``. Of a large map, only the cells go out that differ from the
+        last whole one or from the last update. So a late subscriber, who gets the whole one, is complete after any
+        update, and one who got all updates keeps no cell that changed back.
+        """
+        grid = grid_of(occupancy)
+        with self._lock:
+            shown = self._grid_topic(topic)
+            if shown.newest is not None and _is_same(shown.newest, grid):
+                return False
+            before, shown.newest = (shown.whole, shown.newest), grid
+            of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
+            if of_whole is None or of_newest is None or (grid.values.size <= SMALL_MAP_CELLS and not only_changes):
+                shown.whole = grid
+                self._send(shown.publish, GRID, self._grid_message(stamp_ns, grid))
+            else:
+                region = _bounding(of_whole, of_newest)
+                self._send(shown.update, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
+            return True
+
+    def fleet(
+        self, now_ns: int, teammates: "Sequence[Teammate]", separations: Sequence[tuple[tuple[int, int], str]],
+        own: int | None,
+    ) -> None:  # fmt: skip
+        """Publish where the robots of the own map are, and which robots are in which map.
+
+        Args:
+            now_ns: the time now.
+            teammates: all robots of the fleet, this one as well.
+            separations: for every two maps that are apart: their indices and the reason.
+            own: index of the robot's own map; None: it is in none, so no pose is in its frame.
+        """
+        make, frame = self._codec.make, self._names.map_frame
+        with self._lock:
+            if self._fleet is None:
+                self._fleet = (
+                    self._publisher(FLEET_POSES, POSES, STREAMED), self._publisher(FLEET_STATUS, DIAGNOSTICS, STREAMED)
+                )  # fmt: skip
+            near = [mate for mate in teammates if mate.map_index == own]
+            poses = [self._codec.pose(in_space(mate.T_map_base)) for mate in near]
+            self._send(self._fleet[0], POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
+            for mate, pose in zip(near, poses, strict=True):
+                name = _topic_name(mate.robot)
+                if name not in self._teammates:
+                    if len(self._teammates) >= MOST_TEAMMATES:
+                        continue
+                    self._teammates[name] = self._publisher(f"fleet/{name}/pose", POSE_STAMPED, STREAMED)
+                header = self._codec.header(max(0, now_ns - nanoseconds(mate.age_s)), frame)
+                self._send(self._teammates[name], POSE_STAMPED, make(POSE_STAMPED, header=header, pose=pose))
+            statuses = [
+                self._status(f"robot {mate.robot}", mate.robot, _OK, f"map {mate.map_index}", {
+                    "map": mate.map_index, "floor": mate.floor, "age_s": f"{mate.age_s:.2f}",
+                    **{axis: f"{value:.4f}" for axis, value in zip(("x", "y", "theta"), mate.T_map_base.tolist(),
+                                                                  strict=True)},
+                })
+                for mate in teammates
+            ]  # fmt: skip
+            statuses += [
+                self._status(f"maps {a} and {b}", "", _WARN, why, {"map_a": a, "map_b": b})
+                for (a, b), why in separations
+            ]
+            message = make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
+            self._send(self._fleet[1], DIAGNOSTICS, message)
+
+    def event(self, stamp_ns: int, robot: str, text: str) -> None:
+        """Publish one event of the fleet's map on the topic of diagnostics."""
+        status = self._status(f"fcslam: {robot}: fleet", robot, _OK, text, {"event": "fleet"})
+        message = self._codec.make(DIAGNOSTICS, header=self._codec.header(stamp_ns, ""), status=[status])
+        self._send(self._diagnostics, DIAGNOSTICS, message)
+
+    def diagnostics(
+        self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
+    ) -> None:
+        """Publish the state of the robot: ``trouble``, or ``well`` if that is empty."""
+        status = self._status(f"fcslam: {robot}", robot, _WARN if trouble else _OK, trouble or well, values)
+        header = self._codec.header(stamp_ns, "")
+        self._send(self._diagnostics, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=[status]))
+
+    def _status(self, name: str, hardware: str, level: int, message: str, values: Mapping[str, object]) -> Any:
+        make = self._codec.make
+        pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
+        return make(
+            "diagnostic_msgs/DiagnosticStatus", level=level, name=name, message=message, hardware_id=hardware,
+            values=pairs,
+        )  # fmt: skip
+
+    def _grid_topic(self, topic: str) -> "_GridTopic":
+        if topic not in self._grids:
+            self._grids[topic] = _GridTopic(
+                self._publisher(topic, GRID, LATCHED), self._publisher(f"{topic}_updates", GRID_UPDATE, LATCHED)
+            )
+        return self._grids[topic]
+
+    def _send(self, publish: Publish, kind: str, message: Any) -> None:
+        publish(self._codec.encode(message, kind))
+
+    def _new_fields(self, make: Any) -> dict[str, Any]:
+        """Fields of a marker that ROS 1 does not have."""
+        image = make(
+            "sensor_msgs/CompressedImage", header=self._codec.header(0, ""), format="", data=np.zeros(0, np.uint8)
+        )
+        mesh = make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8))
+        return {"texture_resource": "", "texture": image, "uv_coordinates": [], "mesh_file": mesh}
+
+    def _grid_message(self, stamp_ns: int, grid: Grid) -> Any:
+        height, width = grid.values.shape
+        info = self._codec.make(
+            "nav_msgs/MapMetaData",
+            map_load_time=self._codec.time(stamp_ns),
+            resolution=grid.resolution_m,
+            width=width,
+            height=height,
+            origin=self._codec.pose(in_space(np.array((*grid.origin_xy, 0.0)))),
+        )
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        return self._codec.make(GRID, header=header, info=info, data=grid.values.ravel())
+
+    def _update_message(self, stamp_ns: int, grid: Grid, region: Region) -> Any:
+        cells = grid.values[region.y : region.y + region.height, region.x : region.x + region.width]
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        return self._codec.make(
+            GRID_UPDATE, header=header, **region._asdict(), data=np.ascontiguousarray(cells).ravel()
+        )
+
+
+def grid_of(occupancy: OccupancyMap) -> Grid:
+    """The map with the values of ROS."""
+    return Grid(_values(occupancy.cells), occupancy.resolution_m, occupancy.origin_xy)
+
+
+def changed_region(before: Grid, after: Grid) -> Region | None:
+    """The smallest rectangle with all cells that changed; None if the grids do not cover the same cells.
+
+    Equal grids have a region of one cell.
+    """
+    if before[1:] != after[1:] or before.values.shape != after.values.shape:
+        return None
+    differs = before.values != after.values
+    rows, columns = np.flatnonzero(differs.any(axis=1)), np.flatnonzero(differs.any(axis=0))
+    if not len(rows):
+        return Region(0, 0, 1, 1)
+    x, y = int(columns[0]), int(rows[0])
+    return Region(x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1)
+
+
+def _bounding(first: Region, second: Region) -> Region:
+    """The smallest rectangle around two."""
+    x, y = min(first.x, second.x), min(first.y, second.y)
+    right, top = (max(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
+    return Region(x, y, right - x, top - y)
+
+
+def _topic_name(robot: str) -> str:
+    """A robot's name as part of a topic; ROS allows letters, digits and underscores there, and no digit first."""
+    name = "".join(one if one.isascii() and one.isalnum() else "_" for one in robot)
+    return f"_{name}" if name[:1].isdigit() else name
+
+
+def nanoseconds(stamp: float) -> int:
+    """A stamp in seconds as ROS counts, not below 0."""
+    return max(0, round(stamp * 1e9))
+
+
+def _values(cells: Cells) -> NDArray[np.int8]:
+    table = np.zeros(len(Occupancy), np.int8)
+    for known, value in GRID_VALUES.items():
+        table[known] = value
+    return np.asarray(table[cells])
+
+
+def _is_same(before: Grid, after: Grid) -> bool:
+    return before[1:] == after[1:] and np.array_equal(before.values, after.values)
+
+
+def _steps(poses: FloatArray) -> Sequence[int]:
+    """Indices of poses (N, 3) that are a step apart, and of the last one."""
+    length_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    step_m = max(PATH_STEP_M, length_m / LONGEST_PATH)
+    kept: list[int] = []
+    places = poses[:, :2].tolist()
+    for at, (x, y) in enumerate(places):
+        if not kept or hypot(x - places[kept[-1]][0], y - places[kept[-1]][1]) >= step_m:
+            kept.append(at)
+    if kept and kept[-1] != len(poses) - 1:
+        kept.append(len(poses) - 1)
+    return kept

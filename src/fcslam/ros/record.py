@@ -1,0 +1,197 @@
+"""Records what a robot publishes into a file that `fcslam map` reads: the messages as they come, undecoded."""
+
+import os
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import count, pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from fcslam.errors import OutputError
+from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
+from fcslam.ros.network import Quality, RosNetwork
+from fcslam.ros.sensors import Notify
+from fcslam.ros.topics import TF_STATIC, SensorTopics
+from fcslam.sources.bags.codec import full_name, typestore
+from fcslam.sources.bags.mcap_records import end_mcap
+
+_POLL_S = 0.2
+_DEPTH = 1000
+LARGEST_INBOX_BYTES = 256_000_000
+"""Most bytes that wait for the disk; beyond, the next messages are lost."""
+
+
+def record(
+    network: RosNetwork,
+    topics: SensorTopics,
+    output: Path,
+    stop: threading.Event,
+    notify: Notify,
+    watch: Callable[[Counter[str]], None] = lambda _: None,
+) -> Counter[str]:
+    """Write all messages of the sensors, and /clock, until ``stop``; returns their number by topic.
+
+    The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it.
+
+    Raises:
+        OutputError: the file cannot be written; the message names the file that is kept.
+    """
+    inbox = _Inbox()
+    kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
+
+    def subscribe(topic: str, kind: str, reliable: bool) -> None:
+        latched = topic.rsplit("/", 1)[-1] == TF_STATIC
+        quality = Quality(reliable or latched, latched, _DEPTH)
+        network.subscribe(topic, kind, quality, lambda payload: inbox.put(topic, time.time_ns(), payload))
+
+    offered = [point for point in network.endpoints() if point.publishes]
+    for topic, kind in kinds.items():
+        publishers = [point for point in offered if point.topic == topic]
+        subscribe(topic, kind, bool(publishers) and all(point.quality.reliable for point in publishers))
+    counts: Counter[str] = Counter()
+    kept = ""
+    try:
+        with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
+            recording = _Recording(Path(staging, output.stem), network.ros1)
+            try:
+                recording.open()
+                while not stop.is_set() or not inbox.is_empty:
+                    try:
+                        topic, received_ns, payload = inbox.get(_POLL_S)
+                    except queue.Empty:
+                        continue
+                    recording.write(topic, kinds[topic], received_ns, payload)
+                    counts[topic] += 1
+                    watch(counts)
+                recording.close()
+            except BaseException as error:
+                if recording.rescue(error):
+                    kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}"
+                    if not isinstance(error, OSError):
+                        notify(kept)
+                raise
+            recording.file.replace(output)
+    except OSError as error:
+        advice = "; ".join(filter(None, (kept, "free some space, or choose another path")))
+        raise OutputError(f"{output}: cannot be written ({error}); {advice}") from error
+    for topic in (*topics.scans, *filter(None, (topics.odometry,))):
+        if not counts[topic]:
+            notify(f"{topic}: no message arrived")
+    if inbox.lost:
+        notify(f"the disk is slower than the messages: {inbox.lost} were lost; record fewer topics, or on another disk")
+    return counts
+
+
+def _part_of(output: Path) -> Path:
+    """The first name that is free for a part of ``output``, as in ``day.part.mcap``."""
+    parts = (f"part-{number}" if number > 1 else "part" for number in count(1))
+    places = (output.with_name(f"{output.stem}.{part}{output.suffix}") for part in parts)
+    return next(place for place in places if not place.exists())
+
+
+class _Inbox:
+    """Messages that wait for the disk. Any thread may put."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        """Messages that came while too many bytes waited."""
+        self._messages: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no message waits."""
+        return self._messages.empty()
+
+    def put(self, topic: str, received_ns: int, payload: bytes) -> None:
+        """Add the next message, or lose it if too much waits."""
+        with self._lock:
+            if self._waiting_bytes + len(payload) > LARGEST_INBOX_BYTES:
+                self.lost += 1
+                return
+            self._waiting_bytes += len(payload)
+        self._messages.put((topic, received_ns, payload))
+
+    def get(self, timeout_s: float) -> tuple[str, int, bytes]:
+        """The next message.
+
+        Raises:
+            queue.Empty: none came within the time.
+        """
+        message = self._messages.get(timeout=timeout_s)
+        with self._lock:
+            self._waiting_bytes -= len(message[2])
+        return message
+
+
+class _Recording:
+    """A bag of raw messages: MCAP of ROS 2, or a bag of ROS 1."""
+
+    def __init__(self, place: Path, ros1: bool) -> None:
+        from rosbags import rosbag1, rosbag2
+
+        self._ros1, self._store = ros1, typestore(ros1)
+        self._connections: dict[str, Any] = {}
+        self._latest_ns = 0
+        self._writer: Any
+        if ros1:
+            self._writer = rosbag1.Writer(place)
+            self.file = place
+        else:
+            self._writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+            self.file = place / f"{place.name}.mcap"
+
+    def open(self) -> None:
+        """Make the file."""
+        self._writer.open()
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+    def rescue(self, error: BaseException) -> bool:
+        """End the file after an error, and return whether it holds messages.
+
+        After an error of the disk, the last megabyte is lost.
+        """
+        if not isinstance(error, OSError):
+            with suppress(Exception):
+                self.close()
+                return bool(self._connections)
+        with suppress(Exception):
+            self._writer.abort()
+        try:
+            return _end_bag(self._writer) if self._ros1 else end_mcap(self.file)
+        except OSError:
+            return self.file.exists()
+
+    def write(self, topic: str, kind: str, received_ns: int, payload: bytes) -> None:
+        """Write a message; the time of recording only ever grows."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, full_name(kind), typestore=self._store)
+        self._latest_ns = max(self._latest_ns, received_ns)
+        self._writer.write(self._connections[topic], self._latest_ns, payload)
+
+
+def _end_bag(writer: Any) -> bool:
+    """Cut a ROS 1 bag that was not closed after its last whole chunk and write its index; whether it has messages.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    size = writer.path.stat().st_size
+    whole = [(chunk, after.pos) for chunk, after in pairwise(writer.chunks) if -1 < after.pos <= size]
+    if not whole:
+        return False
+    os.truncate(writer.path, whole[-1][1])
+    writer.chunks = [chunk for chunk, _ in whole]
+    writer.bio = writer.path.open("r+b")
+    writer.bio.seek(0, os.SEEK_END)
+    writer.close()
+    return True

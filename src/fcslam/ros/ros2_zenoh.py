@@ -1,0 +1,275 @@
+"""A ROS 2 network over Zenoh, by eclipse-zenoh from PyPI, in the words of rmw_zenoh of Jazzy and later.
+
+A topic is the key ``<domain>/<topic>/<type>/<hash of the type>``. An endpoint shows itself by a liveliness token, which
+holds its topic and its quality of service. Each message has an attachment: its number, its time and its sender.
+"""
+
+import hashlib
+import itertools
+import os
+import struct
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from typing import Any, Final
+
+from fcslam.errors import NetworkError
+from fcslam.ros.dds_names import dds_type, kind_of
+from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
+from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec, full_name
+
+INSTALL: Final = "pip install 'fcslam[zenoh]'"
+ROUTER: Final = "tcp/localhost:7447"
+"""Where rmw_zenoh expects a router."""
+_SETTINGS: Final = {
+    "mode": '"peer"',
+    "connect/endpoints": f'["{ROUTER}"]',
+    "listen/endpoints": '["tcp/localhost:0"]',
+    "scouting/multicast/enabled": "false",
+    "timestamping/enabled": "true",
+}
+"""These are also the values of rmw_zenoh's own session configuration."""
+_TRIGGER_HASH: Final = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+_ADMIN, _NODE = "@ros2_lv", 0
+_KINDS: Final = {"MP": True, "MS": False}
+"""Whether an endpoint publishes, by its name in a token."""
+_RELIABLE, _BEST_EFFORT, _LATCHED, _VOLATILE = "1", "2", "1", "2"
+_HEARTBEAT_S = 0.5
+"""Period at which a publisher of latched messages says which was its last one."""
+_PARTS = 13
+_ENDPOINTS_KNOWN = 10_000
+"""Most endpoints that are remembered."""
+
+
+class ZenohNetwork:
+    """A session of Zenoh that takes part in one domain of ROS 2."""
+
+    ros1 = False
+
+    def __init__(self, domain: int, environment: Mapping[str, str] = os.environ) -> None:
+        """Join ``domain`` at a router; the environment configures the session as it does that of rmw_zenoh.
+
+        Raises:
+            NetworkError: eclipse-zenoh is not installed, its configuration cannot be used, or no router answers.
+        """
+        try:
+            import zenoh
+        except ImportError as error:
+            raise NetworkError(f"Zenoh needs eclipse-zenoh ({error}); install it: {INSTALL}") from error
+        zenoh.init_log_from_env_or("off")
+        config = session_config(environment)
+        try:
+            session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise NetworkError(f"no session of Zenoh can be opened ({_first_line(error)}); {_ADVICE}") from error
+        if not list(session.info.routers_zid()) and not list(session.info.peers_zid()):
+            session.close()
+            raise NetworkError(f"no Zenoh router answers at {config.get_json('connect/endpoints')}; {_ADVICE}")
+        self._zenoh, self._session, self._domain = zenoh, session, domain
+        self._own = str(session.zid())
+        self._codec = MessageCodec(ros1=False)
+        self._numbers = itertools.count(_NODE + 1)
+        self._lock = threading.Lock()
+        self._known: dict[str, Endpoint] = {}
+        """Endpoints by their tokens."""
+        self._declared: list[Any] = []
+        """Tokens, publishers and subscribers to undeclare at the end."""
+        self._declare(session.liveliness().declare_token(self._token(_NODE, "NN")))
+        everything = f"{_ADMIN}/{domain}/**"
+        self._declare(session.liveliness().declare_subscriber(everything, self._see, history=True))
+
+    def endpoints(self) -> Sequence[Endpoint]:
+        """As in RosNetwork."""
+        with self._lock:
+            return list(self._known.values())
+
+    def subscribe(self, topic: str, kind: str, quality: Quality, deliver: Deliver) -> None:
+        """As in RosNetwork; a type may have another hash than here, as in another release of ROS."""
+        from zenoh import ext
+
+        def take(sample: Any) -> None:
+            if sample.kind == self._zenoh.SampleKind.PUT:
+                deliver(sample.payload.to_bytes())
+
+        key = f"{self._domain}/{topic.strip('/')}/{dds_type(kind)}/*"
+        remote = self._zenoh.Locality.REMOTE
+        if quality.latched:
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=quality.depth)
+            self._declare(
+                ext.declare_advanced_subscriber(
+                    self._session, key, take, allowed_origin=remote, history=history,
+                    recovery=ext.RecoveryConfig(heartbeat=True), subscriber_detection=True,
+                )
+            )  # fmt: skip
+        else:
+            self._declare(self._session.declare_subscriber(key, take, allowed_origin=remote))
+        self._show("MS", topic, dds_type(kind), self._hash(kind), quality)
+
+    def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
+        """As in RosNetwork."""
+        from zenoh import ext
+
+        key = f"{self._domain}/{topic.strip('/')}/{dds_type(kind)}/{self._hash(kind)}"
+        options: dict[str, Any] = {
+            "congestion_control": self._zenoh.CongestionControl.DROP,
+            "reliability": self._zenoh.Reliability.RELIABLE if quality.reliable else None,
+        }
+        if quality.latched:
+            options |= {
+                "cache": ext.CacheConfig(quality.depth),
+                "publisher_detection": True,
+                "sample_miss_detection": ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+            }
+            publisher = ext.declare_advanced_publisher(self._session, key, **options)
+        else:
+            publisher = self._session.declare_publisher(key, **options)
+        self._declare(publisher)
+        sender = self._show("MP", topic, dds_type(kind), self._hash(kind), quality)
+        numbers = itertools.count(1)
+
+        def publish(payload: bytes) -> None:
+            try:
+                publisher.put(payload, attachment=attachment(next(numbers), time.time_ns(), sender))
+            except self._zenoh.ZError:  # the session is closed
+                return
+
+        return publish
+
+    def serve(self, service: str, act: Act) -> None:
+        """As in RosNetwork."""
+        kind = dds_type(TRIGGER, "srv")
+        key = f"{self._domain}/{service.strip('/')}/{kind}/{_TRIGGER_HASH}"
+
+        def take(query: Any) -> None:
+            number, sender = _identity(query.attachment)
+
+            def reply(done: Future[Answer]) -> None:
+                response = self._codec.make(TRIGGER_RESPONSE, **done.result()._asdict())
+                try:
+                    query.reply(
+                        key, self._codec.encode(response, TRIGGER_RESPONSE),
+                        attachment=attachment(number, time.time_ns(), sender),
+                    )  # fmt: skip
+                finally:
+                    query.drop()  # ends the wait of the caller
+
+            act().add_done_callback(reply)
+
+        self._declare(self._session.declare_queryable(key, take, complete=True))
+        self._show("SS", service, kind, _TRIGGER_HASH, Quality(reliable=True))
+
+    def close(self) -> None:
+        """As in RosNetwork."""
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._session.close()
+
+    def _declare(self, declared: Any) -> None:
+        self._declared.append(declared)
+
+    def _show(self, kind: str, topic: str, dds_kind: str, type_hash: str, quality: Quality) -> bytes:
+        """Declare an endpoint; returns its identity."""
+        words = (_mangled(topic), dds_kind, type_hash, quality_text(quality))
+        token = "/".join((self._token(next(self._numbers), kind), *words))
+        self._declare(self._session.liveliness().declare_token(token))
+        return hashlib.blake2b(token.encode(), digest_size=16).digest()
+
+    def _token(self, number: int, kind: str) -> str:
+        """The beginning of each token of this process: ids, and the node's enclave, namespace and name."""
+        return f"{_ADMIN}/{self._domain}/{self._own}/{_NODE}/{number}/{kind}/%/%/fcslam"
+
+    def _hash(self, kind: str) -> str:
+        return self._codec.store.hash_rihs01(full_name(kind))
+
+    def _see(self, sample: Any) -> None:
+        """Somebody's token appeared or went."""
+        token = str(sample.key_expr)
+        found = endpoint_of(token, self._own)
+        with self._lock:
+            if sample.kind == self._zenoh.SampleKind.DELETE:
+                self._known.pop(token, None)
+            elif found is not None and len(self._known) < _ENDPOINTS_KNOWN:
+                self._known[token] = found
+
+
+_ADVICE: Final = (
+    "start one (`ros2 run rmw_zenoh_cpp rmw_zenohd`), or name it: "
+    """ZENOH_CONFIG_OVERRIDE='connect/endpoints=["tcp/ADDRESS:7447"]'"""
+)
+
+
+def session_config(environment: Mapping[str, str]) -> Any:
+    """The configuration of a session: that of ZENOH_SESSION_CONFIG_URI or else rmw_zenoh's, changed by
+    ZENOH_CONFIG_OVERRIDE (``KEY=VALUE;KEY=VALUE``).
+
+    Raises:
+        NetworkError: one of the two cannot be used.
+    """
+    import zenoh
+
+    path = environment.get("ZENOH_SESSION_CONFIG_URI")
+    try:
+        config = zenoh.Config.from_file(path) if path else zenoh.Config()
+    except zenoh.ZError as error:
+        raise NetworkError(f"ZENOH_SESSION_CONFIG_URI: {path} cannot be used ({_first_line(error)})") from error
+    changes = [] if path else list(_SETTINGS.items())
+    for change in filter(None, environment.get("ZENOH_CONFIG_OVERRIDE", "").split(";")):
+        key, equals, value = change.partition("=")
+        if not equals:
+            raise NetworkError(f"ZENOH_CONFIG_OVERRIDE has {change!r}; write KEY=VALUE, separated by semicolons")
+        changes.append((key.strip(), value))
+    for key, value in changes:
+        try:
+            config.insert_json5(key, value)
+        except zenoh.ZError as error:
+            raise NetworkError(f"ZENOH_CONFIG_OVERRIDE: {key}={value} cannot be used ({_first_line(error)})") from error
+    return config
+
+
+def attachment(number: int, time_ns: int, sender: bytes) -> bytes:
+    """Return the attachment that rmw_zenoh adds to a message: its number, its time and the 16 bytes of its sender, with
+    their length.
+    """
+    return struct.pack("<qqB16s", number, time_ns, len(sender), sender)
+
+
+def quality_text(quality: Quality) -> str:
+    """A quality of service as in a token; what is left out is the default: reliable, volatile, keep last."""
+    reliability, durability = "" if quality.reliable else _BEST_EFFORT, _LATCHED if quality.latched else ""
+    return f"{reliability}:{durability}:,{quality.depth}:,:,:,,"
+
+
+def endpoint_of(token: str, own: str) -> Endpoint | None:
+    """The publisher or subscription of a token; None: it is of something else. ``own`` is the id of this session."""
+    parts = token.split("/")
+    if len(parts) < _PARTS or parts[5] not in _KINDS:
+        return None
+    kind = kind_of(_demangled(parts[10]))
+    reliability, _, rest = parts[12].partition(":")
+    durability = rest.partition(":")[0]
+    if kind is None:
+        return None
+    quality = Quality(reliability in ("", _RELIABLE), durability == _LATCHED)
+    return Endpoint(_demangled(parts[9]), kind, _KINDS[parts[5]], quality, parts[2] == own)
+
+
+def _identity(attached: Any) -> tuple[int, bytes]:
+    """The number of a request and its sender."""
+    data = b"" if attached is None else attached.to_bytes()
+    if len(data) != struct.calcsize("<qqB16s"):
+        return 0, bytes(16)
+    number, _, _, sender = struct.unpack("<qqB16s", data)
+    return number, sender
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def _demangled(name: str) -> str:
+    return name.replace("%", "/")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition(" at /")[0].strip()

@@ -1,0 +1,159 @@
+"""Which topics of a ROS network a robot reads: those that the user names, or else those of the right types in its
+namespace."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from fcslam.errors import NetworkError
+from fcslam.ros.network import Endpoint, named_topics, published
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    OLD_TRANSFORMS,
+    POINT_CLOUD,
+    SCAN,
+    SCANS,
+    TRANSFORMS,
+)
+from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
+from fcslam.sources.bags.robots import is_truth
+from fcslam.sources.bags.topics import is_depth
+
+TF, TF_STATIC = "tf", "tf_static"
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTopics:
+    """The topics of one robot's sensors, by their full names."""
+
+    kinds: Mapping[str, str]
+    """Type of every topic below."""
+    scans: tuple[str, ...]
+    """One for each laser, 3D LiDAR or depth camera."""
+    odometry: str | None
+    """None: odometry comes from tf."""
+    transforms: tuple[str, ...]
+    """All topics of tf."""
+    camera: str | None = None
+    camera_info: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+def resolved(namespace: str, name: str) -> str:
+    """The full name of a topic: one with a leading slash is full, another is in the namespace ("" or "/robot1")."""
+    return name if name.startswith("/") else f"{namespace}/{name}"
+
+
+def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options: BagOptions) -> SensorTopics:
+    """Choose the topics to read in ``namespace``, by these rules:
+
+    - laser: laser scans before point clouds and these before depth images, one echo a beam, the name ``scan``, first by
+      name;
+    - odometry: the name ``odom``, first by name, else tf; ground truth only if the user names it;
+    - camera: calibrated, compressed images, first by name;
+    - tf: the namespace's own if there is one, else that of all robots.
+
+    Raises:
+        NetworkError: a required topic is missing, or a named topic is missing or of another type; the message lists the
+            topics that are there.
+    """
+    known = published(endpoints)
+    inside = [topic for topic in known if topic.startswith(f"{namespace}/")]
+    chosen = _Choice(endpoints, known, namespace)
+    notes: list[str] = []
+    scans = [chosen.named(name, "--scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
+    if not scans:
+        depths = [
+            topic for topic in inside if known[topic] == IMAGE and is_depth(topic) and info_beside(topic) in known
+        ]
+        candidates = [*(topic for topic in inside if known[topic] in SCANS), *depths]
+        if not candidates:
+            raise NetworkError(
+                f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images in {namespace or '/'}; start "
+                f"the driver; {chosen.known()}"
+            )
+        rank = [*SCANS, IMAGE].index
+        scans = [min(candidates, key=lambda topic: (rank(known[topic]), _basename(topic) != "scan", topic))]
+        notes += _note("laser scans", "--scan-topic", scans[0], candidates)
+    odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
+    if options.odom_topic == NO_ODOMETRY:
+        notes.append("reads no odometry, as --odom-topic none says")
+    elif odometry is None:
+        candidates = [topic for topic in inside if known[topic] == ODOMETRY and not is_truth(topic)]
+        odometry = min(candidates, key=lambda topic: (_basename(topic) != "odom", topic), default=None)
+        notes += _note("odometry", "--odom-topic", odometry, candidates)
+    else:
+        chosen.named(odometry, "--odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+    transforms = _transforms(known, namespace)
+    if odometry is not None and known[odometry] != ODOMETRY:
+        transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
+    camera, info = _camera(chosen, known, inside, options.camera_topic)
+    depth_infos = [info_beside(topic) for topic in scans if known[topic] == IMAGE]
+    read = (*scans, *depth_infos, *transforms, *filter(None, (odometry, camera, info)))
+    kinds = {topic: known.get(topic, TRANSFORMS) for topic in read}
+    return SensorTopics(kinds, tuple(scans), odometry, transforms, camera, info, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Topics that the user names."""
+
+    endpoints: Sequence[Endpoint]
+    topics: Mapping[str, str]
+    namespace: str
+
+    def named(self, name: str, option: str, *kinds: str) -> str:
+        """The full name of a topic that must have one of these types."""
+        topic = resolved(self.namespace, name)
+        if self.topics.get(topic) not in kinds:
+            what = f"has the type {self.topics[topic]}" if topic in self.topics else "is not there"
+            raise NetworkError(f"topic {topic} {what}; {option} needs {' or '.join(kinds[:2])}; {self.known()}")
+        return topic
+
+    def known(self) -> str:
+        return named_topics(self.endpoints)
+
+
+def _transforms(known: Mapping[str, str], namespace: str) -> tuple[str, ...]:
+    """Topics of tf; they may appear later."""
+    found = []
+    for name in (TF, TF_STATIC):
+        own = f"{namespace}/{name}"
+        found.append(own if own in known else f"/{name}")
+    return tuple(found)
+
+
+def _camera(
+    chosen: _Choice, known: Mapping[str, str], inside: Sequence[str], wanted: str | None
+) -> tuple[str | None, str | None]:
+    """Topics of images and of their calibration; without a calibration there is no camera."""
+    images = [topic for topic in inside if known[topic] in (COMPRESSED_IMAGE, IMAGE)]
+    if wanted is not None:
+        images = [chosen.named(wanted, "--camera-topic", COMPRESSED_IMAGE, IMAGE)]
+    infos = {topic: info_beside(topic) for topic in images if not is_depth(topic)}
+    calibrated = {topic: info for topic, info in infos.items() if known.get(info) == CAMERA_INFO}
+    camera = min(calibrated, key=lambda topic: (known[topic] != COMPRESSED_IMAGE, topic), default=None)
+    if wanted is not None and camera is None:
+        raise NetworkError(f"topic {images[0]} has no calibration: {info_beside(images[0])} is not there; publish it")
+    return camera, None if camera is None else calibrated[camera]
+
+
+def _is_depth(topic: str, known: Mapping[str, str]) -> bool:
+    """Whether a topic has depth images with their calibration."""
+    return known[topic] == IMAGE and is_depth(topic) and known.get(info_beside(topic)) == CAMERA_INFO
+
+
+def info_beside(camera: str) -> str:
+    """The topic of the calibration of a camera."""
+    return camera.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+
+
+def _note(what: str, option: str, chosen: str | None, candidates: Sequence[str]) -> list[str]:
+    others = ", ".join(topic for topic in candidates if topic != chosen)
+    return [f"reads {what} from {chosen}, not from {others} ({option} chooses)"] if others else []
+
+
+def _basename(topic: str) -> str:
+    return topic.rsplit("/", 1)[-1]

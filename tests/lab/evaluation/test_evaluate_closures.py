@@ -1,0 +1,264 @@
+"""Closures of run folders made here, against relations drawn from the truth."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcslam.cli import main
+from fcslam.errors import EvaluationError
+from fcslam.geometry import se2
+from fcslam.lab.evaluation.fleet.closures import ClosureScope, closure_metrics, closure_rows, evaluate_closures
+from fcslam.lab.evaluation.fleet.relation_graph import build_relation_graph
+from fcslam.lab.evaluation.fleet.relations import pose_table, write_metrics
+from fcslam.metrics.closures import ClosureCriteria
+from fcslam.metrics.relations import Relations, write_relations
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
+from fcslam.runs import ClosureRow, RobotTrajectory, Run
+
+CRITERIA = ClosureCriteria()
+ROUND = 50
+"""Steps of one round; both robots go round twice, one behind the other."""
+
+FRAMES = ((3.0, -1.0, 0.4), (20.0, 7.0, -2.0))
+CANDIDATE, VERIFIED, ACCEPTED, REJECTED, REVOKED = ClosureStatus
+
+
+def truth(step):
+    """Pose on a circle of 10 m radius."""
+    angle = 2.0 * np.pi * np.asarray(step) / ROUND
+    return np.stack((10.0 * np.cos(angle), 10.0 * np.sin(angle), se2.wrap_angle(angle + np.pi / 2.0)), axis=-1)
+
+
+def stamp(robot, step):
+    """A scan each 0.4 s of a robot's clock, 1000 s between the robots."""
+    return 1000.123457 * (robot + 1) + 0.4 * np.asarray(step)
+
+
+def closure(i, j, status, off=(0.0, 0.0, 0.0)):
+    """Between (robot, step) i and j."""
+    T_i_j = se2.compose(se2.between(truth(i[1]), truth(j[1])), off)
+    ends = (f"r{i[0]}", float(stamp(*i)), f"r{j[0]}", float(stamp(*j)))
+    return ClosureRow(*ends, Channel.LIDAR, 0.5, frozen(T_i_j), status, Reason(ReasonCode.VERIFIED))
+
+
+def write(folder, closures):
+    steps = np.arange(2 * ROUND)
+    robots = {
+        f"r{k}": RobotTrajectory(f"r{k}", k, stamp(k, steps), se2.compose(FRAMES[k], truth(steps))) for k in (0, 1)
+    }
+    Run(robots, tuple(closures)).save(folder, force=True)
+    return folder
+
+
+def relations_between(ends):
+    first, second = (np.array([end[k] for end in ends]) for k in (0, 1))
+    stamps = np.column_stack((stamp(*first.T), stamp(*second.T)))
+    return Relations(stamps, se2.between(truth(first[:, 1]), truth(second[:, 1])))
+
+
+def chain(robot, first=0, last=2 * ROUND, every=5):
+    steps = range(first, last - every, every)
+    return [((robot, step), (robot, step + every)) for step in steps]
+
+
+RELATIONS = [*chain(0), *chain(1), ((0, 10), (1, 10)), ((0, 30), (1, 80)), ((1, 5), (1, 55)), ((1, 45), (1, 95))]
+
+
+@pytest.fixture
+def relations(tmp_path):
+    write_relations(tmp_path / "relations", relations_between(RELATIONS))
+    return tmp_path / "relations"
+
+
+def test_stages_are_counted_by_hand(tmp_path, relations):
+    between = [
+        closure((0, 11), (1, 12), ACCEPTED),
+        closure((1, 31), (0, 32), ACCEPTED),
+        closure((0, 29), (1, 79), REVOKED, (0.0, 0.6, 0.0)),
+        closure((0, 20), (1, 20), REJECTED),
+        closure((0, 21), (1, 20), CANDIDATE, (0.0, 0.0, 3.0)),
+        closure((0, 41), (1, 90), CANDIDATE),
+    ]
+    within = [closure((1, 6), (1, 54), ACCEPTED), closure((1, 7), (1, 58), REVOKED)]
+    report = evaluate_closures(write(tmp_path / "run", [*between, *within]), relations, CRITERIA)
+    counts = {
+        (kind.value, status.value): (score.graph.closures, score.graph.covered, score.graph.wrong, score.single.covered)
+        for (kind, status), score in report.scores.items()
+    }
+    assert counts == {
+        ("inter_robot", "candidate"): (6, 6, 2, 2),
+        ("inter_robot", "verified"): (4, 4, 1, 2),
+        ("inter_robot", "accepted"): (2, 2, 0, 1),
+        ("inter_robot", "rejected"): (1, 1, 0, 0),
+        ("inter_robot", "revoked"): (1, 1, 1, 1),
+        ("intra_robot", "candidate"): (2, 2, 0, 1),
+        ("intra_robot", "verified"): (2, 2, 0, 1),
+        ("intra_robot", "accepted"): (1, 1, 0, 1),
+        ("intra_robot", "rejected"): (0, 0, 0, 0),
+        ("intra_robot", "revoked"): (1, 1, 0, 0),
+    }
+
+
+def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations):
+    def recall(*closures):
+        report = evaluate_closures(write(tmp_path / "run", closures), relations, CRITERIA)
+        stages = ((ClosureScope.FLEET, CANDIDATE), (ClosureScope.FLEET, VERIFIED), (ClosureScope.FLEET, ACCEPTED))
+        return [report.scores[stage].recall for stage in stages], report
+
+    found, _ = recall()
+    assert [(r.revisits, r.found) for r in found] == [(2, 0)] * 3
+    found, _ = recall(closure((1, 11), (0, 11), ACCEPTED), closure((0, 30), (1, 80), CANDIDATE))
+    assert [(r.revisits, r.found) for r in found] == [(2, 2), (2, 1), (2, 1)]
+    found, _ = recall(closure((1, 11), (0, 11), ACCEPTED, (0.6, 0.0, 0.0)))
+    assert [r.found for r in found] == [0, 0, 0]
+    found, report = recall(closure((1, 12), (0, 11), ACCEPTED))  # two steps are 2.5 m of path
+    assert [r.found for r in found] == [0, 0, 0]
+    # within a robot 60 s are asked for, and 50 steps last 20 s
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 0
+    shorter = ClosureCriteria(within_gap_s=15.0)
+    longer = evaluate_closures(write(tmp_path / "run", [closure((1, 6), (1, 56), ACCEPTED)]), relations, shorter)
+    assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 2
+    assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.found == 1
+    assert longer.scores[ClosureScope.ROBOT, REVOKED].recall is None
+
+
+def test_what_no_relations_join_is_not_covered(tmp_path):
+    ends = [*chain(0), *chain(1, 0, 40), *chain(1, 50), ((0, 10), (1, 10))]
+    write_relations(tmp_path / "relations", relations_between(ends))
+    closures = [closure((0, 70), (1, 20), ACCEPTED), closure((0, 20), (1, 70), ACCEPTED, (5.0, 0.0, 0.0))]
+    closures += [closure((0, 45), (1, 45), ACCEPTED), closure((1, 57), (1, 68), ACCEPTED)]
+    report = evaluate_closures(write(tmp_path / "run", closures), tmp_path / "relations", CRITERIA)
+    score = report.scores[ClosureScope.FLEET, ACCEPTED]
+    assert (score.graph.closures, score.graph.covered, score.graph.wrong) == (3, 1, 0)
+    assert score.graph.coverage == pytest.approx(1.0 / 3.0)
+    assert score.chain == (12 + 1 + 2, 12 + 1 + 2)
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].chain == (3, 3)
+    assert report.relations.component_sizes.tolist() == [20 + 8, 10]
+
+
+def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
+    run = write(tmp_path / "run", [closure((0, 11), (1, 11), ACCEPTED), closure((0, 61), (1, 61), ACCEPTED)])
+    true = relations_between([*RELATIONS, ((0, 80), (1, 80)), ((0, 60), (1, 60))])
+    T_1_2 = np.array(true.T_1_2)
+    T_1_2[-1] += (3.0, 0.0, 0.0)
+    write_relations(tmp_path / "bad", Relations(true.stamps, T_1_2))
+    report = evaluate_closures(run, tmp_path / "bad", CRITERIA)
+    graph = report.relations
+    assert np.flatnonzero(~graph.holds).tolist() == [len(true) - 1]
+    assert graph.residual_m[-1] == pytest.approx(3.0, abs=1e-3)
+    assert graph.residual_m[:-1].max() < 1e-5
+    score = report.scores[ClosureScope.FLEET, ACCEPTED]
+    assert (score.graph.covered, score.graph.wrong, score.single.covered, score.recall.revisits) == (2, 0, 1, 3)
+    assert score.graph.translation_m[1] < 1e-5
+    assert score.chain == (5, 9)  # of 1 and 9: not over the false one
+    values = {metric.name: metric.value for metric in closure_metrics(report)}
+    assert values["relations_contradicted"] == 1
+    assert values["inter_robot_accepted_covered"] == 2
+    assert evaluate_closures(run, relations, CRITERIA).relations.holds.all()
+
+
+def test_where_nothing_tells_which_relation_is_false_none_counts(tmp_path):
+    true = relations_between([*chain(0), *chain(1), ((0, 10), (1, 10)), ((0, 10), (1, 10))])
+    T_1_2 = np.array(true.T_1_2)
+    T_1_2[-1] += (3.0, 0.0, 0.0)
+    write_relations(tmp_path / "relations", Relations(true.stamps, T_1_2))
+    run = write(tmp_path / "run", [closure((0, 11), (1, 11), ACCEPTED)])
+    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    assert np.flatnonzero(~report.relations.holds).tolist() == [len(true) - 2, len(true) - 1]
+    assert report.relations.component_sizes.tolist() == [20, 20]
+    assert np.isnan(report.relations.residual_m[-2:]).all()
+    score = report.scores[ClosureScope.FLEET, ACCEPTED]
+    assert (score.graph.covered, score.single.covered, score.recall.revisits) == (0, 0, 0)
+
+
+def test_stamps_with_five_digits_are_found(tmp_path):
+    true = relations_between(RELATIONS)
+    lines = [
+        f"{a:.5f} {b:.5f} {x} {y} 0 0 0 {theta}" for (a, b), (x, y, theta) in zip(true.stamps, true.T_1_2, strict=True)
+    ]
+    (tmp_path / "relations").write_text("\n".join(lines))
+    run = write(tmp_path / "run", [closure((0, 70), (1, 20), ACCEPTED)])
+    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    assert report.stamps_in_run == len(report.relations.stamps)
+    assert report.scores[ClosureScope.FLEET, ACCEPTED].graph.covered == 1
+
+
+def test_a_stamp_that_the_run_lacks_still_joins_the_others(tmp_path):
+    true = relations_between([((0, 10), (1, 10)), ((1, 10), (0, 60))])
+    stamps = np.where(true.stamps == stamp(1, 10), 5.0, true.stamps)
+    write_relations(tmp_path / "relations", Relations(stamps, true.T_1_2))
+    run = write(tmp_path / "run", [closure((0, 11), (0, 61), ACCEPTED)])
+    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    assert report.stamps_in_run == 2
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].graph.covered == 1
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].chain == (2, 2)
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].single.covered == 0
+
+
+def test_robots_of_one_clock_are_told_apart_by_name():
+    stamps = np.arange(5.0)
+    poses = np.zeros((5, 3))
+    both = {robot: RobotTrajectory(robot, 0, stamps, poses) for robot in "ab"}
+    rows = [ClosureRow("a", 1.0, "b", 1.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, Reason(ReasonCode.VERIFIED))]
+    rows += [
+        ClosureRow("nobody", 1.0, "b", 9.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, Reason(ReasonCode.VERIFIED))
+    ]
+    run = Run(both, tuple(rows))
+    table = pose_table(run)
+    found = closure_rows(run, table)
+    assert table.robots[found[0]].tolist() == [0, 1]
+    assert table.stamps[found[0]].tolist() == [1.0, 1.0]
+    assert found[1].tolist() == [-1, -1]
+
+
+def test_a_run_without_closures_and_a_foreign_recording(tmp_path, relations):
+    report = evaluate_closures(write(tmp_path / "run", []), relations, CRITERIA)
+    assert all(score.graph.closures == 0 for score in report.scores.values())
+    (tmp_path / "foreign").write_text("1 2 0 0 0 0 0 0\n")
+    with pytest.raises(EvaluationError, match="same recording"):
+        evaluate_closures(tmp_path / "run", tmp_path / "foreign", CRITERIA)
+    (tmp_path / "empty_handed").write_text(f"{stamp(0, 1)} {stamp(0, 1)} 0 0 0 0 0 0\n")
+    with pytest.raises(EvaluationError, match="same recording"):
+        evaluate_closures(tmp_path / "run", tmp_path / "empty_handed", CRITERIA)
+
+
+def test_metrics_are_unique_names_and_json_without_nan(tmp_path, relations):
+    metrics = closure_metrics(evaluate_closures(write(tmp_path / "run", []), relations, CRITERIA))
+    assert len({metric.name for metric in metrics}) == len(metrics)
+    write_metrics(metrics, tmp_path / "table.json")
+    values = {row["name"]: row["value"] for row in json.loads((tmp_path / "table.json").read_text())}
+    assert values["inter_robot_accepted_precision"] is None
+    assert values["inter_robot_accepted_revisits"] == 2
+
+
+def test_the_optimised_graph_averages_what_scatters():
+    """Many noisy relations between two rounds: the optimum is nearer to the truth than one of them is."""
+    rng = np.random.default_rng(9)
+    ends = [((0, int(a)), (0, int(b))) for a, b in rng.integers(0, 2 * ROUND, (3000, 2)) if a != b]
+    true = relations_between(ends)
+    noisy = Relations(true.stamps, se2.compose(true.T_1_2, se2.exp(rng.normal(0, (0.03, 0.03, 0.01), (len(true), 3)))))
+    graph = build_relation_graph(noisy)
+    assert graph.holds.mean() > 0.98
+    steps = np.round((graph.stamps - stamp(0, 0)) / 0.4)
+    motion = se2.between(graph.T_component_base[0], graph.T_component_base[1:])
+    error = se2.between(se2.between(truth(steps[0]), truth(steps[1:])), motion)
+    assert np.hypot(error[:, 0], error[:, 1]).mean() < 0.02
+    assert np.median(graph.residual_m) == pytest.approx(0.03 * np.sqrt(2 * np.log(2)), rel=0.1)
+
+
+@pytest.mark.system
+@pytest.mark.skipif("FCSLAM_DATA" not in os.environ, reason="FCSLAM_DATA is not set")
+def test_no_accepted_closure_of_a_real_fleet_is_wrong(tmp_path):
+    logs = Path(os.environ["FCSLAM_DATA"]) / "lidar" / "slam-benchmark"
+    assert main(["map", str(logs / "fr079.clf.xz"), "--split", "3", "--output", str(tmp_path / "run")]) == 0
+    report = evaluate_closures(tmp_path / "run", logs / "fr079.relations.gz", CRITERIA)
+    assert report.relations.holds.all()
+    for within in ClosureScope:
+        score = report.scores[within, ACCEPTED]
+        assert score.graph.wrong == score.single.wrong == 0
+        assert score.graph.covered >= 0.8 * score.graph.closures
+        assert score.single.covered >= 20
+    assert report.scores[ClosureScope.FLEET, CANDIDATE].graph.wrong > 0  # so the reference can tell

@@ -1,0 +1,172 @@
+"""The scorers against plain comparison, pair by pair, and the command on drawn places."""
+
+import csv
+
+import numpy as np
+import pytest
+from tests.evaluation import place_folders
+
+from fcslam.cli import main
+from fcslam.features.codes import hamming_matrix
+from fcslam.lab.evaluation.places.features import choose_features, describe_images, describe_sets
+from fcslam.lab.evaluation.places.scoring import (
+    PretrainedVocabulary,
+    brute_force,
+    index_scores,
+    matching_descriptors,
+    strategy_scorer,
+)
+from fcslam.lab.evaluation.places.sequences import in_sequence
+from fcslam.lab.evaluation.places.sets import read_place_set
+from fcslam.lab.evaluation.places.verification import ACCEPTED_INLIERS, PairVerifier
+from fcslam.metrics.retrieval import recall_at
+from fcslam.places.index import PlaceIndex
+from fcslam.places.similarity import similarity
+from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
+
+WORDS = VocabularyConfig(scoring=Scoring.WORDS, train_batch=3)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sets")
+    return place_folders.generic(folder / "generic"), place_folders.tour(folder / "tour")
+
+
+@pytest.fixture(scope="module")
+def described(folders):
+    return describe_sets(folders, (), choose_features("orb"))
+
+
+def test_brute_force_counts_mutual_neighbours(described):
+    split, _ = described
+    scores = brute_force(split)
+    for q, g in ((0, 0), (0, 1), (3, 3), (4, 5)):
+        distances = hamming_matrix(split.queries[q].descriptors, split.gallery[g].descriptors)
+        mutual = [
+            (i, j)
+            for i, j in enumerate(distances.argmin(axis=1))
+            if distances[:, j].argmin() == i and distances[i, j] <= 48
+        ]
+        assert scores[q, g] == len(mutual)
+    assert (scores.argmax(axis=1) == np.arange(5)).all()
+
+
+def test_the_foreign_tree_scores_as_the_bags_of_two_places(described):
+    split, tour = described
+    tree = PretrainedVocabulary([place.descriptors for place in tour.gallery], 1)
+    assert tree.word_count > 100
+    scores = tree(split)
+    for (q, g), score in np.ndenumerate(scores):
+        bags = tree.bag(split.queries[q].descriptors), tree.bag(split.gallery[g].descriptors)
+        assert score == pytest.approx(similarity(*bags))
+
+
+def test_a_stream_is_asked_before_each_place_is_added(described):
+    _, tour = described
+    scores = strategy_scorer(WORDS.model_copy(update={"strategy": Strategy.STATIC}), 1)(tour)
+    assert (scores[~tour.place_set.admitted] == 0.0).all()
+    index = PlaceIndex(WORDS.model_copy(update={"strategy": Strategy.STATIC}), np.random.default_rng(1))
+    for g in range(31):
+        index.add(g, tour.gallery[g].descriptors)
+    answers = {found.id: found.similarity for found in index.query(tour.queries[31].descriptors, 100)}
+    np.testing.assert_allclose(scores[31, :12], [answers.get(g, 0.0) for g in range(12)])
+
+
+def test_an_index_that_was_trained_elsewhere_finds_places(described):
+    split, tour = described
+    index = PlaceIndex(VocabularyConfig(strategy=Strategy.STATIC), np.random.default_rng(1))
+    index.train([place.descriptors for place in tour.gallery])
+    (truth,) = split.place_set.questions.values()
+    assert recall_at(index_scores(index, split), truth, 1).tolist() == [1.0] * 5
+
+
+def test_geometry_accepts_what_it_should(described):
+    split, _ = described
+    checker = PairVerifier(split)
+    verified = checker.verified(brute_force(split))
+    same = np.eye(5, 6, dtype=bool)
+    assert (verified[same] >= 0.5).all()
+    assert (verified[~same] < 0.5).all()
+    inliers = checker.inliers(2, 2)
+    assert verified[2, 2] == inliers / (inliers + ACCEPTED_INLIERS)
+    assert (checker.verified(np.zeros((5, 6))) == 0.0).all()
+
+
+def test_extracted_features_are_those_of_the_detector(folders, tmp_path):
+    name = folders[0].name
+    options = ["--detector", "orb", "--keypoints", "500"]
+    assert main(["extract", str(folders[0]), "-o", str(tmp_path / name), *options]) == 0
+    found = describe_images(read_place_set(folders[0]), folders[0], choose_features(str(tmp_path)))
+    assert all(len(place.descriptors) for place in (*found.queries, *found.gallery))
+    (truth,) = found.place_set.questions.values()
+    assert recall_at(brute_force(found), truth, 1).tolist() == [1.0] * 5
+
+
+@pytest.mark.slow
+def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    arguments = [*map(str, folders), "--train-on", str(folders[1]), "--strategy", "incremental", "--verify"]
+    assert main(["evaluate", "places", *arguments, "-o", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "generic, matches: 5 queries" in shown
+    assert "tour, loops: 20 queries" in shown
+    with (tmp_path / "places.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["scorer"] for row in rows} == {"brute force", "foreign tree", "incremental"}
+    recalls = {row["scorer"]: row["value"] for row in rows if (row["set"], row["measure"]) == ("tour", "recall_at_1")}
+    assert recalls["brute force"] == "1"
+    matrices = [np.load(tmp_path / "generic" / "incremental" / f"{name}.npy") for name in ("similarity", "verified")]
+    assert [matrix.shape for matrix in matrices] == [(5, 6), (5, 6)]
+    assert (tmp_path / "generic" / "queries.txt").read_text(encoding="utf-8").count("\n") == 5
+    curve = np.loadtxt(tmp_path / "generic" / "brute_force" / "curve_matches.csv", delimiter=",", skiprows=1, ndmin=2)
+    assert curve[-1].tolist() == [curve[:, 0].min(), 1.0, 1.0]
+    assert (tmp_path / "precision_recall.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_order_of_a_stream_is_used_where_there_is_one(folders, tmp_path):
+    arguments = [*map(str, folders), "--strategy", "incremental", "--sequence", "-o", str(tmp_path)]
+    assert main(["evaluate", "places", *arguments]) == 0
+    with (tmp_path / "places.csv").open(encoding="utf-8", newline="") as file:
+        rows = {(row["set"], row["scorer"]) for row in csv.DictReader(file)}
+    both = ["brute force", "incremental"]
+    assert {scorer for name, scorer in rows if name == "generic"} == set(both)
+    kinds = ["", " NSS", " 3 in a row", " along 3", " NSS along 3"]
+    assert {scorer for name, scorer in rows if name == "tour"} == {scorer + kind for scorer in both for kind in kinds}
+
+
+def test_what_a_streams_order_adds_is_measured_on_the_same_pairs(described):
+    split, tour = described
+    assert list(in_sequence(split, brute_force)) == [""]
+    found = in_sequence(tour, brute_force)
+    np.testing.assert_array_equal(found[""], brute_force(tour))
+    assert all((similarity[~tour.place_set.admitted] == 0.0).all() for similarity in found.values())
+    for q, g in np.argwhere(found["NSS"]):
+        own = matching_descriptors(tour.queries[q].descriptors, tour.gallery[q - 1].descriptors)
+        assert found["NSS"][q, g] == pytest.approx(found[""][q, g] / own)
+    kept = {(int(q), int(g)) for q, g in np.argwhere(found["3 in a row"])}
+    assert {(q, q - 30) for q in range(32, 50)} <= kept  # the tour's second round from its third place on
+    assert (30, 0) not in kept
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{nowhere}"], "no set of places"),
+        (["{generic}", "{generic}"], "another set generic"),
+        (["{generic}", "--features", "surf"], "no such features"),
+        (["{generic}", "--features", "{nowhere}"], "cannot read the features"),
+        (["{generic}", "--strategy", "magic"], "not one of static"),
+        (["{generic}", "--label", "floor1"], "no labels"),
+        (["{generic}", "--train-on", "{nowhere}"], "no file there"),
+        (["{generic}/matches.csv"], "matches.csv"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(folders, tmp_path, capsys, arguments, message):
+    (tmp_path / "nowhere").mkdir()
+    words = [word.format(generic=folders[0], nowhere=tmp_path / "nowhere") for word in arguments]
+    assert main(["evaluate", "places", *words, "-o", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert message in " ".join(said.split())
+    assert "Traceback" not in said

@@ -1,0 +1,41 @@
+"""LiDAR places of a recording, and what agrees in the plane."""
+
+import numpy as np
+import pytest
+
+from fcslam.errors import EvaluationError
+from fcslam.geometry import se2
+from fcslam.lab.evaluation.places.lidar_places import describe_recording, planar_inliers
+from fcslam.lab.evaluation.places.scoring import PlaceFeatures
+
+
+@pytest.mark.slow
+def test_places_of_a_recording_are_asked_for_long_after(logs):
+    found = describe_recording(logs[0])
+    (truth,) = found.place_set.questions.values()
+    count = len(found.queries)
+    assert count > 5
+    assert found.place_set.is_online
+    assert all(len(place.positions) == len(place.descriptors) for place in found.gallery)
+    assert not np.triu(found.place_set.admitted).any()
+    assert not ((truth.matches | truth.different) & ~found.place_set.admitted).any()
+    lags = [np.flatnonzero(row).max() - q for q, row in enumerate(found.place_set.admitted) if row.any()]
+    assert all(lag < -3 for lag in lags)  # a minute is several places
+
+
+def test_what_agrees_is_what_a_rigid_motion_moves():
+    rng = np.random.default_rng(2)
+    positions = rng.uniform(-10, 10, (60, 2))
+    codes = rng.integers(0, 256, (60, 32), dtype=np.uint8)
+    here = PlaceFeatures(positions.astype(np.float32), codes)
+    moved = PlaceFeatures(se2.transform((3.0, -2.0, 2.5), positions[:40]).astype(np.float32), codes[:40])
+    scattered = PlaceFeatures(rng.uniform(-10, 10, (60, 2)).astype(np.float32), codes)
+    assert planar_inliers(here, moved) == 40
+    assert planar_inliers(here, scattered) < 8
+
+
+def test_a_recording_of_a_single_place_is_told(tmp_path, logs):
+    short = tmp_path / "short.clf"
+    short.write_text("".join(logs[0].read_text(encoding="utf-8").splitlines(keepends=True)[:3]), encoding="utf-8")
+    with pytest.raises(EvaluationError, match="1 place in it"):
+        describe_recording(short)

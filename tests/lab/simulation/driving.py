@@ -1,0 +1,22 @@
+"""Routes for tests, and an oracle of how close they come to what stands around."""
+
+import numpy as np
+
+from fcslam.lab.simulation.options import Building
+from fcslam.lab.simulation.route import draw_goals, plan_route
+
+INDOORS = [building for building in Building if not building.is_outdoors]
+
+
+def route(plan, length_m, rng):
+    """Waypoints of one robot."""
+    return plan_route(plan, draw_goals(plan, 1, length_m, rng)[0], length_m, rng)
+
+
+def distances(points, segments):
+    """Distance of every point from its nearest segment, shape (N,)."""
+    a, b = segments[:, :2], segments[:, 2:]
+    along = b - a
+    share = np.einsum("nsk,sk->ns", points[:, None] - a, along) / np.sum(along**2, axis=1)
+    nearest = a + np.clip(share, 0.0, 1.0)[..., None] * along
+    return np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1)

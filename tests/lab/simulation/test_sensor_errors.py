@@ -1,0 +1,150 @@
+"""Errors of sensors: odometry drifts and ranges are noisy as the settings say."""
+
+import numpy as np
+import pytest
+from tests.simulation.driving import route
+
+from fcslam import config
+from fcslam.errors import ConfigError
+from fcslam.geometry import se2
+from fcslam.lab.simulation.floorplan import draw_floor_plan
+from fcslam.lab.simulation.noise import LidarSettings, simulate_ranges
+from fcslam.lab.simulation.odometry import (
+    KINDS,
+    OdometryFaults,
+    OdometryNoiseSettings,
+    read_odometry,
+    simulate_odometry,
+)
+from fcslam.lab.simulation.options import OdometryKind
+from fcslam.lab.simulation.route import drive
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings
+from fcslam.records import LaserModel
+
+NO_DRIFT = OdometryNoiseSettings(
+    travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0
+)
+STRAIGHT = np.column_stack((np.linspace(0.0, 20.0, 401), np.zeros((401, 2))))
+
+
+def true_drive(seed):
+    rng = np.random.default_rng(seed)
+    return drive(route(draw_floor_plan(rng), 60.0, rng), 0.2)[1]
+
+
+def test_noise_and_dropouts_are_as_large_as_said():
+    laser = LaserModel(400, -np.pi, 2.0 * np.pi / 400, 12.0)
+    true = np.random.default_rng(1).uniform(0.5, 14.0, (300, 400)).clip(max=12.0)
+    settings = LidarSettings(range_noise_m=0.02, dropout=0.1)
+    ranges = simulate_ranges(true, laser, settings, np.random.default_rng(0))
+    hit, returned = true < laser.max_range_m, ranges < laser.max_range_m
+    assert not np.any(returned & ~hit)
+    assert np.mean(~returned[hit]) == pytest.approx(0.1, abs=0.01)
+    assert np.std((ranges - true)[returned]) == pytest.approx(0.02, rel=0.05)
+    exact = LidarSettings(range_noise_m=0.0, dropout=0.0)
+    np.testing.assert_array_equal(simulate_ranges(true, laser, exact, np.random.default_rng(0)), true)
+
+
+def test_wheels_without_faults_tell_the_truth():
+    truth = true_drive(0)
+    odometry = simulate_odometry(truth, NO_DRIFT, np.random.default_rng(0))
+    np.testing.assert_allclose(odometry[0], 0.0)
+    np.testing.assert_allclose(se2.between(se2.compose(truth[0], odometry), truth), 0.0, atol=1e-9)
+
+
+def test_heading_noise_grows_with_the_square_root_of_the_way():
+    settings = NO_DRIFT.model_copy(update={"heading_noise_rad": 0.01})
+    rng = np.random.default_rng(5)
+    headings = np.array([simulate_odometry(STRAIGHT, settings, rng)[:, 2] for _ in range(400)])
+    assert np.std(headings[:, 80]) == pytest.approx(0.02, rel=0.15)
+    assert np.std(headings[:, 320]) == pytest.approx(0.04, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("bias", "turn_share", "travel_share"), [("scale_bias", 1.0, 0.0), ("veer_bias_rad_m", 0.0, 1.0)]
+)
+def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
+    turning = np.column_stack((np.zeros((101, 2)), np.linspace(0.0, 3.0, 101)))
+    driving = np.column_stack((np.linspace(0.0, 3.0, 101), np.zeros((101, 2))))
+    settings, rng = NO_DRIFT.model_copy(update={bias: 0.01}), np.random.default_rng(6)
+    for truth, share in ((turning, turn_share), (driving, travel_share)):
+        wrong = np.array([simulate_odometry(truth, settings, rng)[:, 2] - truth[:, 2] for _ in range(400)])
+        assert np.std(wrong[:, 100]) == pytest.approx(share * 0.03, rel=0.15, abs=1e-12)
+        np.testing.assert_allclose(wrong[:, 50], wrong[:, 100] / 2.0, atol=1e-9)
+
+
+def test_slips_make_odometry_longer_and_nothing_else():
+    settings = NO_DRIFT.model_copy(update={"slips_per_m": 0.5, "slip_m": 0.04})
+    rng = np.random.default_rng(0)
+    ends = np.array([simulate_odometry(STRAIGHT, settings, rng)[-1] for _ in range(300)])
+    assert np.mean(ends[:, 0]) == pytest.approx(20.0 + 20.0 * 0.5 * 0.04, abs=0.04)
+    np.testing.assert_allclose(ends[:, 1:], 0.0, atol=1e-12)
+
+
+STAMPS = 100.0 + 0.02 * np.arange(401)
+
+
+def read(truth=STRAIGHT, seed=3, noise=NO_DRIFT, **faults):
+    settings = noise.model_copy(update={"faults": OdometryFaults(**faults)})
+    return read_odometry(STAMPS, truth, settings, np.random.default_rng(seed))
+
+
+def test_carpet_makes_distances_and_turns_too_long_on_a_quarter_of_the_floor():
+    truth = STRAIGHT + np.array((0.0, 5.0, 0.3))
+    steps = se2.relative(read(truth, carpet_slip=0.2).T_odom_base)
+    on_carpet = (truth[:-1, 0] // 4.0) % 2 == 1
+    np.testing.assert_allclose(np.hypot(*steps[:, :2].T), np.where(on_carpet, 0.06, 0.05), atol=1e-9)
+    beside = read(STRAIGHT + np.array((0.0, 1.0, 0.0)), carpet_slip=0.2).T_odom_base
+    np.testing.assert_allclose(beside, STRAIGHT, atol=1e-9)
+    turning = np.column_stack((np.full((401, 2), 5.0), np.linspace(0.0, 2.0, 401)))
+    assert read(turning, carpet_slip=0.2).T_odom_base[-1, 2] == pytest.approx(2.4)
+
+
+def test_steps_hold_the_pose_between_updates():
+    readings = read(update_hz=5.0)
+    changes = np.flatnonzero(np.diff(readings.T_odom_base[:, 0])) + 1
+    np.testing.assert_allclose(readings.stamps[changes] - 100.0, 0.2 * np.arange(1, 41), atol=1e-9)
+    np.testing.assert_allclose(readings.T_odom_base[changes], STRAIGHT[changes], atol=1e-9)
+
+
+def test_late_messages_have_the_poses_of_earlier():
+    sound, late = read(), read(delay_s=0.2)
+    np.testing.assert_array_equal(late.T_odom_base, sound.T_odom_base)
+    stamps = np.array([100.01, 101.2, 103.21])
+    np.testing.assert_allclose(late.at(stamps + 0.2), sound.at(stamps), atol=1e-12)
+    assert late.at(np.array([100.1]))[0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_reset_starts_at_zero_and_changes_no_motion():
+    noise = KINDS[OdometryKind.GOOD]
+    sound, reset = (read(noise=noise, **faults).T_odom_base for faults in ({}, {"reset_at": 0.5}))
+    np.testing.assert_allclose(reset[200], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(reset[:200], sound[:200])
+    np.testing.assert_allclose(se2.relative(reset)[200:], se2.relative(sound)[200:], atol=1e-9)
+
+
+def test_scales_are_wrong_by_eight_percent_in_the_mean():
+    ends = [read(noise=KINDS[OdometryKind.SCALED], seed=seed).T_odom_base[-1, 0] for seed in range(300)]
+    assert np.mean(np.abs(np.array(ends) / 20.0 - 1.0)) == pytest.approx(0.08, abs=0.01)
+
+
+def test_every_kind_of_odometry_has_its_settings():
+    assert set(KINDS) == set(OdometryKind)
+    assert {kind for kind, settings in KINDS.items() if settings is None} == {OdometryKind.NONE}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_default_odometry_is_bad_enough_to_need_a_map(seed):
+    truth = true_drive(seed)
+    odometry = simulate_odometry(truth, SimulationSettings().drift, np.random.default_rng(seed))
+    end = se2.between(se2.between(truth[0], truth[-1]), odometry[-1])
+    assert 0.1 < np.hypot(end[0], end[1]) < 10.0
+
+
+@pytest.mark.parametrize(
+    "content", [{"robots": 0}, {"path_length_m": -1}, {"lidar": {"dropout": 2}}, {"lidar": {"beam": 3}}]
+)
+def test_impossible_settings_are_refused(content):
+    with pytest.raises(ConfigError, match="fleet"):
+        config.parse(SimulationSettings, content, "fleet")

@@ -1,0 +1,312 @@
+"""Attacks on a fleet: a stranger who reaches the port, and a robot whose token is valid. None succeeds.
+
+All servers listen on loopback.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from tests.federated.authority import free_port
+from tests.federated.fakes import Fake
+from tests.federated.live import LiveFleet, honest_update
+
+from fcslam.errors import TrainingError
+from fcslam.learning.federated.client import ClientUpdate
+from fcslam.learning.federated.flower import QUIET
+from fcslam.learning.federated.settings import FederatedSettings
+
+pytestmark = [pytest.mark.system, pytest.mark.attack]
+
+HONEST = ("one", "two", "three", "four")
+HOSTILE = "hostile"
+RUN_S = 90.0
+FOREIGN_APP = """import os, pathlib
+if "FOREIGN_APP_OWNER" not in os.environ:  # not in the stranger's own processes
+    pathlib.Path({marker!r}).write_text("a stranger's program ran here")
+    os._exit(0)
+from flwr.{side} import {kind}
+app = {kind}()
+"""
+FOREIGN_PROJECT = """[build-system]
+requires = ["hatchling"]
+build-backend = "hatchling.build"
+[project]
+name = "foreign"
+version = "1.0.0"
+description = "A stranger's app"
+license = { file = "LICENSE" }
+dependencies = ["flwr>=1.41.0,<2.0"]
+[tool.flwr.app]
+publisher = "stranger"
+fab-format-version = 1
+flwr-version-target = "1.41.0"
+[tool.flwr.app.components]
+serverapp = "foreign.server:app"
+clientapp = "foreign.client:app"
+[tool.flwr.app.config]
+"""
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    return LiveFleet(tmp_path_factory.mktemp("fleet"), (*HONEST, HOSTILE))
+
+
+def chosen_settings():
+    return FederatedSettings.model_validate({"rounds": 3, "local_steps": 1, "minimum_robots": 4, "deadline_s": 20.0})
+
+
+@pytest.fixture(scope="module")
+def undisturbed(fleet, tmp_path_factory):
+    """The weights of a run of the honest robots alone."""
+    with fleet.server() as grid:
+        start_honest(fleet)
+        state, reports = fleet.run(grid, tmp_path_factory.mktemp("undisturbed"), chosen_settings())
+    assert [report.robots for report in reports] == [tuple(sorted(HONEST))] * 3
+    return state.weights
+
+
+def start_honest(fleet):
+    for seed, robot in enumerate(HONEST):
+        fleet.start(Fake(robot, answer=honest_update(seed)))
+
+
+# ---- a robot with a valid token ----
+
+
+class HostileClient:
+    """Falsifies what an honest robot would send."""
+
+    name = HOSTILE
+
+    def __init__(self, falsify):
+        self._honest, self._falsify = honest_update(99), falsify
+
+    def train(self, weights, round_number, _run_id, _settings):
+        update, losses = self._falsify(self._honest(weights, round_number), weights)
+        return ClientUpdate(update, losses)
+
+    def evaluate(self, _weights, _settings):
+        return {"repeatability": 1.0, "mma_3px": 1.0}
+
+
+def flipped(update, sent, factor=-1.0):
+    return update | {"a.weight": (sent["a.weight"] + factor * (update["a.weight"] - sent["a.weight"]))}, {"x": 1.0}
+
+
+POISON = {
+    "NaN losses": lambda update, _: (update, {"detector": float("nan")}),
+    "infinite losses": lambda update, _: (update, {"detector": float("inf")}),
+    "losses beyond all measure": lambda update, _: (update, {"detector": 1e300}),
+    "NaN weights": lambda update, _: (update | {"a.weight": update["a.weight"] * np.nan}, {}),
+    "tripled variances": lambda update, _: (update | {"a.running_var": 3.0 * update["a.running_var"]}, {}),
+    "variances of a third": lambda update, _: (update | {"a.running_var": update["a.running_var"] / 3.0}, {}),
+    "shifted means": lambda update, _: (update | {"a.running_mean": update["a.running_mean"] + 3.0}, {}),
+    "one variance of 1e9": lambda update, _: (update | {"a.running_var": with_first(update["a.running_var"], 1e9)}, {}),
+    "flipped update": flipped,
+    "long flipped update": lambda update, sent: flipped(update, sent, -10.0),
+    "wrong shape": lambda update, _: (update | {"a.weight": update["a.weight"][:5]}, {}),
+    "another array": lambda update, _: (update | {"b.weight": update["a.weight"][:5]}, {}),
+    "doubles": lambda update, _: (update | {"a.weight": update["a.weight"].astype(np.float64)}, {}),
+    "huge array": lambda update, _: (update | {"a.weight": np.zeros((3000, 3000), np.float32)}, {}),
+}
+
+
+def with_first(array, value):
+    changed = array.copy()
+    changed[0] = value
+    return changed
+
+
+@pytest.mark.parametrize("poison", POISON)
+def test_a_poisoned_update_changes_nothing(poison, fleet, undisturbed, tmp_path):
+    with fleet.server() as grid:
+        fleet.start(HostileClient(POISON[poison]))
+        start_honest(fleet)
+        wait_for_all(grid)
+        state, reports = fleet.run(grid, tmp_path, chosen_settings())
+    assert [report.robots for report in reports] == [tuple(sorted(HONEST))] * 3
+    assert all(HOSTILE in report.left_out for report in reports)
+    assert all(np.isfinite(list(report.losses.values())).all() for report in reports)
+    for name, array in undisturbed.items():
+        assert np.array_equal(state.weights[name], array), name
+
+
+def wait_for_all(grid):
+    wait_until(lambda: len(grid.get_node_ids()) == len(HONEST) + 1)
+
+
+def wait_until(happened):
+    end = time.monotonic() + RUN_S
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def is_listening(port):
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
+        return True
+    return False
+
+
+def test_a_robot_that_sends_noise_is_left_out(fleet, undisturbed, tmp_path):
+    ended = threading.Event()
+
+    def send_noise():
+        with fleet.link(HOSTILE) as link:
+            while not ended.is_set():
+                found = link.fetch()
+                if found is not None:
+                    assert link.reply(found[0] + 1, b"x") is not None  # the request of another robot
+                    link.reply(found[0], np.random.default_rng(1).bytes(50_000))
+
+    with fleet.server() as grid:
+        thread = threading.Thread(target=send_noise)
+        thread.start()
+        start_honest(fleet)
+        wait_for_all(grid)
+        state, reports = fleet.run(grid, tmp_path, chosen_settings())
+        ended.set()
+        thread.join()
+    assert all("cannot be read" in report.left_out[HOSTILE] for report in reports)
+    assert all(np.array_equal(state.weights[name], array) for name, array in undisturbed.items())
+
+
+def test_a_robot_cannot_answer_in_the_name_of_another(fleet):
+    with fleet.server(), fleet.link("one", owner=HOSTILE) as link, pytest.raises(TrainingError, match="no token of"):
+        link.fetch()
+
+
+@pytest.mark.parametrize(
+    "operation", ["control/start-run", "control/register-node", "runtime/acquire-task", "fleet/push-messages"]
+)
+def test_a_robot_cannot_start_a_run_or_send_to_robots(operation, fleet):
+    """Its token opens the operations of a robot and nothing else."""
+    path = f"/v1/{operation}"
+    with fleet.server():
+        headers = {"Authorization": f"Bearer {fleet.token(HOSTILE)}"}
+        trusted = ssl.create_default_context(cafile=fleet.ca)
+        answer = httpx.post(f"https://{fleet.address}{path}", headers=headers, verify=trusted)
+    assert answer.status_code == 404
+    assert any(line.startswith(f"refused: POST {path} from 127.0.0.1: nobody starts a run") for line in fleet.notices)
+
+
+def test_a_robot_cannot_hold_many_requests_open(fleet):
+    """Four wait for work, the rest are refused at once."""
+    refused = []
+
+    def fetch():
+        with fleet.link(HOSTILE) as link:
+            try:
+                link.fetch()
+            except ConnectionError as error:
+                refused.append(str(error))
+
+    with fleet.server():
+        threads = [threading.Thread(target=fetch) for _ in range(12)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert refused == ["the server answers with status 429"] * 8
+
+
+# ---- a stranger who has nothing but the certificate of the authority ----
+
+
+def foreign_app(folder, marker):
+    package = folder / "foreign"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    for side, kind in (("server", "ServerApp"), ("client", "ClientApp")):
+        text = FOREIGN_APP.format(marker=f"{marker}-{side}", side=f"{side}app", kind=kind)
+        (package / f"{side}.py").write_text(text)
+    (folder / "pyproject.toml").write_text(FOREIGN_PROJECT)
+    (folder / "LICENSE").write_text("none")
+    return folder
+
+
+def flwr(home, *words):
+    """A command of Flower in the stranger's hands."""
+    command = [str(Path(sys.executable).with_name("flwr")), *map(str, words)]
+    environment = {**os.environ, **QUIET, "FLWR_HOME": str(home), "FOREIGN_APP_OWNER": "1"}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=RUN_S, check=False)
+
+
+def connection(home, address, trust):
+    home.mkdir()
+    (home / "config.toml").write_text(f'[superlink]\ndefault = "x"\n[superlink.x]\naddress = "{address}"\n{trust}\n')
+    return home
+
+
+def markers(folder):
+    return sorted(path.name for path in folder.glob("marker*"))
+
+
+def test_a_stranger_starts_no_app_and_registers_no_key(fleet, undisturbed, tmp_path):
+    home = tmp_path / "home"
+    app = foreign_app(tmp_path / "app", tmp_path / "marker")
+    with fleet.server() as grid:
+        connection(home, fleet.address, f'root-certificates = "{fleet.ca}"')
+        start_honest(fleet)
+        run = flwr(home, "run", app, "x")
+        register = flwr(home, "supernode", "register", fleet.ca.parent / "one.pub", "x")
+        state, _ = fleet.run(grid, tmp_path / "run", chosen_settings())
+    assert run.returncode != 0, run.stdout
+    assert register.returncode != 0, register.stdout
+    assert any("refused: POST /v1/control/start-run" in line for line in fleet.notices)
+    assert any("refused: POST /v1/control/register-node" in line for line in fleet.notices)
+    assert markers(tmp_path) == []
+    assert all(np.array_equal(state.weights[name], array) for name, array in undisturbed.items())
+
+
+def test_a_stranger_finds_no_operation(fleet):
+    """All of Flower's, and what a web server may offer beside; nothing is answered without a token."""
+    from flwr.supercore.protobuf.translation import PROTOBUF_REQUEST_TYPES
+
+    paths = [path for _, path in PROTOBUF_REQUEST_TYPES] + ["/", "/docs", "/openapi.json", "/health", "/v1/health"]
+    assert len(paths) > 50
+    with (
+        fleet.server(),
+        httpx.Client(base_url=f"https://{fleet.address}", verify=ssl.create_default_context(cafile=fleet.ca)) as client,
+    ):
+        unknown = {client.request(method, path).status_code for path in paths for method in ("GET", "POST")}
+        operations = [f"/api/v1/robots/one/learning/{name}" for name in ("next", "alive", "reply/1", "taught")]
+        unsigned = {client.post(path).status_code for path in operations}
+        client.headers["Authorization"] = "Bearer guessed"
+        named = {client.post(path, content=b"x").status_code for path in operations}
+    assert (unknown, unsigned, named) == ({404}, {401}, {401})
+
+
+def test_the_foreign_app_runs_on_a_superlink(tmp_path):
+    """So the attack is one: Flower's SuperLink runs what anybody submits."""
+    port = free_port()
+    app = foreign_app(tmp_path / "app", tmp_path / "marker")
+    home = connection(tmp_path / "home", f"127.0.0.1:{port}", "insecure = true")
+    program = Path(sys.executable).with_name("flower-superlink")
+    environment = {**os.environ, **QUIET, "FLWR_HOME": str(home), "PATH": f"{program.parent}:{os.environ['PATH']}"}
+    command = [str(program), "--insecure", "--host", "127.0.0.1", "--port", str(port)]
+    with (tmp_path / "log").open("wb") as log:
+        link = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
+    try:
+        wait_until(lambda: is_listening(port))
+        flwr(home, "run", app, "x")
+        wait_until(lambda: markers(tmp_path) == ["marker-server"])
+    finally:
+        os.killpg(link.pid, signal.SIGKILL)
+        link.wait(RUN_S)

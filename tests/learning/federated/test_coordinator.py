@@ -1,0 +1,411 @@
+"""The server's loop in one process: what it merges, whom it leaves out, how it goes on after a kill."""
+
+import csv
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
+
+from fcslam.errors import OutputError, TrainingError
+from fcslam.lab.evaluation.federated.poison import PoisonedClient
+from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, read_state, write_state
+from fcslam.learning.federated.history import ROUNDS_FILE
+from fcslam.learning.federated.privacy import epsilon
+from fcslam.learning.federated.settings import FederatedSettings
+
+TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
+"""For where statistics are frozen and fakes would move them."""
+
+
+def same(first, second):
+    return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def ragged(seed):
+    """A robot whose update is another one in each coordinate and round."""
+
+    def answer(weights, round_number):
+        rng = np.random.default_rng([seed, round_number])
+        return {name: (array + 0.1 * rng.random(array.shape)).astype(np.float32) for name, array in weights.items()}
+
+    return answer
+
+
+def by_hand(strategy, answers, before, memory):
+    """The result that a strategy should give for the answers, by an independent implementation."""
+    stacked = {name: np.stack([answer[name].astype(np.float64) for answer in answers]) for name in before}
+    mean = {name: np.average(stack, axis=0) for name, stack in stacked.items()}
+    if strategy in ("fedavg", "fedprox"):
+        return mean
+    if strategy == "fedmedian":
+        return {name: np.median(stack, axis=0) for name, stack in stacked.items()}
+    if strategy == "fedtrimmedavg":
+        return {name: np.sort(stack, axis=0)[1:-1].mean(axis=0) for name, stack in stacked.items()}
+    if strategy == "krum":
+        flat = np.stack([np.concatenate([answer[name].ravel() for name in before]) for answer in answers])
+        distances = np.square(flat[:, None] - flat[None]).sum(-1)
+        nearest = np.sort(distances, axis=1)[:, 1 : 1 + len(answers) - 1 - 2]
+        return answers[int(np.argmin(nearest.sum(axis=1)))]
+    step = memory["round"] = memory.get("round", 0) + 1
+    new = {}
+    for name in before:
+        change = mean[name] - before[name]
+        m = memory[f"m{name}"] = 0.9 * memory.get(f"m{name}", 0.0) + 0.1 * change
+        v = memory[f"v{name}"] = 0.99 * memory.get(f"v{name}", 0.0) + 0.01 * change**2
+        rate = 0.003 * np.sqrt(1 - 0.99 ** (step + 1)) / (1 - 0.9 ** (step + 1))
+        new[name] = before[name] + rate * m / (np.sqrt(v) + 1e-3)
+    return new
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"])
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
+    robots = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(5)]
+    chosen = settings(strategy=strategy, rounds=3, normalisation="frozen", server_momentum=share)
+    state, _ = run(robots, tmp_path, chosen, start=TRAINED)
+    weights, memory = TRAINED, {}
+    momentum = dict.fromkeys(TRAINED if strategy not in ("fedadam", "krum") else (), 0.0)
+    for round_number in range(3):
+        answers = [robot.answer(weights, round_number) for robot in robots]
+        merged = by_hand(strategy, answers, weights, memory)
+        for name, before in momentum.items():
+            momentum[name] = merged[name] - weights[name] + share * before
+            merged[name] = merged[name] + share * momentum[name]
+        weights = {name: np.asarray(array, np.float32) for name, array in merged.items()}
+    for name, array in weights.items():
+        assert state.weights[name] == pytest.approx(array, rel=1e-6, abs=1e-6)
+    assert not same(state.weights, TRAINED)
+
+
+def test_the_length_of_the_last_updates_is_kept_for_the_next_round(tmp_path):
+    state, _ = run([Fake("a", 1.0), Fake("b", 1.0)], tmp_path, settings(rounds=2, server_momentum=0.0))
+    trained = [name for name in START if not name.endswith(("running_mean", "running_var"))]
+    assert state.update_length == pytest.approx(np.sqrt(sum(START[name].size for name in trained)), rel=1e-6)
+    again, _ = run([Fake("a", 1.0), Fake("b", 1.0)], tmp_path, settings(rounds=2, server_momentum=0.0))
+    assert again.update_length == state.update_length
+
+
+@pytest.mark.parametrize(("robots", "most"), [(1, 0.0), (2, 0.5), (4, 0.75)])
+def test_momentum_goes_no_further_than_all_robots_one_after_another(robots, most, tmp_path):
+    def end(share):
+        fleet = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(robots)]
+        return run(fleet, tmp_path / str(share), settings(rounds=3, server_momentum=share))[0].weights
+
+    assert same(end(0.9), end(most))
+    assert same(end(0.9), end(0.2)) is (robots == 1)
+
+
+def test_statistics_are_taken_as_they_were_measured(tmp_path):
+    state, _ = run([Fake("a", 0.5), Fake("b", 0.5)], tmp_path, settings(rounds=3, server_momentum=0.5))
+    assert state.weights["a.running_var"] == pytest.approx(1.0 + 3 * 0.5)
+    steps = 0.5 * np.array([1.0, 1.5, 1.75]) * 0.5  # each round's share of momentum, on top of its update
+    assert state.weights["b.weight"] == pytest.approx(0.5 + 3 * 0.5 + steps.sum())
+
+
+def test_what_is_judged_and_released_is_a_mean_of_rounds(tmp_path):
+    judged = []
+
+    def judge(weights):
+        judged.append(float(weights["b.weight"]))
+        return {"repeatability": 0.5, "mma_3px": 0.5}
+
+    chosen = settings(rounds=10, local_steps=100, smoothing=0.8)
+    state, reports = run([Fake("a", 0.1), Fake("b", 0.1)], tmp_path, chosen, evaluate_fn=judge)
+    weight, mean, expected = 0.5, 0.5, [0.5]
+    for number in range(1, 11):
+        weight += 0.1
+        rate = max(min((1000 - (100 * number - 1)) / 300, 1.0), 1e-5 / 2e-3)
+        share = min(0.8, number / (number + 9)) * rate
+        mean = share * mean + (1.0 - share) * weight
+        expected.append(mean)
+    assert judged == pytest.approx(expected)
+    assert state.weights["b.weight"] == pytest.approx(1.5), "training goes on from the weights themselves"
+    assert state.best["b.weight"] == state.average["b.weight"] == pytest.approx(mean)
+    assert reports[-1].version == version(state.best)
+
+
+@pytest.mark.parametrize("strategy", ["fedavg", "fedadam"])
+@pytest.mark.parametrize("moment", ["in training", "after a round"])
+def test_a_killed_server_ends_as_if_it_had_not_been(strategy, moment, tmp_path):
+    chosen = settings(strategy=strategy, rounds=4, normalisation="frozen", server_momentum=0.5, smoothing=0.8)
+    fleet = [Fake("a", answer=ragged(1)), Fake("b", answer=ragged(2))]
+    whole, rows = run(fleet, tmp_path / "whole", chosen, start=TRAINED)
+
+    def killed(weights, round_number):
+        if round_number == 2:
+            raise KeyboardInterrupt
+        return ragged(2)(weights, round_number)
+
+    def watch(weights):
+        if len(judged := judgements) == 3 and moment == "after a round":
+            raise KeyboardInterrupt
+        judged.append(weights)
+        return {"repeatability": 0.5, "mma_3px": 0.5}
+
+    judgements = []
+    second = Fake("b", answer=killed if moment == "in training" else ragged(2))
+    with pytest.raises(KeyboardInterrupt):
+        run([Fake("a", answer=ragged(1)), second], tmp_path / "torn", chosen, start=TRAINED, evaluate_fn=watch)
+    fleet = [Fake("a", answer=ragged(1)), Fake("b", answer=ragged(2))]
+    resumed, late = run(fleet, tmp_path / "torn", chosen, start=TRAINED)
+    assert same(whole.weights, resumed.weights)
+    assert [report.round_number for report in late] == [3, 4]
+    assert [report.version for report in rows[2:]] == [report.version for report in late]
+    with (tmp_path / "torn" / ROUNDS_FILE).open() as file:
+        assert [row["round"] for row in csv.DictReader(file)] == ["1", "2", "3", "4"]
+
+
+def test_a_kill_between_table_and_checkpoint_repeats_the_round(tmp_path, monkeypatch):
+    def fail(path, state, chosen):
+        if state.rounds_done == 2:
+            raise OutputError("no room")
+        write_state(path, state, chosen)
+
+    robots = [Fake("a")]
+    run(robots, tmp_path, settings(rounds=1))
+    monkeypatch.setattr("fcslam.learning.federated.coordinator.write_state", fail)
+    with pytest.raises(OutputError):
+        run(robots, tmp_path, settings(rounds=3))
+    with (tmp_path / ROUNDS_FILE).open() as file:
+        assert [row["round"] for row in csv.DictReader(file)] == ["1", "2"]
+    monkeypatch.undo()
+    run(robots, tmp_path, settings(rounds=3))
+    with (tmp_path / ROUNDS_FILE).open() as file:
+        assert [row["round"] for row in csv.DictReader(file)] == ["1", "2", "3"]
+
+
+def test_the_order_of_robots_does_not_matter(tmp_path):
+    robots = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(4)]
+    first, _ = run(robots, tmp_path / "1")
+    second, _ = run(robots[::-1], tmp_path / "2")
+    assert same(first.weights, second.weights)
+
+
+def refuses(*_args):
+    raise TrainingError("no images here")
+
+
+def breaks(*_args):
+    raise RuntimeError("out of memory")
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (refuses, "no images here"),
+        (breaks, "RuntimeError: out of memory"),
+        (lambda weights, _round: shifted(weights, np.nan), "not finite"),
+        (lambda weights, _round: {"a.weight": weights["a.weight"]}, "other arrays"),
+        (lambda weights, _round: weights | {"c": weights["b.weight"]}, "other arrays"),
+        (lambda weights, _round: weights | {"b.weight": np.zeros(2, np.float32)}, "shape (2,)"),
+        (lambda weights, _round: weights | {"b.weight": np.zeros(())}, "float64"),
+        (lambda weights, _round: weights | {"a.running_var": np.full(2, -1, np.float32)}, "negative variances"),
+    ],
+)
+def test_a_robot_that_fails_is_left_out_with_a_reason(answer, reason, tmp_path):
+    state, reports = run([Fake("good", 0.25), Fake("bad", answer=answer)], tmp_path)
+    assert all(reason in report.left_out["bad"] for report in reports)
+    assert [report.robots for report in reports] == [("good",), ("good",)]
+    assert same(state.weights, shifted(START, 0.5))
+
+
+def test_stragglers_are_left_out_and_asked_again(tmp_path):
+    now = [0.0]
+
+    def slowly(weights, round_number):
+        now[0] += 100.0 if round_number == 0 else 1.0
+        return shifted(weights, 1.0)
+
+    robots = [Fake("fast", 0.0), Fake("slow", answer=slowly)]
+    grid = grid_of(robots, clock=lambda: now[0])
+    state, reports = run(robots, tmp_path, settings(deadline_s=10.0), grid=grid)
+    assert reports[0].left_out == {"slow": "no answer: gone, or later than the deadline"}
+    assert reports[1].robots == ("fast", "slow")
+    assert same(state.weights, shifted(START, 0.5))
+
+
+def test_only_a_share_takes_part_and_all_in_turn(tmp_path):
+    robots = [Fake(f"r{index}") for index in range(6)]
+    _, reports = run(robots, tmp_path, settings(rounds=12, participation=0.5))
+    assert {len(report.robots) for report in reports} == {3}
+    assert all(robot.asked for robot in robots)
+    assert len({report.robots for report in reports}) > 1
+
+
+def test_two_robots_of_one_name_count_once(tmp_path):
+    _, reports = run([Fake("twin"), Fake("twin"), Fake("other")], tmp_path)
+    assert [report.robots for report in reports] == [("other", "twin")] * 2
+    assert all("of one name" in report.left_out["another twin"] for report in reports)
+
+
+def test_bytes_are_those_of_the_arrays(tmp_path):
+    _, reports = run([Fake("a"), Fake("b")], tmp_path)
+    content = sum(array.nbytes for array in START.values())
+    header = 128 * len(START)
+    assert [(report.bytes_down, report.bytes_up) for report in reports] == [(2 * (content + header),) * 2] * 2
+
+
+def test_without_anybody_the_server_says_so_or_waits(tmp_path):
+    robots = [Fake("a", answer=refuses)]
+    with pytest.raises(TrainingError, match="no round can be completed: a: no images here"):
+        run(robots, tmp_path)
+    waited = []
+
+    def wait(reason):
+        waited.append(reason)
+        robots[0].answer = None
+
+    state, _ = run(robots, tmp_path, wait=wait)
+    assert waited == ["a: no images here"]
+    assert state.rounds_done == 2
+
+
+def test_a_worse_detector_is_not_released_and_a_collapsed_one_is_undone(tmp_path):
+    scores = iter([0.5, 0.6, 0.55, 0.2, 0.6])
+    robots = [Fake("a", answer=ragged(1))]
+    state, reports = run(
+        robots,
+        tmp_path,
+        settings(rounds=4),
+        evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores)),
+    )
+    assert [report.released for report in reports] == [True, False, False, True]
+    assert [report.returned for report in reports] == [False, False, True, False]
+    first = ragged(1)(START, 0)
+    assert same(state.weights, ragged(1)(first, 3))
+    assert state.best_round == 4
+
+
+def test_after_a_collapse_the_mean_begins_anew_as_well(tmp_path):
+    scores = iter([0.5, 0.6, 0.2, 0.1])
+    judged = []
+
+    def judge(weights):
+        judged.append(weights)
+        return dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+
+    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3, smoothing=0.8), evaluate_fn=judge)
+    assert [report.returned for report in reports] == [False, True, True]
+    assert same(state.weights, judged[1])
+    assert same(state.average, judged[1])
+    # Of the third round: what the second had come to is in it no more.
+    share = 3 / 12 * (3 - 2) / (0.3 * 3)
+    assert judged[3]["b.weight"] == pytest.approx(judged[1]["b.weight"] + (1.0 - min(share, 3 / 12)))
+
+
+def test_a_mean_never_reaches_beyond_what_it_is_of(tmp_path):
+    """However low the learning rate: that of training has a floor."""
+    chosen = settings(rounds=12, smoothing=0.8, training={"learning_rate": 1e-6})
+    state, _ = run([Fake("a", 1.0)], tmp_path, chosen)
+    assert 0.5 < float(state.average["b.weight"]) < float(state.weights["b.weight"]) == 12.5
+
+
+def test_what_does_not_change_stays_to_the_last_bit_in_the_mean(tmp_path):
+    frozen = {"a.running_var": START["a.running_var"] / 3}
+    robot = Fake("a", answer=lambda weights, _round: shifted(weights, 0.1) | frozen)
+    state, _ = run([robot], tmp_path, settings(rounds=12, smoothing=0.7), start=START | frozen)
+    assert np.array_equal(state.average["a.running_var"], frozen["a.running_var"])
+    assert all(isinstance(array, np.ndarray) for array in state.average.values())
+
+
+def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
+    scores = iter([0.9, 0.1, 0.3])
+    state, reports = run(
+        [Fake("a", 0.5)], tmp_path, evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+    )
+    assert [report.returned for report in reports] == [False, False]
+    assert same(state.weights, shifted(START, 1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
+def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
+    """The others end where they would have ended without it."""
+    start = {"weight": np.random.default_rng(0).normal(size=100_000).astype(np.float32)}
+    common = np.random.default_rng(1).normal(size=100_000)
+
+    def towards(seed):
+        def answer(weights, round_number):
+            own = np.random.default_rng([seed, round_number]).normal(size=100_000)
+            return {"weight": (weights["weight"] + 0.02 * (0.5 * common + own)).astype(np.float32)}
+
+        return answer
+
+    def fleet():
+        return [Fake(f"r{seed}", answer=towards(seed)) for seed in range(4)]
+
+    chosen = settings(rounds=3, screening={"least_agreement": 0.01})
+    alone, _ = run(fleet(), tmp_path / "alone", chosen, start=start)
+    bad = PoisonedClient(Fake("bad", answer=towards(9)), poison)
+    together, reports = run([*fleet(), bad], tmp_path / "together", chosen, start=start)
+    assert all(set(report.left_out) == {"bad"} for report in reports)
+    assert same(alone.weights, together.weights)
+
+
+def test_epsilon_counts_what_was_asked_even_of_those_left_out(tmp_path):
+    private = {"clip_norm": 1.0, "noise_multiplier": 5.0, "delta": 1e-6}
+    chosen = settings(rounds=3, normalisation="frozen", privacy=private)
+    _, reports = run([Fake("good"), Fake("bad", answer=refuses)], tmp_path, chosen, start=TRAINED)
+    assert [report.epsilon for report in reports] == [epsilon(5.0, rounds, 1e-6) for rounds in (1, 2, 3)]
+
+
+def test_epsilon_counts_what_a_server_asked_before_it_was_killed(tmp_path):
+    def kills(_weights, _round):
+        raise KeyboardInterrupt
+
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            run([Fake("a"), Fake("b", answer=kills)], tmp_path)
+    state = read_state(tmp_path / CHECKPOINT_FILE, settings(), START, version(START))
+    assert (state.rounds_done, state.times_asked) == (0, {"a": 3, "b": 3})
+    _, reports = run([Fake("a"), Fake("b")], tmp_path)
+    size = reports[0].bytes_up
+    assert [report.bytes_down for report in reports] == [size, size], "what is sent in this round"
+
+
+def test_a_start_that_nothing_beats_stays(tmp_path):
+    scores = iter([0.5, 0.4, 0.3])
+    state, reports = run(
+        [Fake("a")], tmp_path, evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+    )
+    assert (state.best_round, [report.released for report in reports]) == (0, [False, False])
+    assert same(state.best, START)
+
+
+def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path):
+    run([Fake("a")], tmp_path)
+    with pytest.raises(TrainingError, match=r"other settings \(local_steps\)"):
+        run([Fake("a")], tmp_path, settings(local_steps=2))
+    with pytest.raises(TrainingError, match="began from"):
+        run([Fake("a")], tmp_path, start=shifted(START, 1.0))
+    with pytest.raises(TrainingError, match="its weights do not fit"):
+        run([Fake("a")], tmp_path, start={"other": np.zeros(3, np.float32)})
+    state, reports = run([Fake("a")], tmp_path, settings(rounds=3))
+    assert (state.rounds_done, len(reports)) == (3, 1)
+
+
+def test_a_checkpoint_of_a_version_without_some_setting_is_told_as_such(tmp_path, monkeypatch):
+    whole = FederatedSettings.model_dump
+    monkeypatch.setattr(
+        FederatedSettings,
+        "model_dump",
+        lambda self, **how: {name: value for name, value in whole(self, **how).items() if name != "smoothing"},
+    )
+    run([Fake("a")], tmp_path)
+    monkeypatch.undo()
+    with pytest.raises(TrainingError, match=r"comes from another version of fcslam \(smoothing\)"):
+        run([Fake("a")], tmp_path)
+    (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
+    with pytest.raises(TrainingError, match="is not a checkpoint"):
+        run([Fake("a")], tmp_path)
+
+
+def test_noise_that_would_turn_variances_negative_is_refused():
+    with pytest.raises(ValueError, match="frozen"):
+        settings(privacy={"noise_multiplier": 1.0})
+    settings(privacy={"noise_multiplier": 1.0}, normalisation="frozen")

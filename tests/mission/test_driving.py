@@ -1,0 +1,119 @@
+"""Robots side by side in processes: the same run as one by one, and errors arrive."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from fcslam.errors import FcslamError, SourceError
+from fcslam.mission import driving
+from fcslam.mission.driving import one_by_one, side_by_side
+from fcslam.mission.mission import MissionConfig, run_mission
+from fcslam.records import Keyscan
+from fcslam.robot.frontend import RobotConfig
+from fcslam.sources import open_source
+from fcslam.sources.faults import Fault, Faults
+from tests.wire.examples import same
+
+
+class Broken:
+    """A recording that ends its reader."""
+
+    faults = Faults({})
+
+    def __init__(self, name, end):
+        self.name, self._end = name, end
+
+    def records(self):
+        self._end()
+        yield
+
+
+def refuse():
+    raise SourceError("robot.clf: cut off; copy it again")
+
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_processes_change_no_byte_of_a_run(logs, tmp_path):
+    alone = run_mission([open_source(log) for log in logs], MissionConfig())
+    together = run_mission([open_source(log) for log in logs], MissionConfig(), drive=side_by_side(2))
+    for name, run in (("alone", alone), ("together", together)):
+        run.save(tmp_path / name)
+    files = {path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*") if path.is_file()}
+    different = [f for f in files if (tmp_path / "alone" / f).read_bytes() != (tmp_path / "together" / f).read_bytes()]
+    assert len(files) > 10
+    assert different == []
+
+
+def test_legs_are_the_same_and_their_arrays_read_only(logs):
+    with one_by_one([open_source(logs[0])], RobotConfig()) as (here,):
+        expected = list(here)
+    with side_by_side(5)([open_source(log) for log in logs[:2]], RobotConfig()) as (there, _):
+        legs = list(there)
+    sent, wanted = ([sized.packet for leg in found for sized in leg.packets] for found in (legs, expected))
+    assert all(same(one, other) for one, other in zip(sent, wanted, strict=True))
+    assert not any(packet.body.ranges_m.flags.writeable for packet in sent if isinstance(packet.body, Keyscan))
+    assert legs[-1].faults == expected[-1].faults
+
+
+def test_faults_of_a_recording_arrive(logs, tmp_path):
+    damaged = tmp_path / "damaged.clf"
+    damaged.write_bytes(logs[0].read_bytes() + b"FLASER 3 1 2\n")
+    seen = []
+    run_mission([open_source(damaged), open_source(logs[1])], MissionConfig(), seen.append, drive=side_by_side(2))
+    assert seen[-1].faults["damaged"][Fault.BROKEN_LINE].count == 1
+    assert not seen[-1].faults["robot_2"]
+
+
+def test_one_robot_needs_no_process(monkeypatch):
+    monkeypatch.setattr(driving, "start_method", lambda: pytest.fail("a process"))
+    with side_by_side(4)([Broken("a", refuse)], RobotConfig()) as (legs,), pytest.raises(SourceError):
+        next(legs)
+
+
+@pytest.mark.parametrize(("end", "error", "text"), [(refuse, SourceError, "cut off"), (die, FcslamError, "code -9")])
+def test_an_error_in_a_process_is_raised_here(end, error, text):
+    sources = [Broken("a", end), Broken("b", end)]
+    with side_by_side(2)(sources, RobotConfig()) as (legs, _), pytest.raises(error, match=text):
+        next(legs)
+
+
+def test_processes_end_with_the_one_that_started_them(tmp_path):
+    """Even if that was killed."""
+    script = (
+        "import os, time\n"
+        "from fcslam.mission.driving import side_by_side\n"
+        "from fcslam.robot.frontend import RobotConfig\n"
+        "from tests.test_driving import Broken\n"
+        "file = os.open(os.environ['PIDS'], os.O_CREAT | os.O_WRONLY | os.O_APPEND)\n"
+        "def note(): os.write(file, f'{os.getpid()}\\n'.encode()); time.sleep(60)\n"
+        "with side_by_side(2)([Broken('a', note), Broken('b', note)], RobotConfig()) as (legs, _): next(legs)\n"
+    )
+    pids = tmp_path / "pids"
+    parent = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PIDS": str(pids)})
+    await_true(lambda: pids.exists() and len(pids.read_text().split()) == 2)
+    parent.kill()
+    parent.wait()
+    await_true(lambda: not any(is_running(int(pid)) for pid in pids.read_text().split()))
+
+
+def await_true(condition):
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail("it never was")
+
+
+def is_running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

@@ -1,0 +1,199 @@
+"""Recordings in, one run out: the same seed gives the same bytes, and what the run says adds up."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from fcslam.errors import FcslamError, PacketError, SourceError
+from fcslam.mission import mission
+from fcslam.mission.mission import MissionConfig, run_mission
+from fcslam.records import Channel, ClosureStatus, Veto
+from fcslam.sources import open_source, write_carmen
+from fcslam.sources.faults import Faults
+from tests.robot.kidnapping import kidnapping
+
+
+@pytest.fixture(scope="module")
+def watched(logs):
+    """A run, and the progress that was reported during it."""
+    seen = []
+    return run_mission([open_source(log) for log in logs], MissionConfig(seed=3), seen.append), seen
+
+
+@pytest.fixture(scope="module")
+def run(watched):
+    return watched[0]
+
+
+def files(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_the_same_seed_gives_the_same_bytes(run, logs, tmp_path):
+    again = run_mission([open_source(log) for log in logs], MissionConfig(seed=3))
+    run.save(tmp_path / "one")
+    again.save(tmp_path / "two")
+    one, two = files(tmp_path / "one"), files(tmp_path / "two")
+    assert one.keys() == two.keys()
+    assert [name for name in one if one[name] != two[name]] == []
+    assert {"robots.csv", "closures.csv", "pose_graph.g2o", "metrics.json", "config.yaml", "map.pgm", "map.png"} <= set(
+        one
+    )
+
+
+class Kidnapped:
+    """A recording of a robot that was put down elsewhere."""
+
+    name = "r"
+    faults = Faults({})
+
+    def records(self):
+        return iter(kidnapping()[0])
+
+
+@pytest.mark.slow
+def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
+    settings = MissionConfig()
+    robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
+    seen = []
+    run = run_mission([Kidnapped()], settings.model_copy(update={"robot": robot}), seen.append, [Veto("r", "r+1")])
+    assert run.metrics["keyscans"].value == seen[-1].keyscans
+    scans, moment = kidnapping()
+    first, second = run.trajectories.values()
+    assert (first.robot, second.robot) == ("r", "r+1")
+    assert [*first.stamps, *second.stamps] == [scan.stamp for scan in scans]
+    assert first.stamps[-1] == moment
+    assert first.map_index != second.map_index
+
+
+def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(watched):
+    run, seen = watched
+    assert [now.fusing for now in seen] == [False] * (len(seen) - 1) + [True]
+    assert [now.scans for now in seen] == sorted(now.scans for now in seen)
+    assert seen[-1].scans == sum(len(trajectory.stamps) for trajectory in run.trajectories.values())
+
+
+@pytest.mark.slow
+def test_the_order_of_the_recordings_does_not_matter(run, logs):
+    turned = run_mission([open_source(log) for log in reversed(logs)], MissionConfig(seed=3))
+    assert turned.closures
+    assert [str(c) for c in turned.closures] == [str(c) for c in run.closures]
+    assert turned.pose_graph_g2o == run.pose_graph_g2o
+    assert turned.map_files["map.pgm"] == run.map_files["map.pgm"]
+    poses = {t.robot: t.T_map_base.tobytes() for t in run.trajectories.values()}
+    assert {t.robot: t.T_map_base.tobytes() for t in turned.trajectories.values()} == poses
+
+
+def test_trajectories_have_every_scan_of_the_recording(run, drawn):
+    assert list(run.trajectories) == [robot.name for robot in drawn.robots]
+    for trajectory, robot in zip(run.trajectories.values(), drawn.robots, strict=True):
+        assert np.allclose(trajectory.stamps, robot.stamps, atol=1e-6)
+        assert trajectory.T_map_base.shape == (len(robot.stamps), 3)
+
+
+@pytest.mark.slow
+def test_a_robots_own_map_is_what_it_would_have_mapped_alone(run, logs):
+    """To the last bit: no other robot has a say in it, and its trajectory starts at the origin."""
+    for log, local in zip(logs, run.local_maps.values(), strict=True):
+        (alone,) = run_mission([open_source(log)], MissionConfig(seed=3)).local_maps.values()
+        assert (local.robot, local.pgm, local.yaml) == (alone.robot, alone.pgm, alone.yaml)
+        assert local.T_local_base.tobytes() == alone.T_local_base.tobytes()
+        assert np.array_equal(local.T_local_base[0], np.zeros(3))
+    for local, joint in zip(run.local_maps.values(), run.trajectories.values(), strict=True):
+        assert np.array_equal(local.stamps, joint.stamps)
+    second = run.local_maps["robot_2"]
+    assert np.abs(second.T_local_base - run.trajectories["robot_2"].T_map_base).max() > 0.5, "another frame"
+
+
+def test_numbers_add_up(run, drawn):
+    values = {name: metric.value for name, metric in run.metrics.items()}
+    assert values["robots"] == 3
+    assert values["maps"] == len({t.map_index for t in run.trajectories.values()})
+    assert values["scans"] == sum(len(robot.stamps) for robot in drawn.robots)
+    assert values["recorded_time"] == pytest.approx(sum(r.stamps[-1] - r.stamps[0] for r in drawn.robots))
+    assert values["keyscans"] == values["keyscan_packets"] == run.pose_graph_g2o.count("VERTEX_SE2")
+    assert values["hello_packets"] == 3
+    assert 3 <= values["correction_packets"] < values["place_packets"], "only those that are news"
+    packets = sum(values[f"{kind}_packets"] for kind in ("hello", "keyscan", "constraint", "place"))
+    assert values["acknowledgement_packets"] == packets
+    for figure in ("packets", "bytes"):
+        assert values[f"place_{figure}"] == values[f"lidar_place_{figure}"] + values[f"camera_place_{figure}"]
+    sent = sum(values[f"{kind}_bytes"] for kind in ("hello", "keyscan", "constraint", "place"))
+    assert sent == sum(values[f"uplink_bytes_{robot.name}"] for robot in drawn.robots)
+    received = sum(values[f"{kind}_bytes"] for kind in ("correction", "acknowledgement"))
+    assert received == sum(values[f"downlink_bytes_{robot.name}"] for robot in drawn.robots)
+    for robot in drawn.robots:
+        for link in ("uplink", "downlink"):
+            over = values[f"{link}_bytes_{robot.name}"] / (robot.stamps[-1] - robot.stamps[0]) / 1e3
+            assert values[f"{link}_rate_{robot.name}"] == pytest.approx(over)
+    for status in ClosureStatus:
+        between = [c for c in run.closures if c.robot_i != c.robot_j and c.status is status]
+        assert values[f"inter_robot_closures_{status}"] == len(between)
+    assert values["inter_robot_closures_verified"] == 0, "in the end every closure is decided"
+
+
+def test_closures_tell_where_and_why(run):
+    stamps = {t.robot: set(np.round(t.stamps, 6)) for t in run.trajectories.values()}
+    for closure in run.closures:
+        assert round(closure.stamp_i, 6) in stamps[closure.robot_i]
+        assert round(closure.stamp_j, 6) in stamps[closure.robot_j]
+        assert 0.0 <= closure.similarity <= 1.0
+        assert holds_setting(closure.reason.setting)
+
+
+def holds_setting(name):
+    """Whether the configuration has this setting; a reason without a limit names none."""
+    part = MissionConfig()
+    for step in name.split(".") if name else ():
+        part = getattr(part, step)
+    return True
+
+
+def test_the_run_carries_its_configuration(run):
+    assert MissionConfig.model_validate(yaml.safe_load(run.config_yaml)) == MissionConfig(seed=3)
+
+
+def test_progress_goes_forward_to_the_end(watched, drawn):
+    _, seen = watched
+    scans = [progress.scans for progress in seen]
+    assert scans == sorted(scans)
+    assert scans[-1] > 0.9 * sum(len(robot.stamps) for robot in drawn.robots)
+    assert [p.keyscans for p in seen] == sorted(p.keyscans for p in seen)
+    assert seen[-1].closures.keys() == {"within robots", "between robots"}
+    json.dumps(seen[-1].closures)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("a b.clf", None), ("_robot.clf", None), ("(1).log", None), ("Ä.log", None), ("x" * 90 + ".log", SourceError)],
+)
+def test_a_recording_may_have_any_name_that_a_robot_can_bear(tmp_path, drawn, name, error):
+    """Names go over the wire and into file names; one that cannot is refused before the work."""
+    robot = drawn.robots[0]
+    path = tmp_path / name
+    write_carmen(path, list(robot.scans())[:12])
+    sources = [open_source(path)]
+    if error is None:
+        assert len(run_mission(sources, MissionConfig()).trajectories) == 1
+        return
+    with pytest.raises(error, match="rename"):
+        run_mission(sources, MissionConfig(), watch=lambda _: pytest.fail("worked"))
+
+
+def test_two_recordings_of_one_name_are_refused(logs, tmp_path):
+    copy = tmp_path / logs[0].name
+    copy.write_bytes(logs[0].read_bytes())
+    with pytest.raises(SourceError, match="robot_1"):
+        run_mission([open_source(logs[0]), open_source(copy)], MissionConfig())
+
+
+def test_a_refusal_by_the_cloud_is_not_lost(logs, monkeypatch):
+    def refuse(_self, _packet):
+        raise PacketError("no room")
+
+    monkeypatch.setattr(mission.Cloud, "apply", refuse)
+    with pytest.raises(FcslamError, match=r"robot_1.*no room"):
+        run_mission([open_source(logs[0])], MissionConfig())

@@ -1,0 +1,286 @@
+"""A mission that goes on from its file is the mission of all recordings at once, byte for byte."""
+
+import os
+import shutil
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import fcslam
+from fcslam.cloud.edits import kind_of
+from fcslam.cloud.settings import CloudConfig, FleetConfig
+from fcslam.errors import EditError, SourceError
+from fcslam.mission.mission import MissionCloud
+from fcslam.mission.mission_file import edit_mission, mission_bytes, read_mission
+from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
+from fcslam.runs import open_run
+from fcslam.sources import write_carmen
+
+pytestmark = pytest.mark.slow
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(logs, tmp_path_factory):
+    """The run of three recordings at once."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    fcslam.map_recordings(logs, output=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def begun(logs, tmp_path_factory):
+    """The run of the first two."""
+    folder = tmp_path_factory.mktemp("begun") / "run"
+    fcslam.map_recordings(logs[:2], output=folder)
+    return folder
+
+
+def test_a_mission_goes_on_without_its_recordings(logs, whole, begun, tmp_path):
+    fcslam.map_recordings(logs[2:], output=tmp_path / "run", onto=begun)
+    assert contents(tmp_path / "run") == contents(whole)
+
+
+def test_a_mission_goes_on_more_than_once(logs, whole, tmp_path):
+    fcslam.map_recordings(logs[:1], output=tmp_path / "one")
+    fcslam.map_recordings(logs[1:2], output=tmp_path / "two", onto=tmp_path / "one" / "mission.fcslam")
+    fcslam.map_recordings(logs[2:], output=tmp_path / "three", onto=tmp_path / "two")
+    assert contents(tmp_path / "three") == contents(whole)
+
+
+@pytest.fixture
+def resumed(monkeypatch):
+    """Whether each mission went on from the state of the earlier one."""
+    answers = []
+
+    def resume(cloud, onto, first, original=MissionCloud.resume):
+        answers.append(original(cloud, onto, first))
+        return answers[-1]
+
+    monkeypatch.setattr(MissionCloud, "resume", resume)
+    return answers
+
+
+def copied(run, folder):
+    return Path(shutil.copytree(run, folder))
+
+
+def test_a_state_saves_work_and_changes_nothing(drawn, logs, begun, resumed, tmp_path):
+    hour_later = tmp_path / "later.clf"
+    write_carmen(hour_later, (replace(scan, stamp=scan.stamp + 3600.0) for scan in drawn.robots[2].scans()))
+    fcslam.map_recordings([*logs[:2], hour_later], output=tmp_path / "whole")
+    fcslam.map_recordings(hour_later, output=tmp_path / "from state", onto=begun)
+    bare = copied(begun, tmp_path / "bare")
+    (bare / "mission.state").unlink()
+    fcslam.map_recordings(hour_later, output=tmp_path / "from packets", onto=bare)
+    assert resumed[1:] == [True, False]
+    assert contents(tmp_path / "from state") == contents(tmp_path / "from packets") == contents(tmp_path / "whole")
+
+
+def test_a_mission_that_is_mapped_again_goes_on_from_its_state(begun, resumed, tmp_path):
+    fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
+    assert resumed == [True]
+    assert contents(tmp_path / "again") == contents(begun)
+
+
+@pytest.mark.parametrize("broken", [lambda state: state[:-1] + b"!", lambda state: state[:40], lambda _: b""])
+def test_a_state_that_somebody_changed_is_not_read(begun, resumed, tmp_path, broken):
+    run = copied(begun, tmp_path / "run")
+    state = run / "mission.state"
+    state.write_bytes(broken(state.read_bytes()))
+    fcslam.map_recordings([], output=tmp_path / "again", onto=run)
+    assert resumed == [False]
+    assert contents(tmp_path / "again") == contents(begun)
+
+
+def test_a_pipe_in_place_of_a_state_is_not_waited_for(begun, resumed, tmp_path):
+    run = copied(begun, tmp_path / "run")
+    (run / "mission.state").unlink()
+    os.mkfifo(run / "mission.state")
+    fcslam.map_recordings([], onto=run)
+    assert resumed == [False]
+
+
+def test_the_state_of_another_user_is_not_read(begun, resumed, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    fcslam.map_recordings([], onto=begun)
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
+    fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
+    assert resumed == [False, False]
+    assert not (tmp_path / "again" / "mission.state").exists()
+
+
+def test_a_state_counts_only_if_nothing_but_the_packets_changed(logs, begun, resumed, tmp_path):
+    first, second = (path.stem for path in logs[:2])
+    fcslam.map_recordings(logs[2:], onto=begun, vetoes=[Veto(first, second)])
+    fcslam.map_recordings(logs[2:], onto=begun, config=fcslam.MissionConfig(seed=1))
+    edited = copied(begun, tmp_path / "edited")
+    edit_mission(edited, [Veto(first, second)], "anna", 1.0)
+    fcslam.map_recordings(logs[2:], onto=edited)
+    assert resumed == [False, False, False]
+
+
+def test_a_state_does_not_count_for_packets_that_come_before_it(logs, whole, resumed, tmp_path):
+    """The three robots drive at the same time."""
+    fcslam.map_recordings(logs[1:], output=tmp_path / "later")
+    run = fcslam.map_recordings(logs[:1], onto=tmp_path / "later")
+    assert not any(resumed)
+    assert set(run.trajectories) == set(open_run(whole).trajectories)
+
+
+def test_a_state_that_makes_no_sense_is_left_out(begun, caplog):
+    saved = replace(read_mission(begun), state={"cloud": {"fleet": {}, "log": {}}, "traffic": []})
+    run = fcslam.map_recordings([], onto=saved)
+    assert "all packets take effect again" in caplog.text
+    assert run.pose_graph_g2o == open_run(begun).pose_graph_g2o
+
+
+def test_a_robot_that_comes_back_begins_a_new_session(logs, begun, tmp_path):
+    again = tmp_path / logs[0].name
+    shutil.copy(logs[2], again)
+    run = fcslam.map_recordings(again, onto=begun)
+    first, second = (path.stem for path in logs[:2])
+    assert list(run.trajectories) == [first, f"{first}+1", second]
+    assert len({trajectory.map_index for trajectory in run.trajectories.values()}) == 1
+
+
+def test_vetoes_stay_in_force(logs, tmp_path):
+    first, second = (path.stem for path in logs[:2])
+    fcslam.map_recordings(logs[:2], output=tmp_path / "apart", vetoes=[Veto(first, second)])
+    run = fcslam.map_recordings(logs[2:], onto=tmp_path / "apart")
+    between = [c for c in run.closures if {c.robot_i, c.robot_j} == {first, second}]
+    assert between
+    assert not any(c.status is fcslam.ClosureStatus.ACCEPTED for c in between)
+
+
+def test_the_settings_of_the_cloud_are_kept(logs, tmp_path):
+    fcslam.map_recordings(logs[:2], output=tmp_path / "alone", join_maps=False)
+    run = fcslam.map_recordings(logs[2:], onto=tmp_path / "alone")
+    assert len({trajectory.map_index for trajectory in run.trajectories.values()}) == 3
+
+
+def test_a_mission_file_survives_the_run_folder(begun, tmp_path):
+    open_run(begun).save(tmp_path / "copy")
+    assert (tmp_path / "copy" / "mission.fcslam").read_bytes() == (begun / "mission.fcslam").read_bytes()
+
+
+def test_what_is_no_mission_file_is_told_in_one_line(begun, tmp_path):
+    whole = (begun / "mission.fcslam").read_bytes()
+    with pytest.raises(SourceError, match=r"nowhere: no mission file; `fcslam map` writes one"):
+        read_mission(tmp_path / "nowhere")
+    for name, content in (("empty", b""), ("cut", whole[: len(whole) // 2]), ("text", b"hello\n" * 999)):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(SourceError, match=name):
+            read_mission(path)
+        assert path.read_bytes() == content
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut", "empty", "text"]
+
+
+def test_reading_is_the_inverse_of_writing(begun, tmp_path):
+    saved = read_mission(begun)
+    packets = sorted(saved.stored, key=lambda packet: packet.order)
+    path = tmp_path / "again"
+    path.write_bytes(mission_bytes(saved.config, saved.edits, packets, saved.refused, saved.tracks))
+    again = read_mission(path)
+    assert again.config == saved.config == CloudConfig()
+    assert [s.data for sent in again.packets.values() for s in sent] == [
+        s.data for sent in saved.packets.values() for s in sent
+    ]
+    assert again.tracks.keys() == saved.tracks.keys()
+    for name, track in saved.tracks.items():
+        assert again.tracks[name].stamps.tobytes() == track.stamps.tobytes()
+        assert again.tracks[name].T_keyscan_base.tobytes() == track.T_keyscan_base.tobytes()
+
+
+GOLDEN = Path(__file__).parent / "golden" / "mission_7.fcslam"
+
+
+def test_the_golden_mission_means_what_it_says():
+    mission = read_mission(GOLDEN)
+    assert {robot: len(sent) for robot, sent in mission.packets.items()} == {"anna": 24, "ben": 26}
+    assert [len(track.stamps) for track in mission.tracks.values()] == [19, 19]
+    assert mission.tracks["ben"].stamps[[0, -1]].tolist() == [1000.001, 1009.001]
+    assert [kind_of(edit.content) for edit in mission.edits] == ["veto", "cut", "region", "undo"]
+    assert {edit.author for edit in mission.edits} == {"boss"}
+    # A mission keeps the settings with which it began; the default was another one then.
+    assert mission.config == CloudConfig(fleet=FleetConfig(contradiction=0.3))
+    assert mission.refused == ()
+
+
+def test_a_mission_is_mapped_again_with_its_edits():
+    run = fcslam.map_recordings([], onto=GOLDEN)
+    assert set(run.trajectories) == {"anna", "ben"}
+    assert b"Room 1" in run.map_files["map_areas.geojson"]
+
+
+@pytest.mark.parametrize("version", [6, 8])
+def test_a_mission_file_of_another_version_is_refused(tmp_path, version):
+    other = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, other)
+    with closing(sqlite3.connect(other)) as connection:
+        connection.execute(f"PRAGMA user_version={version}")
+    with pytest.raises(SourceError, match=f"a file of version {version}; this fcslam reads version 7"):
+        read_mission(other)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.99])
+def test_a_truncated_mission_file_is_refused_and_stays_as_it_is(tmp_path, share):
+    whole = GOLDEN.read_bytes()
+    cut = tmp_path / "mission.fcslam"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    for read in (read_mission, lambda path: edit_mission(path, [Removal("ben")], "me", 0.0)):
+        with pytest.raises(SourceError) as refused:
+            read(cut)
+        assert "\n" not in str(refused.value)
+        assert "disk full" not in str(refused.value)
+    assert cut.read_bytes() == whole[: int(share * len(whole))]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Removal("zoe"), Removal("ben", 1), Veto("anna", "zoe"), Pin("anna", "ben", (1000.0, 5000.0)), Undo(1), Undo(9),
+        FloorLabel("zoe", "2"), FloorLabel("ben", "no floor"),
+        Cut("ben", 2.0, 1.0), MapRegion(RegionUse.ERASE, "", "ben", 1000.0, ((0.0, 0.0), (1.0, 0.0))),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_wrong_edit_leaves_the_file_as_it_was(tmp_path, wrong):
+    mission = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, mission)
+    with pytest.raises(EditError) as refused:
+        edit_mission(mission, [Removal("ben"), wrong], "me", 0.0)
+    assert "\n" not in str(refused.value)
+    assert mission.read_bytes() == GOLDEN.read_bytes()
+
+
+def test_no_closure_by_hand_is_made_between_floors_that_users_named(tmp_path):
+    mission = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, mission)
+    edit_mission(mission, [FloorLabel("ben", "2")], "me", 0.0)
+    made = ManualClosure("anna", 1000.0, "ben", 1000.0, (0.0, 0.0, 0.0), (0.1, 0.1))
+    with pytest.raises(EditError, match="different floors"):
+        edit_mission(mission, [made], "me", 0.0)
+    edit_mission(mission, [FloorLabel("anna", "2"), made], "me", 0.0)
+
+
+def test_two_people_who_edit_at_once_lose_nothing(tmp_path):
+    mission = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, mission)
+    with ThreadPoolExecutor(4) as people:
+        made = [
+            people.submit(edit_mission, mission, [Cut("anna", 1000.0, 1001.0 + k)], f"person{k}", 0.0) for k in range(8)
+        ]
+        numbers = sorted(edit.number for one in made for edit in one.result())
+    assert numbers == list(range(5, 13))
+    edits = read_mission(mission).edits
+    assert {edit.author for edit in edits[4:]} == {f"person{k}" for k in range(8)}
+    assert list(tmp_path.iterdir()) == [mission]

@@ -1,0 +1,286 @@
+"""Packets are stored once and unchanged, in the order of their arrival, in a file and on a PostgreSQL server."""
+
+import os
+import secrets
+import sqlite3
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
+from fcslam.errors import EditError, PacketConflictError, StoreError
+from fcslam.mission.mission_store import EDITS, FACTS, PACKETS, MissionStore, StoredPacket, check_mission
+from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, frozen
+from fcslam.service.shared.mission_tables import MissionTables
+from fcslam.service.shared.registry import Registry
+from fcslam.storage.database import SealedConnection, seal
+from fcslam.wire.messages import PacketKind
+
+NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))
+BATCHES = st.lists(st.lists(NUMBERS, max_size=8), max_size=12)
+
+
+def packet(robot="a", epoch=0, sequence=0, data=None) -> StoredPacket:
+    content = f"{robot} {epoch} {sequence}".encode() if data is None else data
+    return StoredPacket(robot, epoch, sequence, 0.5 * sequence, PacketKind.PLACE, Channel.CAMERA, content)
+
+
+class FilePlace:
+    """A mission in a file."""
+
+    def __init__(self, folder):
+        self._path = folder / "mission.sqlite"
+
+    def open(self):
+        return MissionStore(self._path)
+
+
+class ServerPlace:
+    """A mission on a PostgreSQL server."""
+
+    def __init__(self, server):
+        self._server = server
+        self._number = Registry(server, "tests", "tests").create(f"m{secrets.token_hex(8)}")
+
+    def open(self):
+        return MissionStore(MissionTables(self._server, self._number))
+
+
+@pytest.fixture(params=["file", "server"])
+def place(request, tmp_path):
+    """Each test of a store is one of both stores."""
+    return FilePlace(tmp_path) if request.param == "file" else ServerPlace(request.getfixturevalue("postgres"))
+
+
+@pytest.fixture
+def store(place):
+    store = place.open()
+    yield store
+    store.close()
+
+
+def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0, quality=0.25):
+    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta)), quality))
+
+
+def stored(store):
+    return [packet for _, packet in store.arrivals(0, 1000)]
+
+
+@pytest.mark.slow
+@given(batches=BATCHES)
+@pytest.mark.parametrize("kind", ["file", "server"])
+def test_packets_are_stored_once_in_the_order_of_their_arrival(kind, batches, tmp_path_factory, request):
+    is_file = kind == "file"
+    place = FilePlace(tmp_path_factory.mktemp("store")) if is_file else ServerPlace(request.getfixturevalue("postgres"))
+    store = place.open()
+    expected: dict[tuple[str, int, int], None] = {}
+    for batch in batches:
+        new = store.put([packet(*number) for number in batch], received_s=1.0)
+        assert new == len(set(batch) - expected.keys())
+        expected |= dict.fromkeys(batch)
+        assert stored(store) == [packet(*number) for number in expected]
+    arrivals = store.arrivals(0, 1000)
+    assert [arrival for arrival, _ in arrivals] == list(range(1, len(expected) + 1))
+    assert [e[:3] for e in store.envelopes()] == list(expected)
+    store.close()
+    again = place.open()
+    assert again.arrivals(0, 1000) == arrivals
+    again.close()
+
+
+def test_arrivals_can_be_read_in_pieces(store):
+    store.put([packet(sequence=k) for k in range(7)], 0.0)
+    assert [p.sequence for after in (0, 3, 6) for _, p in store.arrivals(after, 3)] == list(range(7))
+    assert [e.sequence for e in store.envelopes(until=4)] == [0, 1, 2, 3]
+
+
+def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_are_stored(store):
+    store.put([packet(sequence=1)], 0.0)
+    with pytest.raises(PacketConflictError, match="other content") as caught:
+        store.put([packet(sequence=0), packet(sequence=1, data=b"other"), packet(sequence=2)], 0.0)
+    assert caught.value.index == 1
+    assert [p.data for p in stored(store)] == [b"a 0 1", b"a 0 0"]
+
+
+def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
+    store.put([packet(sequence=0)], 0.0)
+    with pytest.raises(StoreError, match=r"full|null value"):
+        store.put([packet(sequence=1), replace(packet(sequence=2), data=None)], 0.0)  # type: ignore[arg-type]
+    assert [p.sequence for p in stored(store)] == [0]
+    store.put([packet(sequence=1)], 0.0)
+    assert [p.sequence for p in stored(store)] == [0, 1]
+
+
+def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
+    store = MissionStore(tmp_path / "mission.sqlite")
+    store.put([packet()], 0.0)
+    pages = store._database.value("PRAGMA page_count")
+    store._database.share(lambda database: database.execute(f"PRAGMA max_page_count={pages + 2}"))
+    with pytest.raises(StoreError, match="is the disk full"):
+        store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
+    assert stored(store) == [packet()]
+    store._database.share(lambda database: database.execute("PRAGMA max_page_count=100000"))
+    store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
+    assert len(stored(store)) == 9
+    store.close()
+
+
+def test_what_another_process_wrote_is_seen(store, place):
+    other = place.open()
+    other.put([packet()], 0.0)
+    other.refuse("a", 0, 0, "no good")
+    assert store.refusals("a") == [(0, 0, "no good")]
+    assert store.packet("a", 0, 0).refusal == "no good"
+    other.close()
+
+
+@pytest.mark.parametrize("reopened", [False, True])
+def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(place, reopened):
+    store = place.open()
+    told = []
+    for x in (0.0, 0.0, 1.0, 1.0, 0.0):
+        store.progress(5, [correction("a", x), correction("b", 3.0)])
+        if reopened:
+            store.close()
+            store = place.open()
+        versions = {robot: store.correction(robot, 0).correction.version for robot in "ab"}
+        told.append((x, versions["a"], versions["b"]))
+    assert [x for x, *_ in told] == [0.0, 0.0, 1.0, 1.0, 0.0]
+    a = [version for _, version, _ in told]
+    assert a[0] == a[1] < a[2] == a[3] < a[4]
+    assert len({b for *_, b in told}) == 1
+    assert np.array_equal(store.correction("a", 0).correction.T_map_odom, (0.0, 0.0, 0.0))
+    assert store.correction("a", 1) is None
+    assert store.applied() == 5
+    store.close()
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "theta"])
+def test_what_a_robot_believes_creeps_no_further_away_than_what_is_news(store, axis):
+    """Many steps, each too small for a report, are reported when their sum is large enough."""
+    limit = NEWS_RAD if axis == "theta" else NEWS_M
+    versions = []
+    for step in range(100):
+        truth = {"x": 3.0, axis: -0.3 * limit * step}
+        store.progress(step, [correction("a", **truth)])
+        told = store.correction("a", 0).correction
+        assert np.abs(told.T_map_odom - correction("a", **truth).correction.T_map_odom).max() < limit
+        versions.append(told.version)
+    assert 20 < len(set(versions)) < 35
+    assert versions == sorted(versions)
+
+
+def test_half_a_turn_to_the_left_is_half_a_turn_to_the_right(store):
+    store.put([], 0.0)
+    store.progress(1, [correction("a", 0.0, theta=np.pi)])
+    told = store.correction("a", 0).correction.version
+    store.progress(2, [correction("a", 0.0, theta=-np.pi)])
+    assert store.correction("a", 0).correction.version == told
+    store.progress(3, [correction("a", 0.0, theta=-np.pi + 2 * NEWS_RAD)])
+    assert store.correction("a", 0).correction.version > told
+
+
+def test_another_map_is_news_wherever_it_lies(store):
+    for map_index in (0, 1):
+        store.progress(1, [correction("a", 1.0, map_index=map_index)])
+        assert store.correction("a", 0).correction.map_index == map_index
+
+
+def test_edits_and_requests_are_kept_in_their_order(store):
+    contents = [Veto("a", "b"), Veto("a", "a", (1.5, 2.5)), Removal("b"), Removal("a", 3), Undo(3)]
+    edits = [store.edit(content, "boss", float(k)) for k, content in enumerate(contents)]
+    assert edits == [Edit(k + 1, "boss", float(k), content) for k, content in enumerate(contents)]
+    store.put([packet()], 0.0)
+    number = store.ask_to_finalize()
+    asked = store.finalization(number)
+    assert (asked.arrivals, asked.edits, asked.run) == (1, 5, None)
+    store.answer(number, "1")
+    assert store.finalization(number).run == "1"
+    assert store.edits() == edits
+    assert store.edits(3) == edits[3:]
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [(1, "before, by edit 2"), (2, "again"), (4, "there are 3")], ids=["twice", "an undo", "none"]
+)
+def test_what_cannot_be_undone_changes_nothing(store, number, told):
+    for content in (Veto("a", "b"), Undo(1), Removal("a")):
+        store.edit(content, "boss", 0.0)
+    with pytest.raises(EditError, match=told):
+        store.edit(Undo(number), "boss", 0.0)
+    assert len(store.edits()) == 3
+
+
+def test_an_export_is_the_mission_and_nothing_else_is(store, tmp_path):
+    store.put([packet(sequence=k) for k in (0, 1, 5)], 0.0)
+    store.export(tmp_path / "out.sqlite")
+    check_mission(tmp_path / "out.sqlite")
+    copy = MissionStore(tmp_path / "out.sqlite")
+    assert copy.arrivals(0, 10) == store.arrivals(0, 10)
+    copy.close()
+    with pytest.raises(StoreError):
+        store.export(tmp_path / "out.sqlite")
+
+
+def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypatch):
+    store.put([packet()], 0.0)
+    link = os.link
+
+    def meanwhile(*paths):
+        storing = threading.Thread(target=store.put, args=([packet(sequence=1)], 0.0), daemon=True)
+        storing.start()
+        storing.join(20.0)
+        assert not storing.is_alive()
+        link(*paths)
+
+    monkeypatch.setattr(os, "link", meanwhile)
+    store.export(tmp_path / "out.sqlite")
+    assert len(stored(store)) == 2
+    copy = MissionStore(tmp_path / "out.sqlite")
+    assert len(stored(copy)) == 1
+    copy.close()
+
+
+@pytest.mark.parametrize(
+    "harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config", "edit", "undo", "seal"]
+)
+def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
+    path = tmp_path / "out.sqlite"
+    store.put([packet(sequence=k, data=bytes(4000)) for k in range(20)], 0.0)
+    store.export(path)
+    content = path.read_bytes()
+    if harm == "text":
+        path.write_text("no database at all" * 100)
+    elif harm == "torn":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        connection = sqlite3.connect(path, factory=SealedConnection)
+        connection.create_function("seal", -1, seal)
+        changes = {"kind": {"kind": "rumour"}, "channel": {"channel": "smell"}, "none": {"kind": None}}
+        rows = {
+            "edit": (EDITS, (1, "boss", 0.0, "removal", '{"robot": 1}')),
+            "undo": (EDITS, (1, "boss", 0.0, "undo", '{"number": 1}')),
+            "config": (FACTS, ("config", '{"seed": "x"}')),
+        }
+        statements = {
+            "trigger": "CREATE TRIGGER t AFTER INSERT ON edits BEGIN DELETE FROM packets; END",
+            "view": "CREATE VIEW v AS SELECT 1",
+            "version": "PRAGMA user_version=99",
+            "seal": "UPDATE packets SET time = 1.0 WHERE sequence = 3",
+        }
+        if harm in changes:
+            connection.update(PACKETS, changes[harm], "sequence = 3", {})
+        elif harm in rows:
+            table, row = rows[harm]
+            connection.insert(table, [row])
+        else:
+            connection.execute(statements[harm])
+        connection.commit()
+        connection.close()
+    with pytest.raises(StoreError):
+        check_mission(path)

@@ -1,0 +1,47 @@
+"""A ROS network in memory: what is published arrives at once, in the thread that publishes."""
+
+from collections import defaultdict
+
+from fcslam.ros.network import Endpoint, Quality
+from fcslam.sources.bags.codec import MessageCodec
+
+
+class MemoryNetwork:
+    def __init__(self, others=(), ros1=False):
+        """``others``: publishers and subscriptions of somebody else."""
+        self.ros1 = ros1
+        self.others = list(others)
+        self.sent = defaultdict(list)
+        self.subscribed = {}
+        self.services = {}
+        self._own = []
+        self._subscribers = defaultdict(list)
+        self._codec = MessageCodec(self.ros1)
+
+    def endpoints(self):
+        return [*self.others, *self._own]
+
+    def subscribe(self, topic, kind, quality, deliver):
+        self._own.append(Endpoint(topic, kind, False, quality, True))
+        self.subscribed[topic] = quality
+        self._subscribers[topic].append(deliver)
+
+    def publisher(self, topic, kind, quality):
+        self._own.append(Endpoint(topic, kind, True, quality, True))
+        return lambda payload: self.sent[topic].append(self._codec.decode(payload, kind))
+
+    def serve(self, service, act):
+        self.services[service] = act
+
+    def close(self):
+        pass
+
+    def say(self, topic, kind, message):
+        """Publish as somebody else."""
+        for deliver in self._subscribers[topic]:
+            deliver(self._codec.encode(message, kind))
+
+
+def offered(topic, kind, reliable=True, latched=False):
+    """A publisher of somebody else."""
+    return Endpoint(topic, kind, True, Quality(reliable, latched))

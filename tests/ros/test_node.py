@@ -1,0 +1,434 @@
+"""A robot between a network in memory and its map: what it publishes, and what it says."""
+
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.bridges.memory_network import MemoryNetwork, offered
+from tests.bridges.ros_messages import CODEC, odometry, scan, transform
+
+import fcslam
+from fcslam.errors import NetworkError
+from fcslam.geometry import se2
+from fcslam.live.fleet_view import Teammate
+from fcslam.ros import node as node_module
+from fcslam.ros.network import Endpoint, Quality
+from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
+from fcslam.ros.outputs import POSE
+from fcslam.ros.parameters import NodeParameters
+from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
+from fcslam.runs.map_files import Occupancy, OccupancyMap, parse_map
+from fcslam.sources import BagOptions
+from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.transforms import in_space
+from tests import small_fleet
+from tests.live.same_thread import SameThread
+
+TOPICS = (("/robot1/scan", SCAN, False), ("/robot1/odom", ODOMETRY), ("/tf_static", TRANSFORMS, True, True))
+LOST_AT_A_RESTART = STEPS_BACK_FOR_RESTART - 1
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return list(small_fleet.draw(1, path_length_m=4.0).robots[0].scans())
+
+
+@pytest.fixture
+def network():
+    return MemoryNetwork([offered(*topic) for topic in TOPICS])
+
+
+@pytest.fixture
+def robot():
+    with fcslam.Robot("robot1", executor=SameThread()) as robot:
+        yield robot
+
+
+def start(network, robot, notify=lambda _: None, suggest_pose=None, change_floor=None, **parameters):
+    topics = await_sensors(network, "/robot1", BagOptions(), 0.0, 0.0)
+    return RobotNode(
+        network,
+        "/robot1",
+        topics,
+        BagOptions(),
+        robot,
+        NodeParameters(**parameters),
+        notify,
+        suggest_pose,
+        change_floor,
+    )
+
+
+def plays(network, scans):
+    laser = scans[0].laser
+    network.say("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser", laser.T_base_laser))
+    for record in scans:
+        network.say("/robot1/odom", ODOMETRY, odometry(record.stamp, record.T_odom_base, "robot1/odom"))
+        ranges = np.where(record.ranges_m >= laser.max_range_m, np.inf, record.ranges_m)
+        network.say("/robot1/scan", SCAN, scan(
+            record.stamp, ranges, "laser", laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m,
+        ))  # fmt: skip
+
+
+def run_until(node, count):
+    node.run(lambda scans, _: node.stop() if scans == count else None)
+
+
+def test_every_scan_gets_a_pose_and_the_map_is_published(network, robot, scans):
+    node = start(network, robot)
+    plays(network, scans)
+    run_until(node, len(scans))
+    node.publish_map()
+    assert [pose.header.stamp.sec for pose in network.sent["/robot1/pose"]] == [int(s.stamp) for s in scans]
+    (grid,) = network.sent["/robot1/map"]
+    expected = robot.map()
+    assert (grid.info.height, grid.info.width) == expected.cells.shape
+    assert set(grid.data) == {-1, 0, 100}
+    assert grid.header.frame_id == "map"
+    (path,) = network.sent["/robot1/path"]
+    assert path.poses[0].header.stamp.sec == int(scans[0].stamp)
+
+
+def test_map_to_odom_carries_the_frame_of_the_odometry(network, robot, scans):
+    node = start(network, robot)
+    plays(network, scans)
+    run_until(node, len(scans))
+    sent = [message.transforms[0] for message in network.sent["/tf"]]
+    assert {(t.header.frame_id, t.child_frame_id) for t in sent} <= {("map", "robot1/odom")}
+    stamps = [t.header.stamp.sec * 10**9 + t.header.stamp.nanosec for t in sent]
+    assert stamps == sorted(set(stamps))
+
+
+def test_the_finish_topic_ends_the_drive(network, robot):
+    node = start(network, robot)
+    thread = threading.Thread(target=node.run)
+    thread.start()
+    network.say(f"/robot1/{FINISH}", EMPTY, CODEC.make(EMPTY, structure_needs_at_least_one_member=0))
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def test_what_is_offered_reliably_is_asked_for_reliably(network, robot):
+    start(network, robot)
+    asked = network.subscribed
+    assert not asked["/robot1/scan"].reliable
+    assert asked["/robot1/odom"].reliable
+    assert asked["/tf_static"].latched
+
+
+def test_a_second_robot_of_one_name_is_refused(network, robot):
+    network.others.append(offered("/robot1/map", "nav_msgs/OccupancyGrid"))
+    with pytest.raises(NetworkError, match="another node publishes /robot1/map: a second robot of this name"):
+        start(network, robot)
+
+
+def test_a_simulated_clock_that_does_not_run_is_told_once_and_the_robot_maps(network, robot, scans):
+    said = []
+    node = start(network, robot, said.append, use_sim_time=True, topic_timeout=0.01)
+    plays(network, scans)
+    with running(node):
+        wait_for(lambda: said and node.scans == len(scans))
+        time.sleep(0.3)
+    assert len(said) == 1
+    assert "nobody publishes /clock, so map -> odom is published once for each scan; start the simulator" in said[0]
+
+
+def test_peers_that_get_nothing_are_told_once(network, robot):
+    said = []
+    node = start(network, robot, said.append)
+    network.others += [
+        Endpoint("/robot1/pose", "geometry_msgs/PoseWithCovarianceStamped", False, Quality(True, True)),
+        Endpoint("/robot1/map", "nav_msgs/GridCells", False, Quality(True)),
+    ]
+    for _ in range(2):
+        node.watch_network()
+    assert len(said) == 2
+    assert "/robot1/pose: a subscription asks for transient local messages, and the publisher is volatile" in said[0]
+    assert "/robot1/map: another node takes it as nav_msgs/GridCells" in said[1]
+
+
+def test_a_robot_of_the_same_name_that_comes_later_is_told_once(network, robot):
+    said = []
+    node = start(network, robot, said.append)
+    network.others.append(offered("/robot1/map", "nav_msgs/OccupancyGrid", latched=True))
+    for _ in range(2):
+        node.watch_network()
+    assert said == ["another node publishes /robot1/map now, too; two robots must not have one name"]
+
+
+def test_missing_topics_end_the_wait():
+    with pytest.raises(NetworkError, match="nobody publishes anything"):
+        await_sensors(MemoryNetwork(), "/robot1", BagOptions(), 0.0, 0.0)
+
+
+@contextmanager
+def running(node):
+    """The drive in a thread of its own."""
+    thread = threading.Thread(target=node.run)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        node.stop()
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def wait_for(condition):
+    end = time.monotonic() + 20.0
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert condition()
+
+
+def save(network, name):
+    network.say(f"/robot1/{SAVE_MAP}", STRING, CODEC.make(STRING, data=name))
+
+
+def saved_map(folder, name):
+    return parse_map(name, *((folder / f"{name}.{kind}").read_bytes() for kind in ("pgm", "yaml")))
+
+
+def test_a_map_is_saved_for_map_server(network, robot, scans, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    node = start(network, robot, said.append)
+    plays(network, scans)
+    with running(node):
+        wait_for(lambda: node.scans == len(scans))
+        save(network, "office")
+        wait_for(lambda: f"map saved: {tmp_path / 'office.yaml'}" in said)
+        answer = network.services[f"/robot1/{SAVE_MAP}"]().result(20.0)
+    assert answer == (True, f"map saved: {tmp_path / 'robot1.yaml'}")
+    for name in ("office", "robot1"):
+        assert np.array_equal(saved_map(tmp_path, name).cells, robot.map().cells)
+
+
+@pytest.mark.parametrize("name", ["../office", "/etc/office", "a b", ".hidden"])
+def test_nobody_on_the_network_chooses_a_folder(network, robot, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    with running(start(network, robot, said.append)):
+        save(network, name)
+        wait_for(lambda: said)
+    assert list(tmp_path.iterdir()) == []
+    assert "is not a name; give letters" in said[0]
+
+
+def test_the_finish_service_ends_the_drive(network, robot):
+    with running(start(network, robot)) as thread:
+        assert network.services[f"/robot1/{FINISH}"]().result(10.0) == (True, "the drive ends")
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def test_a_flood_of_commands_is_refused_and_none_waits_for_ever(network, robot):
+    node = start(network, robot)
+    asked = [network.services[f"/robot1/{FINISH}"]() for _ in range(100)]
+    assert asked[-1].result(0.0) == (False, "8 commands wait already; ask again later")
+    node.run()
+    assert [future.result(10.0).success for future in asked[:8]] == [True] + 7 * [False]
+
+
+def test_an_initial_pose_is_refused_with_the_reason(network, robot):
+    said = []
+    start(network, robot, said.append)
+    for _ in range(2):
+        network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
+    assert said == ["an initial pose is ignored: the robot maps, and its first scan is the origin of the map"]
+
+
+def test_a_floor_begins_a_session_on_it(network, robot, scans):
+    said = []
+    start(network, robot, said.append)
+    network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data="2"))
+    assert said == ["a floor is ignored: the robot localises in one finished map"]
+    said.clear()
+    network = MemoryNetwork([offered(*topic) for topic in TOPICS])
+    node = start(network, robot, said.append, None, robot.change_floor)
+    for floor in ("2", "not a floor"):
+        network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data=floor))
+    assert said == ["a floor is refused: floor 'not a floor' is not 1 to 16 of A-Z a-z 0-9 . _ + -"]
+    plays(network, scans)
+    run_until(node, len(scans))
+    robot.finish()
+    assert robot.trajectory().floor == "2"
+
+
+def given_pose(x, y, theta, frame="map"):
+    pose = CODEC.pose(in_space(np.array((x, y, theta))))
+    posed = CODEC.make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    return CODEC.make(POSE, header=CODEC.header(0, frame), pose=posed)
+
+
+@pytest.fixture(scope="module")
+def own_map(scans):
+    with fcslam.Robot("robot1", executor=SameThread()) as robot:
+        for scan in scans:
+            robot.add(scan)
+        robot.finish()
+        return robot.map()
+
+
+def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(network, scans, own_map):
+    said = []
+    with fcslam.LocalizedRobot("robot1", own_map, executor=SameThread()) as robot:
+        node = start(network, robot, said.append, suggest_pose=robot.suggest_pose)
+        node.publish_map()
+        (grid,) = network.sent["/robot1/map"]
+        assert (grid.info.height, grid.info.width) == own_map.cells.shape
+        plays(network, scans[:10])
+        run_until(node, 10)
+        assert not network.sent["/tf"]
+        assert not network.sent["/robot1/pose"]
+        node._diagnose()
+        assert "not localised for" in network.sent["/diagnostics"][-1].status[0].message
+        x, y, theta = se2.between(scans[0].T_odom_base, scans[9].T_odom_base)  # the map begins at the first scan
+        network.say(f"/robot1/{INITIAL_POSE}", POSE, given_pose(x, y, theta))
+        assert said[-1].endswith("it counts once the walls confirm it")
+        node = start(network, robot, said.append, suggest_pose=robot.suggest_pose)
+        plays(network, scans[10:20])
+        run_until(node, 10)
+        assert len(network.sent["/robot1/pose"]) >= 10
+        node._diagnose()
+        assert network.sent["/diagnostics"][-1].status[0].message.startswith("localised for")
+        node.publish_map()
+        assert len(network.sent["/robot1/map"]) <= 2, "once for each start"
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (given_pose(0.0, 0.0, 0.0, "odom"), "it is in frame 'odom'; give it in 'map'"),
+        (given_pose(1e300, 0.0, 0.0), "is outside of the map"),
+        (given_pose(np.nan, 0.0, 0.0), "the translation is not finite"),
+    ],
+)
+def test_an_initial_pose_that_cannot_be_used_is_refused(network, own_map, message, reason):
+    said = []
+    with fcslam.LocalizedRobot("robot1", own_map, executor=SameThread()) as robot:
+        start(network, robot, said.append, suggest_pose=robot.suggest_pose)
+        network.say(f"/robot1/{INITIAL_POSE}", POSE, message)
+        network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
+    assert reason in said[0]
+    assert "no message of this type" in said[1]
+
+
+def test_silence_is_told_once_and_the_robot_goes_on(network, robot, scans, monkeypatch):
+    monkeypatch.setattr(node_module, "_SILENCE_S", 0.3)
+    said = []
+    node = start(network, robot, said.append)
+    plays(network, scans[:10])
+    later = threading.Timer(1.5, plays, (network, scans[10:20]))
+    later.start()
+    run_until(node, 20)
+    later.join()
+    assert len(said) == 2
+    assert said[0].startswith("no scan for")
+    assert said[1].startswith("scans arrive again after")
+    assert robot.status().scans == 20
+
+
+def test_a_bag_in_a_loop_is_told_once_and_mapped(network, robot, scans):
+    said = []
+    node = start(network, robot, said.append)
+    for _ in range(4):
+        plays(network, scans)
+    run_until(node, 4 * len(scans) - 3 * LOST_AT_A_RESTART)
+    node.publish_map()
+    assert len(said) == 1
+    assert "as when a bag is played again; the robot goes on from there" in said[0]
+    assert network.sent["/robot1/map"]
+
+
+def test_a_clock_that_jumps_ahead_is_no_event(network, robot, scans):
+    said = []
+    node = start(network, robot, said.append)
+    plays(network, [*scans[:10], *(replace(scan, stamp=scan.stamp + 1e6) for scan in scans[10:])])
+    run_until(node, len(scans))
+    assert said == []
+
+
+def test_messages_that_come_too_fast_are_counted(network, robot, scans, monkeypatch):
+    monkeypatch.setattr(node_module, "_LONGEST_INBOX", 5)
+    said = []
+    start(network, robot, said.append)
+    plays(network, scans[:10])
+    assert said == ["messages come faster than this computer can map; some are lost"]
+
+
+class FollowedFleet:
+    """A fleet as the service tells of it, without the service."""
+
+    def __init__(self):
+        self.map_index, self.news = 0, ["map 0 holds robot1, r-2; joined: r-2"]
+
+    def robots(self):
+        return [
+            Teammate("robot1", 0, "", np.zeros(3), 0.2),
+            Teammate("r-2", 0, "", np.array([1.0, 2.0, 0.5]), 1.5),
+            Teammate("3", 1, "up", np.zeros(3), 0.0),
+        ]
+
+    def separations(self):
+        return (((0, 1), "no two of their places look alike"),)
+
+
+class FleetRobot:
+    """A robot whose joint map is more than its own."""
+
+    name = "robot1"
+
+    def __init__(self, robot, joint):
+        self._robot, self.joint, self.fleet = robot, joint, FollowedFleet()
+
+    def joint_map(self):
+        return self.joint
+
+    def __getattr__(self, name):
+        return getattr(self._robot, name)
+
+
+def test_with_a_fleet_map_is_the_joint_map_and_own_map_what_the_robot_saw(network, robot, scans):
+    cells = np.zeros((128, 192), np.uint8)
+    cells[5:120, 7:150] = Occupancy.FREE
+    followed = FleetRobot(robot, OccupancyMap(cells, 0.05, (-3.2, -6.4)))
+    node = start(network, followed)
+    plays(network, scans[:10])
+    run_until(node, 10)
+    node.publish_map()
+    (grid,), (own,) = network.sent["/robot1/map"], network.sent["/robot1/own_map"]
+    assert (grid.info.height, grid.info.width) == cells.shape
+    assert (own.info.height, own.info.width) == robot.map().cells.shape
+    changed = cells.copy()
+    changed[20, 30] = Occupancy.OCCUPIED
+    followed.joint = OccupancyMap(changed, 0.05, (-3.2, -6.4))
+    node.publish_map()
+    assert len(network.sent["/robot1/map"]) == 1
+    (update,) = network.sent["/robot1/map_updates"]
+    assert (update.x, update.y, update.width, update.height, list(update.data)) == (30, 20, 1, 1, [100])
+    followed.joint = None  # the robot was taken out: its own map goes on
+    node.publish_map()
+    assert network.sent["/robot1/map"][-1].info.width == own.info.width
+
+
+def test_poses_and_state_of_the_fleet_are_published_and_each_change_once(network, robot):
+    followed = FleetRobot(robot, None)
+    node = start(network, followed)
+    with running(node):
+        wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 3)
+    poses = network.sent["/robot1/fleet/poses"][0]
+    assert poses.header.frame_id == "map"
+    assert [(pose.position.x, pose.position.y) for pose in poses.poses] == [(0.0, 0.0), (1.0, 2.0)]
+    mate = network.sent["/robot1/fleet/r_2/pose"][0]
+    now, then = (one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in (poses, mate))
+    assert now - then == pytest.approx(1.5, abs=1e-5)
+    status = {one.name: one for one in network.sent["/robot1/fleet/status"][0].status}
+    values = {pair.key: pair.value for pair in status["robot r-2"].values}
+    assert (values["map"], values["age_s"], values["x"]) == ("0", "1.50", "1.0000")
+    assert status["maps 0 and 1"].message == "no two of their places look alike"
+    events = [one.status[0] for one in network.sent["/diagnostics"] if one.status[0].name.endswith("fleet")]
+    assert [event.message for event in events] == followed.fleet.news

@@ -1,0 +1,166 @@
+"""A recording of a network in memory is read as a bag; what is missing on a computer is said in one line."""
+
+import resource
+import sys
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from tests.bridges.memory_network import MemoryNetwork, offered
+from tests.bridges.ros_messages import multi_echo, odometry, scan, transform
+
+from fcslam.cli import main
+from fcslam.errors import NetworkError, OutputError
+from fcslam.records import LaserScan
+from fcslam.ros.node import await_sensors
+from fcslam.ros.record import _Inbox, record
+from fcslam.ros.ros1 import INSTALL as INSTALL_ROS1
+from fcslam.ros.ros1 import Ros1Network
+from fcslam.ros.ros2 import INSTALL as INSTALL_ROS2
+from fcslam.ros.ros2 import Ros2Network
+from fcslam.sources import BagOptions, open_source
+from fcslam.sources.bags.codec import MULTI_ECHO_SCAN, ODOMETRY, OLD_TRANSFORMS, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.container import BagFile
+from fcslam.sources.bags.transforms import in_space
+
+RANGES = [5.0] * 180
+
+
+def test_a_recording_is_a_bag(tmp_path):
+    network = MemoryNetwork([offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)])
+    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
+    stop, said = threading.Event(), []
+    output = tmp_path / "day.mcap"
+    thread = threading.Thread(target=lambda: said.append(record(network, topics, output, stop, said.append)))
+    thread.start()
+    while "/clock" not in network.subscribed:
+        stop.wait(0.01)
+    network.say("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser"))
+    for stamp in range(1, 9):
+        network.say("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0)))
+        network.say("/scan", SCAN, scan(stamp, RANGES))
+    stop.set()
+    thread.join(10.0)
+    assert said == [{"/tf_static": 1, "/odom": 8, "/scan": 8}]
+    survey = open_source(output).survey()
+    assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
+
+
+def recorded(network, output, messages):
+    """Record these messages; returns what is said, and the error if there is one."""
+    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
+    stop, said = threading.Event(), []
+
+    def write():
+        try:
+            record(network, topics, output, stop, said.append)
+        except OutputError as error:
+            said.append(str(error))
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    while "/clock" not in network.subscribed:
+        stop.wait(0.01)
+    for topic, kind, message in messages:
+        network.say(topic, kind, message)
+    stop.set()
+    thread.join(20.0)
+    return said
+
+
+@contextmanager
+def largest_file(size_bytes):
+    """Writing fails beyond this size, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_recording_of_several_echoes_is_read_by_the_first(tmp_path):
+    network = MemoryNetwork([offered("/echoes", MULTI_ECHO_SCAN), offered("/odom", ODOMETRY)])
+    messages = []
+    for stamp in range(1, 9):
+        messages.append(("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))))
+        messages.append(("/echoes", MULTI_ECHO_SCAN, multi_echo(stamp, RANGES)))
+    assert recorded(network, tmp_path / "day.mcap", messages) == []
+    source = open_source(tmp_path / "day.mcap", BagOptions(laser_poses=((0.0, 0.0, 0.0),)))
+    scans = [record for record in source.records() if isinstance(record, LaserScan)]
+    np.testing.assert_array_equal([scan.ranges_m for scan in scans], [RANGES] * 8)
+
+
+def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):
+    network = MemoryNetwork([offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)])
+    messages = [("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser"))]
+    for stamp in range(1, 400):
+        messages.append(("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))))
+        messages.append(("/scan", SCAN, scan(stamp, [5.0] * 3000, increment=0.001)))
+    part = tmp_path / "day.part.mcap"
+    with largest_file(3_500_000):
+        (error,) = recorded(network, tmp_path / "day.mcap", messages)
+    assert f"what was recorded before is in {part}; free some space" in error
+    assert list(tmp_path.iterdir()) == [part]
+    assert 200 < open_source(part).survey().scan_count < 399
+
+
+def test_a_bag_of_early_ros_1_on_a_full_disk_is_kept_with_its_index(tmp_path):
+    network = MemoryNetwork([offered("/scan", SCAN), offered("/tf", OLD_TRANSFORMS)], ros1=True)
+    codec = MessageCodec(ros1=True)
+    message = codec.transforms(codec.header(10**9, "odom"), "base_link", in_space(np.zeros(3)))
+    part = tmp_path / "day.part.bag"
+    part.write_bytes(b"of yesterday")
+    with largest_file(1_800_000):
+        (error,) = recorded(network, tmp_path / "day.bag", 15_000 * [("/tf", OLD_TRANSFORMS, message)])
+    assert f"is in {tmp_path / 'day.part-2.bag'}; " in error
+    ((topic, kind, count),) = BagFile(tmp_path / "day.part-2.bag").topics
+    assert (topic, kind) == ("/tf", TRANSFORMS)
+    assert 5000 < count < 15_000
+
+
+def test_messages_that_the_disk_cannot_take_are_counted(monkeypatch):
+    monkeypatch.setattr("fcslam.ros.record.LARGEST_INBOX_BYTES", 250)
+    inbox = _Inbox()
+    for number in range(4):
+        inbox.put("/image", number, bytes(100))
+    assert inbox.lost == 2
+    assert inbox.get(0.0)[1] == 0
+    inbox.put("/image", 4, bytes(100))
+    assert [inbox.get(0.0)[1] for _ in range(2)] == [1, 4]
+    assert (inbox.lost, inbox.is_empty) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("network", "module", "remedy"),
+    [
+        (lambda: Ros2Network(0, {}), "cyclonedds", INSTALL_ROS2),
+        (Ros1Network, "rosgraph", INSTALL_ROS1),
+    ],
+)
+def test_a_missing_middleware_is_told_with_the_command_that_installs_it(network, module, remedy, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(NetworkError, match="install it: ") as caught:
+        network()
+    assert str(caught.value).endswith(remedy)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["record", "robot.bag", "-o", "day.mcap"], "robot.bag: is not an address of a live robot"),
+        (["record", "ros2:/a", "-o", "day.bag"], "a recording of ros2 is a .mcap file"),
+        (["record", "ros2:/a", "-o", "nowhere/day.mcap"], "there is no folder nowhere"),
+        (["robot", "ros2:a b"], "'a b' is not a namespace"),
+        (["robot", "ros2:/a", "--domain", "999"], "'999' is not a domain of ROS 2"),
+        (["robot", "log.clf"], "a recording needs --server and --state"),
+    ],
+)
+def test_wrong_arguments_are_one_line(words, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line

@@ -1,0 +1,452 @@
+"""Messages of a live robot become the records of a bag."""
+
+import numpy as np
+import pytest
+from tests.bridges.ros_messages import (
+    CODEC,
+    KINDS,
+    LASER_POSE,
+    camera_info,
+    encoded,
+    header,
+    image,
+    multi_echo,
+    odometry,
+    scan,
+    transform,
+)
+
+from fcslam.errors import NetworkError
+from fcslam.records import CameraImage
+from fcslam.ros import sensors
+from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
+from fcslam.ros.topics import SensorTopics
+from fcslam.sources import BagOptions
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
+from tests.sources.clouds import PERIOD_S, VELODYNE, at_rest, cloud, depth_image, plan_ranges, rotation, spinning
+
+RANGES = np.full(180, 5.0)
+
+
+class Robot:
+    """Feeds messages to sensors and keeps what comes out."""
+
+    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), **options):
+        self.said = []
+        self.kinds = kinds
+        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info)
+        self.sensors = LiveSensors(topics, "", BagOptions(**options), False, self.hears_of)
+        self.records = []
+        self.now_s = 0.0
+
+    def hears_of(self, line):
+        if line not in self.said:
+            self.said.append(line)
+
+    def hears(self, topic, message):
+        payload = message if isinstance(message, bytes) else encoded(self.kinds[topic], message)
+        self.records += self.sensors.add(topic, payload, self.now_s, 1)
+        return self
+
+    def drives(self, stamps, offset=0.0):
+        for stamp in stamps:
+            self.hears("/odom", odometry(stamp + offset, (stamp, 0.0, 0.0)))
+            self.hears("/scan", scan(stamp + offset, RANGES))
+        return self
+
+    def waits(self, until_s):
+        self.now_s = until_s
+        self.records += self.sensors.wait(until_s)
+
+    @property
+    def stamps(self):
+        return [record.stamp for record in self.records]
+
+
+@pytest.fixture
+def robot():
+    return Robot().hears("/tf_static", transform(0.0, "base_link", "laser"))
+
+
+def test_no_scan_is_lost_while_the_mounting_is_not_known():
+    robot = Robot().drives(np.arange(1.0, 9.0))
+    assert robot.records == []
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    assert robot.records[0].laser.T_base_laser == pytest.approx(LASER_POSE)
+    assert robot.records[3].T_odom_base == pytest.approx([4.0, 0.0, 0.0])
+    assert (robot.sensors.odom_frame, robot.sensors.base_frame) == ("odom", "base_link")
+
+
+def test_a_scan_waits_for_its_odometry(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", scan(6.5, RANGES))
+    assert robot.stamps[-1] == 6.0
+    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
+    assert robot.stamps[-1] == 6.5
+    assert robot.records[-1].T_odom_base[0] == pytest.approx(6.5)
+
+
+def test_a_scan_of_a_spinning_scanner_waits_for_the_odometry_of_its_last_beam(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
+    robot.hears("/scan", scan(6.9, RANGES, beam_s=0.2 / 179))
+    assert robot.stamps[-1] == 6.0
+    robot.hears("/odom", odometry(7.2, (7.2, 0.0, 0.0)))
+    assert robot.stamps[-1] == 6.9
+    sweep = robot.records[-1].sweep
+    assert (sweep.first_s, sweep.last_s) == pytest.approx((0.0, 0.2))
+    assert sweep.displacement(0.2) == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
+
+
+def test_odometry_that_stops_holds_no_spinning_scan_for_longer_than_the_next_one(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
+    robot.hears("/scan", scan(6.9, RANGES, beam_s=0.2 / 179))
+    robot.hears("/scan", scan(7.1, RANGES, beam_s=0.2 / 179))
+    assert robot.stamps[-1] == 6.9
+    assert robot.records[-1].sweep.displacement(0.2) == pytest.approx([0.2, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_robot_without_odometry_is_mapped_after_some_seconds():
+    robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/scan", scan(1.0, RANGES))
+    robot.waits(0.0)
+    assert robot.records == []
+    robot.waits(PATIENCE_S + 1.0)
+    assert "no odometry" in robot.said[0]
+    robot.hears("/scan", scan(2.0, RANGES))
+    assert robot.stamps == [1.0, 2.0]
+    assert all(np.isnan(record.T_odom_base).all() for record in robot.records)
+    assert robot.sensors.base_frame == "base_link"
+
+
+def test_odometry_may_be_left_out():
+    robot = Robot(odom_topic="none").hears("/tf_static", transform(0.0, "base_link", "laser"))
+    for stamp in range(SCANS_FOR_RIG):
+        robot.hears("/scan", scan(float(stamp + 1), RANGES))
+    assert len(robot.records) == SCANS_FOR_RIG
+    assert np.isnan(robot.records[0].T_odom_base).all()
+
+
+def test_a_scan_whose_odometry_does_not_come_gets_the_nearest(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", scan(6.5, RANGES))
+    robot.hears("/scan", scan(8.5, RANGES))
+    robot.waits(0.5 * ODOMETRY_PATIENCE_S)
+    assert robot.stamps[-1] == 6.0
+    robot.waits(1.1 * ODOMETRY_PATIENCE_S)
+    assert robot.stamps[-1] == 6.5
+    assert robot.records[-1].T_odom_base[0] == pytest.approx(6.0)
+    assert len(robot.said) == 1
+    assert "no odometry within 1 s" in robot.said[0]
+
+
+def test_odometry_from_tf():
+    robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "robot/base", "laser"))
+    for stamp in np.arange(1.0, 8.0):
+        robot.hears("/tf", transform(stamp, "map", "robot/odom", (9.0, 9.0, 0.0)))
+        robot.hears("/tf", transform(stamp, "robot/odom", "robot/base", (stamp, 0.0, 0.0)))
+        robot.hears("/scan", scan(stamp, RANGES))
+    assert robot.records[-1].T_odom_base == pytest.approx([7.0, 0.0, 0.0])
+    assert robot.sensors.odom_frame == "robot/odom"
+
+
+def test_the_odometry_in_tf_is_that_of_the_laser():
+    robot = Robot(odometry=None)
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/tf", transform(stamp, "camera_odom_frame", "camera_pose_frame", (9.0, 9.0, 0.0)))
+        robot.hears("/tf", transform(stamp, "odom", "base_link", (stamp, 0.0, 0.0)))
+        robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+        robot.hears("/scan", scan(stamp, RANGES))
+    assert [record.T_odom_base[0] for record in robot.records] == list(np.arange(1.0, 9.0))
+    assert (robot.sensors.odom_frame, robot.sensors.base_frame) == ("odom", "base_link")
+
+
+def test_the_odometry_in_tf_may_be_named():
+    robot = Robot(odometry=None, odom_frame="world").hears("/tf_static", transform(0.0, "base_link", "laser"))
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/tf", transform(stamp, "world", "base_link", (stamp, 0.0, 0.0)))
+        robot.hears("/scan", scan(stamp, RANGES))
+    assert robot.records[3].T_odom_base[0] == 4.0
+
+
+def test_scans_of_another_frame_on_the_topic_are_left_out_and_said(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", scan(6.5, RANGES, frame="rear"))
+    robot.drives(np.arange(7.0, 9.0))
+    assert 6.5 not in robot.stamps
+    assert "/scan has scans of the frames 'laser' and 'rear'" in robot.said[0]
+
+
+def test_a_bag_that_is_played_again_goes_on(robot):
+    robot.drives(np.arange(100.0, 110.0))
+    robot.drives(np.arange(10.0, 20.0))
+    assert robot.stamps[-5:] == list(np.arange(15.0, 20.0))
+    assert len(robot.said) == 1
+    assert "stepped back by 97.0 s" in robot.said[0]
+    assert robot.sensors.restarts == 1
+
+
+def test_one_scan_far_back_in_time_is_left_out(robot):
+    robot.drives([*np.arange(100.0, 110.0), 50.0, 110.0])
+    assert robot.stamps == list(np.arange(100.0, 111.0))
+    assert robot.said == []
+
+
+def test_damaged_messages_are_told_once(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", b"no message").hears("/scan", b"nor this").drives([7.0])
+    assert robot.stamps[-1] == 7.0
+    assert len(robot.said) == 1
+    robot.hears("/scan", scan(8.0, RANGES, increment=0.0))
+    assert "angle_increment is 0; correct the driver" in robot.said[1]
+
+
+def test_a_missing_mounting_says_who_could_publish_it_and_the_robot_waits():
+    robot = Robot().drives(np.arange(1.0, 9.0))
+    robot.waits(PATIENCE_S + 1.0)
+    (line,) = robot.said
+    assert "no transform from 'base_link' to 'laser'" in line
+    assert "start robot_state_publisher" in line
+    robot.drives(np.arange(9.0, 300.0)).hears("/tf_static", transform(0.0, "base_link", "laser"))
+    assert robot.stamps == list(np.arange(1.0, 300.0))
+    assert robot.said == [line]
+
+
+def test_a_mounting_on_the_command_line_needs_no_tf():
+    robot = Robot(laser_poses=((0.1, 0.0, 0.0),)).drives(np.arange(1.0, 1.0 + SCANS_FOR_RIG))
+    assert len(robot.records) == SCANS_FOR_RIG
+
+
+def test_a_camera_whose_clock_is_ahead_delays_no_scan_and_is_said_once():
+    kinds = {**KINDS, "/camera/image_raw": IMAGE, "/camera/camera_info": CAMERA_INFO}
+    robot = Robot(kinds=kinds, camera="/camera/image_raw", info="/camera/camera_info")
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "camera")).hears("/camera/camera_info", camera_info(0.0))
+    for stamp in np.arange(1.0, 20.0):
+        robot.now_s = stamp
+        robot.drives([stamp])
+        assert robot.records == [] or robot.stamps[-1] == stamp
+        robot.hears("/camera/image_raw", image(stamp + 3.0))
+    assert sum(isinstance(record, CameraImage) for record in robot.records) > 10
+    (line,) = [line for line in robot.said if "clock" in line]
+    assert "the clock of /camera/image_raw is about 2.0 s ahead" in line
+
+
+def test_of_several_echoes_the_first_counts():
+    robot = Robot(kinds={**KINDS, "/scan": MULTI_ECHO_SCAN}, laser_poses=((0.1, 0.0, 0.0),))
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0))).hears("/scan", multi_echo(stamp, [5.0] * 179 + [0.0]))
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    np.testing.assert_array_equal(robot.records[0].ranges_m, [5.0] * 179 + [np.nan])
+
+
+def test_odometry_without_a_frame_is_odometry(robot):
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0), frame="")).hears("/scan", scan(stamp, RANGES))
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    assert robot.sensors.odom_frame == "odom"
+
+
+def test_silence_of_the_odometry_is_told():
+    robot = Robot(laser_poses=((0.1, 0.0, 0.0),))
+    robot.hears("/scan", scan(1.0, RANGES))
+    robot.waits(PATIENCE_S + 1.0)
+    assert "waits for odometry: /odom is silent" in robot.said[0]
+    robot.drives([2.0, 3.0])
+    assert robot.stamps == [1.0, 2.0, 3.0]
+
+
+def test_silence_of_a_laser_is_told(robot):
+    for second in range(3):
+        robot.waits(PATIENCE_S + second)
+    assert robot.said[0] == "waits for scans: none that can be read arrived on /scan within 5 s"
+    robot.drives([1.0])
+    assert robot.stamps == [1.0]
+
+
+def two_lasers(**options):
+    robot = Robot(kinds={**KINDS, "/rear": KINDS["/scan"]}, scans=("/scan", "/rear"), **options)
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "rear", (-0.3, 0.0, 3.0)))
+    return robot
+
+
+def test_the_scans_of_two_lasers_come_in_the_order_of_their_stamps():
+    robot = two_lasers()
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
+        robot.hears("/rear", scan(stamp - 0.25, RANGES, "rear"))
+        robot.hears("/scan", scan(stamp - 0.5, RANGES))
+    assert robot.stamps == sorted(robot.stamps)
+    assert len(robot.records) >= 14
+    assert [record.laser.T_base_laser[0] for record in robot.records[:2]] == pytest.approx([LASER_POSE[0], -0.3])
+
+
+def late_by(robot, laser_stops_s, until_s):
+    """How late each record of a drive comes, if the rear laser stops at a time."""
+    late = []
+    for step in range(1, int(10 * until_s)):
+        robot.now_s = now_s = 0.1 * step
+        before = len(robot.records)
+        robot.hears("/odom", odometry(now_s, (now_s, 0.0, 0.0)))
+        robot.hears("/scan", scan(now_s - 0.02, RANGES))
+        if now_s < laser_stops_s:
+            robot.hears("/rear", scan(now_s - 0.01, RANGES, "rear"))
+        late += [(now_s, now_s - record.stamp) for record in robot.records[before:]]
+    return late
+
+
+def test_a_laser_that_stops_does_not_delay_the_other():
+    robot = two_lasers()
+    late = late_by(robot, laser_stops_s=5.0, until_s=15.0)
+    assert max(delay for now_s, delay in late if 1.0 < now_s < 5.0) < 0.15
+    assert max(delay for now_s, delay in late if now_s > 6.0) < 0.15
+    assert robot.said == ["/rear is silent; the robot goes on with its other lasers"]
+    assert robot.stamps == sorted(robot.stamps)
+
+
+def test_a_laser_that_starts_again_is_merged_again():
+    robot = two_lasers()
+    late_by(robot, laser_stops_s=2.0, until_s=4.0)
+    for stamp in np.arange(5.0, 9.0, 0.1):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
+        robot.hears("/rear", scan(stamp - 0.01, RANGES, "rear"))
+        robot.hears("/scan", scan(stamp - 0.02, RANGES))
+    again = [record for record in robot.records if record.stamp > 5.2]
+    assert [record.stamp for record in again] == sorted(record.stamp for record in again)
+    assert sum(record.laser.T_base_laser[0] == pytest.approx(-0.3) for record in again) > 30
+
+
+def test_two_lasers_of_one_frame_are_refused():
+    robot = two_lasers()
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/scan", scan(stamp, RANGES)).hears("/rear", scan(stamp, RANGES))
+    with pytest.raises(NetworkError, match="the scans of /scan and /rear have one frame"):
+        robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
+
+
+def test_a_tilted_laser_is_refused():
+    robot = Robot()
+    lying = transform(0.0, "base_link", "laser")
+    lying.transforms[0].transform.rotation = type(lying.transforms[0].transform.rotation)(x=0.7071, y=0, z=0, w=0.7071)
+    robot.hears("/tf_static", lying)
+    with pytest.raises(NetworkError, match="tilted by 90 degrees"):
+        robot.drives(np.arange(1.0, 9.0))
+
+
+def test_tf_is_not_decoded_once_the_mounting_is_known(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/tf", b"no message")
+    assert robot.said == []
+
+
+def with_camera():
+    """A robot with a camera of raw images that waits for its mountings."""
+    return Robot(kinds={**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}, camera="/image", info="/camera_info")
+
+
+def mounted(robot):
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "camera", (0.1, 0.0, 0.0)))
+    return robot.hears("/camera_info", camera_info(0.0)).drives(np.arange(1.0, 7.0))
+
+
+@pytest.fixture
+def camera_robot():
+    """The robot with its mountings."""
+    return mounted(with_camera())
+
+
+def images_of(robot):
+    return [record for record in robot.records if isinstance(record, CameraImage)]
+
+
+def test_few_images_wait_for_a_mounting(monkeypatch):
+    monkeypatch.setattr(sensors, "_IMAGES_KEPT", 3)
+    robot = with_camera()
+    for step in range(9):
+        robot.now_s = 0.5 * step
+        robot.hears("/odom", odometry(0.1 * step, (0.0, 0.0, 0.0))).hears("/image", image(0.1 * step))
+    mounted(robot)
+    assert [image.stamp for image in images_of(robot)] == pytest.approx([0.6, 0.7, 0.8])
+
+
+def test_raw_images_become_records_at_a_rate_that_is_enough(camera_robot):
+    for step in range(10):
+        camera_robot.now_s = 0.1 * step
+        camera_robot.hears("/image", image(6.0))
+    images = images_of(camera_robot)
+    assert len(images) == 3
+    assert images[0].T_odom_base == pytest.approx([6.0, 0.0, 0.0])
+    assert images[0].camera.T_base_camera.translation_m == pytest.approx((0.1, 0.0, 0.0))
+
+
+def test_a_range_max_that_grows_cuts_no_range(robot):
+    robot.drives(np.arange(1.0, 9.0))
+    robot.hears("/scan", scan(9.0, np.full(180, 25.0), range_max=30.0))
+    robot.hears("/odom", odometry(9.5, (9.5, 0.0, 0.0)))
+    record = robot.records[-1]
+    assert robot.records[0].laser.max_range_m == 20.0
+    assert (record.ranges_m == 25.0).all()
+    assert record.laser.max_range_m > 25.0
+
+
+def test_sectors_of_a_turn_are_joined(robot):
+    for number in range(40):
+        stamp = 1.0 + 0.05 * number
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
+        sector = scan(
+            stamp, np.full(90, 1.0 + number % 4), angle_min=-np.pi + np.pi / 2 * (number % 4), beam_s=0.05 / 90
+        )
+        robot.hears("/scan", sector)
+    robot.hears("/odom", odometry(4.0, (4.0, 0.0, 0.0)))
+    assert robot.stamps == pytest.approx(1.0 + 0.2 * np.arange(10))
+    for record in robot.records:
+        assert np.array_equal(record.ranges_m, np.repeat(np.float32([1, 2, 3, 4]), 90))
+        assert record.sweep.duration_s == pytest.approx(0.2 * 359 / 360)
+
+
+def test_point_clouds_wait_for_tf_and_then_are_scans():
+    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",))
+    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8, columns=480)
+
+    def drives(stamps):
+        for stamp in stamps:
+            robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
+            robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+
+    drives([1.0, 1.1])
+    robot.waits(PATIENCE_S + 1.0)
+    assert any("waits for tf: it has no transform from 'base_link' to 'lidar'" in line for line in robot.said)
+    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    drives(1.2 + 0.1 * np.arange(2 * SCANS_FOR_RIG))
+    record = robot.records[0]
+    assert record.laser.T_base_laser == pytest.approx(LASER_POSE)
+    assert record.sweep.duration_s == pytest.approx(PERIOD_S, rel=0.01)
+    angles = record.laser.angles_rad() + LASER_POSE[2]
+    errors = np.abs(record.ranges_m - plan_ranges(*LASER_POSE[:2], angles))
+    assert np.nanmedian(errors) < 0.005
+    assert np.isfinite(errors).mean() > 0.9
+
+
+def test_depth_images_wait_for_their_calibration():
+    kinds = {**KINDS, "/depth/image": IMAGE, "/depth/camera_info": CAMERA_INFO}
+    robot = Robot(kinds=kinds, scans=("/depth/image",), laser_poses=((0.0, 0.0, 0.0),))
+    frame, info = depth_image(1.0, "32FC1")
+
+    def drives(stamps):
+        for stamp in stamps:
+            frame.header = header(stamp, "depth_optical_frame")
+            robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
+            robot.hears("/depth/image", CODEC.encode(frame, IMAGE))
+
+    drives([1.0, 1.1])
+    robot.waits(PATIENCE_S + 1.0)
+    assert any("waits for the calibration of /depth/image: /depth/camera_info is silent" in each for each in robot.said)
+    robot.hears("/depth/camera_info", CODEC.encode(info, CAMERA_INFO))
+    drives(1.2 + 0.1 * np.arange(SCANS_FOR_RIG + 1))
+    record = robot.records[0]
+    errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, record.laser.angles_rad()))
+    assert np.nanmedian(errors) < 0.005
