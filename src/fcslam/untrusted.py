@@ -132,8 +132,8 @@ def read_arrays(path: Path, within: Path | None = None) -> Arrays:
             with np.load(file, allow_pickle=False) as found:
                 return {name: found[name] for name in found.files}
         except (
-            zipfile.BadZipFile, EOFError, KeyError, AttributeError, NotImplementedError, TypeError, zlib.error,
-            MemoryError, RecursionError,
+            zipfile.BadZipFile, EOFError, KeyError, AttributeError, RuntimeError, TypeError, zlib.error,
+            lzma.LZMAError, MemoryError,
         ) as error:  # fmt: skip
             raise ValueError(f"no archive of arrays: {error}") from error
 

@@ -21,7 +21,7 @@ def listen(host: str, port: int) -> "socket.socket":
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=512)
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         raise ServiceError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
 
 

@@ -22,6 +22,8 @@ from fcslam.untrusted import read_bytes
 
 MOST_FILE_BYTES: Final = 1 << 26
 MOST_NODES: Final = 2000
+MOST_ATTRIBUTES: Final = 20 * MOST_NODES
+MOST_AXES: Final = 8
 MOST_ELEMENTS: Final = 1 << 24
 """Numbers in one array of weights."""
 TRIAL_MEMORY_BYTES: Final = 400_000_000
@@ -94,25 +96,27 @@ def check_network(path: Path) -> None:
     while graphs and not reason:
         graph = graphs.pop()
         nodes += len(graph.node)
+        if nodes > MOST_NODES or sum(len(node.attribute) for node in graph.node) > MOST_ATTRIBUTES:
+            reason = f"more than {MOST_NODES} nodes or {MOST_ATTRIBUTES} attributes, the limits"
+            break
         attributes = [attribute for node in graph.node for attribute in node.attribute]
         graphs += (inner for attribute in attributes for inner in (*attribute.g, *attribute.graphs))
         tensors = [*graph.initializer, *(t for attribute in attributes for t in (*attribute.t, *attribute.tensors))]
-        reason = _reason(graph, attributes, tensors, nodes)
+        reason = _reason(graph, attributes, tensors)
     if reason:
         raise FeatureError(f"{path}: is not like the networks of fcslam ({reason}); give weights of an fcslam detector")
     _try(path)
 
 
-def _reason(graph: Any, attributes: list[Any], tensors: list[Any], nodes: int) -> str:
+def _reason(graph: Any, attributes: list[Any], tensors: list[Any]) -> str:
     """What a graph has that no exported network has; empty if nothing."""
-    if nodes > MOST_NODES:
-        return f"more than {MOST_NODES} nodes, the limit"
     if graph.sparse_initializer or any(each.sparse_tensor or each.sparse_tensors for each in attributes):
         return "sparse arrays"
     for tensor in tensors:
         if tensor.external_data or any(tensor.data_location):
             return "arrays in other files"
-        if any(side < 0 for side in tensor.dims) or prod(tensor.dims) > MOST_ELEMENTS:
+        too_deep = len(tensor.dims) > MOST_AXES  # before the product, which grows without end
+        if too_deep or any(side < 0 for side in tensor.dims) or prod(tensor.dims) > MOST_ELEMENTS:
             return f"an array of more than {MOST_ELEMENTS} numbers, the limit"
     for node in graph.node:
         names = [name.decode(errors="replace") for name in node.op_type]

@@ -1,10 +1,12 @@
 """The files of the page. They hold no data of a mission, so nobody needs a token for them."""
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from hashlib import sha256
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
+from starlette.concurrency import run_in_threadpool
 
 from fcslam.page import ASSETS, MODULES
 from fcslam.page.report import report_html
@@ -41,11 +43,15 @@ def report_router(state: ViewerState) -> APIRouter:
     """The report of the open mission, for viewers."""
     router = APIRouter(include_in_schema=False, dependencies=state.require(Role.VIEWER, Role.ADMIN))
 
+    turn = asyncio.Lock()  # a report takes much memory, and the threads are needed for packets
+
     @router.get(f"{PREFIX}/report.html")
-    def get_report() -> Response:
+    async def get_report() -> Response:
         """The page as one file."""
+        async with turn:
+            report = await run_in_threadpool(report_html, state.mission)
         headers = {"Content-Disposition": 'attachment; filename="report.html"', "X-Content-Type-Options": "nosniff"}
-        return Response(report_html(state.mission), media_type="text/html", headers=headers)
+        return Response(report, media_type="text/html", headers=headers)
 
     return router
 

@@ -1,10 +1,11 @@
 """The routes of a service whose robots learn: requests of its robots go to the process in which the fleet learns."""
 
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import httpx
 from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import Path as InPath
 
 from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER, PATH
 from fcslam.service.http.authentication import Role
@@ -12,6 +13,8 @@ from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
 
 ANSWER_S: Final = 60.0
+Operation = Annotated[str, InPath(pattern="^(next|alive|taught|reply/[0-9]{1,18})$")]
+"""Nothing else may stand in the path: it would lead to the operations of another robot."""
 
 
 def learning_router(state: ServiceState, listener: Path) -> APIRouter:
@@ -25,8 +28,11 @@ def learning_router(state: ServiceState, listener: Path) -> APIRouter:
     limits = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 
     @router.post(f"{PATH}/{{operation:path}}", dependencies=state.require(Role.ROBOT))
-    async def learn(request: Request, robot: Name, operation: str) -> Response:
-        transport = httpx.AsyncHTTPTransport(uds=str(listener))
+    async def learn(request: Request, robot: Name, operation: Operation) -> Response:
+        wait_s = state.rate.wait_s(robot, 0)
+        if wait_s > 0.0:
+            raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
+        transport = httpx.AsyncHTTPTransport(uds=str(listener), verify=False)
         address = f"http://learning{PATH.format(robot=robot)}/{operation}"
         try:
             async with httpx.AsyncClient(transport=transport, timeout=limits) as client:

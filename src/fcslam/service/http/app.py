@@ -129,5 +129,5 @@ class _Watch:
         known = scope.get("state", {})
         if ACTOR in known:
             asked = f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
-            action = f"{scope['method']} {scope['path']}{asked}"
+            action = f"{scope['method']} {scope['path']}{asked}"[:LONGEST_ACTION]
             self._state.audit.record(known[ACTOR], address, action, status, known.get(CONTENT, {}))

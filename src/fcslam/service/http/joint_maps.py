@@ -4,14 +4,16 @@ import time
 from functools import lru_cache
 from typing import Annotated
 
-from fastapi import APIRouter, Header, HTTPException, Query
+from fastapi import APIRouter, Header, HTTPException, Query, Request
 from fastapi.responses import Response
 from pydantic import BeforeValidator, Field
+from starlette.concurrency import run_in_threadpool
 
 from fcslam.config import Settings
 from fcslam.lidar.occupancy import FARTHEST_M
 from fcslam.runs import Run, separations
 from fcslam.service.http.authentication import Role
+from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import Pose, content, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
@@ -72,9 +74,15 @@ def joint_map_router(state: ServiceState) -> APIRouter:
     as_reader = state.require(*Role)
     joint = ServedJointMaps()
 
-    @router.post("/robots/{robot}/fleet", dependencies=state.require(Role.ROBOT))
-    def exchange_poses(robot: Name, own: OwnPose) -> FleetPoses:
+    @router.post(
+        "/robots/{robot}/fleet", dependencies=state.require(Role.ROBOT), responses=refusals(413),
+        openapi_extra=json_body(OwnPose),
+    )  # fmt: skip
+    async def exchange_poses(request: Request, robot: Name) -> FleetPoses:
         """Say where a robot is, and read where all robots are."""
+        return await run_in_threadpool(exchange, robot, await read_json(request, OwnPose))
+
+    def exchange(robot: str, own: OwnPose) -> FleetPoses:
         now_s = time.time()
         if own.map is not None and own.pose is not None:
             joint.say(robot, LivePose(own.map, own.pose, now_s))

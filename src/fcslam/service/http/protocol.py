@@ -27,7 +27,9 @@ REFUSAL_S = 5.0
 IDLE_S = 10.0
 """Time for the header of a request, from the connection or the response before."""
 BODY_S = 60.0
-"""Time for a request with its body."""
+"""Time for a request with its body, beside that of its bytes."""
+LEAST_BYTES_PER_S = 20_000
+"""A slower body is cut: a mission that is imported may take long, a client that sends a byte now and then may not."""
 HANDSHAKE_S = 10.0
 """Time for a TLS handshake."""
 ACCEPTED_AT_ONCE, PAUSE_S = 20, 0.01
@@ -90,7 +92,7 @@ class _Listener:
 
     def __init__(self, factory: _Factory, listening: socket.socket, tls: ssl.SSLContext | None) -> None:
         self._factory, self._listening, self._tls = factory, listening, tls
-        self._handshakes: set[asyncio.Task[None]] = set()
+        self._handshakes: dict[asyncio.Task[None], None] = {}
         listening.setblocking(False)
         self._accepting = asyncio.get_running_loop().create_task(self._accept())
 
@@ -111,8 +113,10 @@ class _Listener:
                 await asyncio.sleep(PAUSE_S)
                 continue
             handshake = loop.create_task(self._connect(connection))
-            self._handshakes.add(handshake)
-            handshake.add_done_callback(self._handshakes.discard)
+            self._handshakes[handshake] = None
+            handshake.add_done_callback(lambda task: self._handshakes.pop(task, None))
+            if len(self._handshakes) > most_connections():
+                next(iter(self._handshakes)).cancel()
             if number % ACCEPTED_AT_ONCE == 0:
                 await asyncio.sleep(PAUSE_S)
 
@@ -136,6 +140,10 @@ class GuardedProtocol(H11Protocol):
     _idle_since = _asked_since = 0.0
     """Times of the loop: when the present request began, or when the connection was seen without one first."""
     _look: asyncio.TimerHandle | None = None
+    _seen: object = None
+    """The request at the last look."""
+    _received = 0
+    """Bytes that came in since the present request began."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """After the handshake: a client certificate, if there is one, was signed by the trusted authority."""
@@ -145,6 +153,11 @@ class GuardedProtocol(H11Protocol):
         if len(self.connections) > most_connections():
             self._make_room()
         self._pass_certificate(transport)
+
+    def data_received(self, data: bytes) -> None:
+        """The client sends."""
+        self._received += len(data)
+        super().data_received(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The client or a limit closed the connection."""
@@ -184,12 +197,15 @@ class GuardedProtocol(H11Protocol):
     def _enforce_timeouts(self) -> None:
         """Close the connection if it has been idle, or its request has been coming in, for too long."""
         now = self.loop.time()
+        if self.cycle is not self._seen:
+            self._seen, self._asked_since, self._received = self.cycle, now, 0
         if self.is_idle:
             self._asked_since = now
             is_late = now - self._idle_since > IDLE_S
         else:
             self._idle_since = now
-            is_late = self.cycle.more_body and now - self._asked_since > BODY_S
+            longest_s = BODY_S + self._received / LEAST_BYTES_PER_S
+            is_late = self.cycle.more_body and now - self._asked_since > longest_s
         if is_late or (self._stuck_since is not None and now - self._stuck_since > WRITE_S):
             self.transport.abort()
         else:

@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 PER_S, AT_ONCE = 100.0, 20.0
 """Requests that are answered, on average and at once: each takes about a millisecond of the process."""
 MOST_WAITING = 4096
-"""Requests that wait for a turn; further ones are refused."""
+"""Requests that wait for a turn; of more, one of the address that has most is refused."""
 WAITING = "waiting"
 """Key in the state of a request that waits: its connection may be closed to make room."""
 
@@ -24,7 +24,7 @@ class Strangers:
 
     def __init__(self, app: ASGIApp, is_known: Callable[[Scope], bool]) -> None:
         self._app, self._is_known = app, is_known
-        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
+        self._waiting: dict[str, deque[asyncio.Future[bool]]] = {}
         """By address, that of the next turn first."""
         self._count = 0
         self._credit, self._at = AT_ONCE, 0.0
@@ -34,9 +34,10 @@ class Strangers:
         """Pass the request on when it is its turn, or refuse it."""
         if scope["type"] == "http" and not self._is_known(scope) and not self._passes():
             if self._count >= MOST_WAITING:
+                self._drop()
+            if not await self._turn(scope):
                 await _refuse(send)
                 return
-            await self._turn(scope)
         await self._app(scope, receive, send)
 
     def _passes(self) -> bool:
@@ -49,7 +50,8 @@ class Strangers:
         self._credit -= 1.0
         return True
 
-    async def _turn(self, scope: Scope) -> None:
+    async def _turn(self, scope: Scope) -> bool:
+        """Wait for the turn; false if the request has to make room."""
         loop = asyncio.get_running_loop()
         turn = loop.create_future()
         if not self._waiting:
@@ -58,12 +60,24 @@ class Strangers:
         self._count += 1
         scope["state"][WAITING] = True
         try:
-            await turn
+            return await turn
         finally:
             del scope["state"][WAITING]
 
+    def _drop(self) -> None:
+        """Refuse the newest request of the address that has most."""
+        address, turns = max(self._waiting.items(), key=lambda each: len(each[1]))
+        turn = turns.pop()
+        self._count -= 1
+        if not turns:
+            del self._waiting[address]
+        if not turn.done():
+            turn.set_result(False)
+
     def _next(self) -> None:
         """Give the turn to the next address that waits."""
+        if not self._waiting:
+            return
         address, turns = next(iter(self._waiting.items()))
         del self._waiting[address]
         turn = turns.popleft()
@@ -71,7 +85,7 @@ class Strangers:
         if turns:
             self._waiting[address] = turns
         if not turn.done():
-            turn.set_result(None)
+            turn.set_result(True)
         if self._waiting:
             asyncio.get_running_loop().call_later(1.0 / PER_S, self._next)
 
