@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.test_mission_file import contents
 
 import fcslam
 from fcslam.cloud.cloud import Cloud
@@ -19,6 +18,7 @@ from fcslam.runs import open_run, separations
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
 from tests import small_fleet
+from tests.mission.test_mission_file import contents
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import cv2
 import pytest
-from tests.simulation.gl import require_gl
 
 from fcslam.cli import main
 from fcslam.lab.simulation import engine
 from fcslam.records import CameraImage
 from fcslam.runs import open_run
 from fcslam.sources import open_source
+from tests.lab.simulation.gl import require_gl
 
 TINY = ["demo", "--robots", "2", "--path-length", "20"]
 TINIEST = ["--no-camera", "--building", "flat", "--robots", "1", "--path-length", "3"]

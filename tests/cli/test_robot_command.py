@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rich.console import Console
-from tests.bridges.memory_network import MemoryNetwork
 
 from fcslam.cli import live, main
 from fcslam.cli.progress import ProgressDisplay
@@ -31,6 +30,7 @@ from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.robot.fake_cloud import FakeCloud
 from tests.robot.http_cloud import serving
+from tests.ros.memory_network import MemoryNetwork
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from tests.simulation.gl import require_gl
 
 from fcslam.cli import main
 from fcslam.lab.simulation import engine
 from fcslam.records import CameraImage, GroundTruth, LaserScan, Odometry
 from fcslam.runs import open_run, read_tum
 from fcslam.sources import open_source
+from tests.lab.simulation.gl import require_gl
 
 TINY = ["simulate", "--building", "flat", "--path-length", "6", "--seed", "3"]
 

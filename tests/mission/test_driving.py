@@ -91,7 +91,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path):
         "import os, time\n"
         "from fcslam.mission.driving import side_by_side\n"
         "from fcslam.robot.frontend import RobotConfig\n"
-        "from tests.test_driving import Broken\n"
+        "from tests.mission.test_driving import Broken\n"
         "file = os.open(os.environ['PIDS'], os.O_CREAT | os.O_WRONLY | os.O_APPEND)\n"
         "def note(): os.write(file, f'{os.getpid()}\\n'.encode()); time.sleep(60)\n"
         "with side_by_side(2)([Broken('a', note), Broken('b', note)], RobotConfig()) as (legs, _): next(legs)\n"

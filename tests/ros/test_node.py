@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.bridges.memory_network import MemoryNetwork, offered
-from tests.bridges.ros_messages import CODEC, odometry, scan, transform
 
 import fcslam
 from fcslam.errors import NetworkError
@@ -26,6 +24,8 @@ from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
 from tests import small_fleet
 from tests.live.same_thread import SameThread
+from tests.ros.memory_network import MemoryNetwork, offered
+from tests.ros.ros_messages import CODEC, odometry, scan, transform
 
 TOPICS = (("/robot1/scan", SCAN, False), ("/robot1/odom", ODOMETRY), ("/tf_static", TRANSFORMS, True, True))
 LOST_AT_A_RESTART = STEPS_BACK_FOR_RESTART - 1

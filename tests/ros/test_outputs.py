@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from tests.bridges.memory_network import MemoryNetwork
 
 from fcslam.records import frozen
 from fcslam.ros import outputs
 from fcslam.ros.outputs import Grid, OutputNames, Outputs, Region, changed_region
 from fcslam.ros.transform_stream import TransformStream
 from fcslam.runs.map_files import Occupancy, OccupancyMap
+from tests.ros.memory_network import MemoryNetwork
 
 SECOND = 10**9
 POSE = np.zeros(3)

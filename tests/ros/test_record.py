@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from tests.bridges.memory_network import MemoryNetwork, offered
-from tests.bridges.ros_messages import multi_echo, odometry, scan, transform
 
 from fcslam.cli import main
 from fcslam.errors import NetworkError, OutputError
@@ -23,6 +21,8 @@ from fcslam.sources import BagOptions, open_source
 from fcslam.sources.bags.codec import MULTI_ECHO_SCAN, ODOMETRY, OLD_TRANSFORMS, SCAN, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.container import BagFile
 from fcslam.sources.bags.transforms import in_space
+from tests.ros.memory_network import MemoryNetwork, offered
+from tests.ros.ros_messages import multi_echo, odometry, scan, transform
 
 RANGES = [5.0] * 180
 

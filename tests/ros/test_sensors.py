@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from tests.bridges.ros_messages import (
+
+from fcslam.errors import NetworkError
+from fcslam.records import CameraImage
+from fcslam.ros import sensors
+from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
+from fcslam.ros.topics import SensorTopics
+from fcslam.sources import BagOptions
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
+from tests.ros.ros_messages import (
     CODEC,
     KINDS,
     LASER_POSE,
@@ -15,14 +23,6 @@ from tests.bridges.ros_messages import (
     scan,
     transform,
 )
-
-from fcslam.errors import NetworkError
-from fcslam.records import CameraImage
-from fcslam.ros import sensors
-from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
-from fcslam.ros.topics import SensorTopics
-from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
 from tests.sources.clouds import PERIOD_S, VELODYNE, at_rest, cloud, depth_image, plan_ranges, rotation, spinning
 
 RANGES = np.full(180, 5.0)

@@ -1,7 +1,6 @@
 """Which topics a live robot reads, and what it says if there are none."""
 
 import pytest
-from tests.bridges.memory_network import offered
 
 from fcslam.errors import NetworkError
 from fcslam.ros.addresses import RosAddress, open_network, parse_address
@@ -17,6 +16,7 @@ from fcslam.sources.bags.codec import (
     SCAN,
     TRANSFORMS,
 )
+from tests.ros.memory_network import offered
 
 
 def choose(*topics, namespace="/robot1", **options):

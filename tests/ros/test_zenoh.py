@@ -7,16 +7,16 @@ from concurrent.futures import Future
 
 import numpy as np
 import pytest
-from tests.bridges.ros_messages import CODEC, encoded, scan, transform
 
 from fcslam.errors import NetworkError
 from fcslam.ros.network import Answer, Endpoint, Quality
 from fcslam.ros.ros2_zenoh import ZenohNetwork, attachment, endpoint_of, quality_text, session_config
 from fcslam.sources.bags.codec import SCAN, TRANSFORMS
+from tests.ros.ros_messages import CODEC, encoded, scan, transform
 
 pytest.importorskip("zenoh", reason="no eclipse-zenoh: make ros-test")
 
-from tests.bridges import zenoh_peer
+from tests.ros import zenoh_peer
 
 STRING = "std_msgs/String"
 HELLO, WORLD = (encoded(STRING, CODEC.make(STRING, data=word)) for word in ("hello", "world"))

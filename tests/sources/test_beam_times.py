@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from tests.bridges.ros_messages import scan
 
 from fcslam.sources.bags.messages import scan_of
+from tests.ros.ros_messages import scan
 
 RANGES = np.full(180, 5.0)
 

@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from tests.federated.authority import certificates
 
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
@@ -11,6 +10,7 @@ from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, rea
 from fcslam.wire.http_transport import HttpResponse, HttpTransport, InstancesTransport, Refusal, addresses
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
+from tests.learning.federated.authority import certificates
 from tests.robot.fake_cloud import said
 from tests.robot.http_cloud import serving
 from tests.wire.examples import LIDAR_PLACE

@@ -4,7 +4,6 @@ import csv
 
 import numpy as np
 import pytest
-from tests.evaluation import place_folders
 
 from fcslam.cli import main
 from fcslam.features.codes import hamming_matrix
@@ -23,6 +22,7 @@ from fcslam.metrics.retrieval import recall_at
 from fcslam.places.index import PlaceIndex
 from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
+from tests.lab.evaluation import place_folders
 
 WORDS = VocabularyConfig(scoring=Scoring.WORDS, train_batch=3)
 

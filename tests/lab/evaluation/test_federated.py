@@ -13,8 +13,6 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.fakes import Fake  # noqa: E402
-
 from fcslam.errors import EvaluationError  # noqa: E402
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.lab.evaluation.federated.pairs import (  # noqa: E402
@@ -32,6 +30,7 @@ from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.trainer import ExecutionOptions  # noqa: E402
+from tests.learning.federated.fakes import Fake  # noqa: E402
 
 TINY = {
     "federated": {

@@ -4,7 +4,6 @@ import csv
 
 import numpy as np
 import pytest
-from tests.evaluation import place_folders
 
 from fcslam.cli import main
 from fcslam.lab.evaluation.places.features import choose_features, describe_sets
@@ -19,6 +18,7 @@ from fcslam.lab.evaluation.places.vocabulary_growth import (
 )
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
+from tests.lab.evaluation import place_folders
 
 GROUPS, SEED = 12, 3
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.simulation.driving import INDOORS, distances, route
 
 from fcslam.lab.simulation.floorplan import (
     DOOR_M,
@@ -20,6 +19,7 @@ from fcslam.lab.simulation.floorplan import (
 from fcslam.lab.simulation.lighting import light_of
 from fcslam.lab.simulation.options import Building, Lighting
 from fcslam.lab.simulation.route import drive, schedule
+from tests.lab.simulation.driving import INDOORS, distances, route
 
 every_building = pytest.mark.parametrize("building", INDOORS)
 

@@ -9,8 +9,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from tests.simulation.driving import route
-from tests.simulation.gl import require_gl
 
 from fcslam.lab.simulation.decoration import WallPicture, decorate
 from fcslam.lab.simulation.engine import mujoco
@@ -23,6 +21,8 @@ from fcslam.lab.simulation.scene import furnished_model
 from fcslam.lab.simulation.sensors import Camera
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.records import CameraImage, LaserScan
+from tests.lab.simulation.driving import route
+from tests.lab.simulation.gl import require_gl
 
 pytestmark = pytest.mark.system
 

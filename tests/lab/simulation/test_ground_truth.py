@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from tests.simulation.driving import distances
 
 from fcslam.lab.simulation.floorplan import PieceKind
 from fcslam.lab.simulation.ground_truth import true_map, true_relations, write_ground_truth
@@ -15,6 +14,7 @@ from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
 from fcslam.runs.map_files import Occupancy
+from tests.lab.simulation.driving import distances
 
 SETTINGS = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=30.0, camera=None, lidar=LidarSettings(max_range_m=6.0, rate_hz=5.0)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.simulation.gl import require_gl
 
 from fcslam.cli import main
 from fcslam.lab.simulation.noise import LidarSettings
@@ -16,6 +15,7 @@ from fcslam.lab.simulation.sensors import Camera, RayCaster
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.records import GroundTruth, LaserScan, Odometry
 from fcslam.sources import RecordingWriter, open_source
+from tests.lab.simulation.gl import require_gl
 
 BLIND = SimulationSettings(
     building=Building.FLAT, robots=1, path_length_m=3.0, camera=None, lidar=LidarSettings(beams=40, rate_hz=10.0)

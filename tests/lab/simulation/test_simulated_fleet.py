@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.simulation.driving import route
 
 from fcslam.errors import SimulationError
 from fcslam.geometry import se2
@@ -19,6 +18,7 @@ from fcslam.lab.simulation.scene import bare_model
 from fcslam.lab.simulation.sensors import RayCaster
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.records import GroundTruth, LaserModel, LaserScan
+from tests.lab.simulation.driving import route
 
 TINY = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=4.0, camera=None, lidar=LidarSettings(beams=60, rate_hz=4.0)

@@ -5,7 +5,6 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from tests.simulation.driving import distances
 
 from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import SCANNERS
@@ -18,6 +17,7 @@ from fcslam.lidar.scan import beam_times, point_scan
 from fcslam.records import CameraImage, GroundTruth, LaserScan, Odometry, frozen
 from fcslam.sources import open_source, write_bag
 from fcslam.sources.motion import moving_sweep
+from tests.lab.simulation.driving import distances
 from tests.sources.camera_records import same
 
 SPINNING = [scanner for scanner, lidar in SCANNERS.items() if lidar.spin]

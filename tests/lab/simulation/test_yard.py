@@ -4,7 +4,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from tests.simulation.driving import distances
 
 from fcslam.errors import SimulationError
 from fcslam.lab.simulation.drivable_space import ROBOT_RADIUS_M
@@ -19,6 +18,7 @@ from fcslam.lab.simulation.terrain import CELL_M, Terrain
 from fcslam.lab.simulation.walk import draw_starts, plan_walk
 from fcslam.lab.simulation.yard import draw_yard, move_cars
 from fcslam.records import LaserModel
+from tests.lab.simulation.driving import distances
 
 SICK = LidarSettings(beams=181, field_of_view_rad=np.pi, max_range_m=81.9, rate_hz=0.5)
 TINY = SimulationSettings(building=Building.YARD, robots=2, path_length_m=60.0, camera=None, lidar=SICK)

@@ -7,7 +7,6 @@ import time
 from datetime import UTC, datetime
 
 import numpy as np
-from tests.federated.fakes import version
 
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
@@ -16,6 +15,7 @@ from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serv
 from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.authentication import Authenticator, Role, read_tokens
+from tests.learning.federated.fakes import version
 
 LIMIT_S = 120.0
 """For a run."""

@@ -21,14 +21,13 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.authority import free_port
-from tests.federated.fakes import Fake
-from tests.federated.live import LiveFleet, honest_update
-
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client import ClientUpdate
 from fcslam.learning.federated.flower import QUIET
 from fcslam.learning.federated.settings import FederatedSettings
+from tests.learning.federated.authority import free_port
+from tests.learning.federated.fakes import Fake
+from tests.learning.federated.live import LiveFleet, honest_update
 
 pytestmark = [pytest.mark.system, pytest.mark.attack]
 

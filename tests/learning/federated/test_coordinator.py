@@ -8,14 +8,13 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
-
 from fcslam.errors import OutputError, TrainingError
 from fcslam.lab.evaluation.federated.poison import PoisonedClient
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, read_state, write_state
 from fcslam.learning.federated.history import ROUNDS_FILE
 from fcslam.learning.federated.privacy import epsilon
 from fcslam.learning.federated.settings import FederatedSettings
+from tests.learning.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
 
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
 """For where statistics are frozen and fakes would move them."""

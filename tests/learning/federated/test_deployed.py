@@ -11,10 +11,10 @@ from datetime import UTC, datetime
 import cv2
 import pytest
 import yaml
-from tests.federated.authority import free_port
 
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.authentication import Role
+from tests.learning.federated.authority import free_port
 from tests.learning.textures import textured
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")

@@ -8,13 +8,12 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.fakes import START, Fake, run, settings, shifted
-
 from fcslam.cli.federate.rounds import round_line
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.evaluation import PublicImages, VersionComparison, valid_metrics
 from fcslam.learning.federated.flower import InProcessGrid
+from tests.learning.federated.fakes import START, Fake, run, settings, shifted
 
 
 def figures(value):

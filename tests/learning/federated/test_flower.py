@@ -10,14 +10,13 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.fakes import START, Fake, run, settings
-
 from fcslam.errors import TrainingError
 from fcslam.learning.federated import flower
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.strategies import create_strategy
+from tests.learning.federated.fakes import START, Fake, run, settings
 
 STRATEGIES = ("fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum")
 

@@ -8,9 +8,8 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.fakes import START, Fake, run, settings, version
-
 from fcslam.learning.federated.live_settings import GateSettings
+from tests.learning.federated.fakes import START, Fake, run, settings, version
 
 CODES = {"trained": "codes", "normalisation": "frozen"}
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}

@@ -13,8 +13,6 @@ import time
 import numpy as np
 import pytest
 import yaml
-from tests.federated.authority import free_port
-from tests.simulation.gl import require_gl
 
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.lab.simulation.noise import LidarSettings
@@ -26,6 +24,8 @@ from fcslam.records import Channel
 from fcslam.service.detectors import DetectorStore
 from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import decode
+from tests.lab.simulation.gl import require_gl
+from tests.learning.federated.authority import free_port
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")

@@ -8,11 +8,10 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted
-
 from fcslam.learning.federated.flower import Array, ArrayRecord, Error, Message, MessageType, MetricRecord
 from fcslam.learning.federated.history import ROUNDS_FILE, read_rows
 from fcslam.learning.federated.replies import MAX_REASON_LENGTH, RoundReplies
+from tests.learning.federated.fakes import START, Fake, grid_of, run, settings, shifted
 
 
 def array_of(data):

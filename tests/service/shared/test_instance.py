@@ -6,7 +6,6 @@ import time
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.service.test_mission_store import packet
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import ServiceError, StoreError
@@ -17,6 +16,7 @@ from fcslam.service.shared.audit_table import AuditTable
 from fcslam.service.shared.instance import LOOK_S, REST_LOOK_S, REST_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.registry import LEASE_S, Registry
+from tests.mission.test_mission_store import packet
 
 
 class Started:

@@ -5,7 +5,6 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from tests.service.test_mission_store import correction, packet
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.settings import CloudConfig
@@ -15,6 +14,7 @@ from fcslam.records import Removal, Veto, frozen
 from fcslam.service.shared.files import SharedFiles, fetch_folder, fetched
 from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables
 from fcslam.storage.postgres import Postgres
+from tests.mission.test_mission_store import correction, packet
 
 
 def fill(store):

@@ -28,6 +28,8 @@ from fcslam.service.http.strangers import Strangers
 from fcslam.service.http.viewers import fleet_router, map_router
 
 PREFIX = "/api/v1"
+LONGEST_ACTION = 300
+"""Characters of a request in the audit log; anybody with a token chooses the rest."""
 VIEWER_ROUTERS = (fleet_router, map_router, event_router)
 """Routes of the page; they read."""
 ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, file_router, decision_router)
