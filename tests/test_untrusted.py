@@ -32,9 +32,9 @@ BOMB_BYTES = 1 << 30
 OWN = {
     "compiled.py": "the cache of this user",
     "ros/record.py": "the recording that this process writes",
-    "cli/robot.py": "the robot's own token",
+    "wire/keys.py": "the robot's own token",
     "cli/serve_learning.py": "written by the training that this service started",
-    "federated": "the folder of this user's training",
+    "features/network_check.py": "the memory of this process",
     "features/onnx_runtime.py": "no file",
     "learning": "the folder of this user's training",
     "mission/mission_file.py": "what this process wrote",
@@ -46,7 +46,7 @@ OWN = {
     "sources/bags/mcap_records.py": "the recording that this process writes",
     "sources/recording/writer.py": "the recording that this process writes",
     "storage": "the folder of the service or of this user",
-    "evaluation/federated": "the folder of this user's training",
+    "lab/evaluation/federated": "the folder of this user's training",
     "wire/prediction.py": "files of the package",
 }
 """Where files of this user are read that nobody else wrote, by module or folder, and which ones."""
@@ -266,7 +266,7 @@ def chunk(content, compression, stated):
 
 
 OPEN = """
-import resource, sys, time
+import re, sys, time
 from pathlib import Path
 from fcslam.errors import FcslamError
 from fcslam.sources import open_source
@@ -276,7 +276,7 @@ try:
     open_source(Path(sys.argv[1])).survey()
 except FcslamError as error:
     print(error)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+print(int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1]) // 1024)
 """
 
 

@@ -13,7 +13,15 @@ from fcslam.errors import SourceError
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.driving import side_by_side
-from fcslam.mission.mission import NOTHING_KNOWN, Live, MissionConfig, Watch, continued_config, run_mission
+from fcslam.mission.mission import (
+    NOTHING_KNOWN,
+    Live,
+    MissionConfig,
+    Watch,
+    check_robots,
+    continued_config,
+    run_mission,
+)
 from fcslam.mission.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.robot.calibrating import calibrated
@@ -90,6 +98,7 @@ def map_recordings(
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
     opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=0 if earlier else 1)
     robots = split_recordings(opened, split)
+    check_robots(robots)
     sources.check_copies(robots)
     drive = side_by_side(processes)
     if isinstance(floors, str):

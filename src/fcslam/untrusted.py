@@ -47,6 +47,7 @@ _FREE_STEPS: Final = 20_000_000
 _STEPS_PER_BYTE: Final = 20
 """Steps that SQLite may take to read a database; an honest one needs less than one per byte."""
 _BUFFER_BYTES: Final = 1 << 17
+_COMPRESSED: Final = (".gz", ".xz", ".bz2")
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _IMAGES: Final = ("JPEG", "PPM", "TIFF", "BMP", "WEBP")
 _BYTES_OF_BAND: Final = {"I": 4, "F": 4, "I;16": 2, "I;16B": 2}
@@ -154,6 +155,9 @@ def open_unpacked(path: Path, within: Path | None = None) -> BinaryIO:
         unpacking = lzma.LZMAFile(file)  # noqa: SIM115  _Limited closes it
     elif magic.startswith(b"BZh"):
         unpacking = bz2.BZ2File(file)
+    elif path.suffix in _COMPRESSED:
+        file.close()
+        raise OSError(f"not a {path.suffix} file")
     else:
         return file
     return cast("BinaryIO", io.BufferedReader(_Limited(unpacking, file, size), _BUFFER_BYTES))

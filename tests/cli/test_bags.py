@@ -106,11 +106,11 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
-    twin = save(tmp_path / "run1.mcap", drive(30))
+    twin = save(tmp_path / "run1.mcap", drive(15))
     assert "NAME=LOG" in refused(capsys, "map", bag, twin, "-o", tmp_path / "out")
     assert "already; give each" in refused(capsys, "map", bag, f"ben={bag}", "-o", tmp_path / "out")
     assert run("map", f"anna={bag}", f"ben={twin}", "-o", tmp_path / "out") == 0
-    assert robots(tmp_path / "out") == {"anna": 40, "ben": 30}
+    assert robots(tmp_path / "out") == {"anna": 40, "ben": 15}
 
 
 def test_a_name_works_for_logs_too(tmp_path):
@@ -121,10 +121,10 @@ def test_a_name_works_for_logs_too(tmp_path):
 
 def test_a_file_with_an_equals_sign_is_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name, scans in (("speed=2.bag", 40), ("speed=3.bag", 30)):
+    for name, scans in (("speed=2.bag", 40), ("speed=3.bag", 15)):
         save(tmp_path / name, drive(scans))
     assert run("map", "speed=2.bag", "slow=speed=3.bag", "-o", "out") == 0
-    assert robots(tmp_path / "out") == {"speed_2": 40, "slow": 30}
+    assert robots(tmp_path / "out") == {"speed_2": 40, "slow": 15}
 
 
 @pytest.mark.parametrize("name", ["an/na", "x" * 80, "+", " "])

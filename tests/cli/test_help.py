@@ -61,6 +61,7 @@ def test_long_commands_can_be_quiet():
         ("info",),
         *(words for words in COMMANDS if words[:1] in {("tokens",), ("edit",)}),
         ("config", "dump"),
+        ("evaluate", "quality"),
         ("evaluate", "relations"),
     }
     commands = {words for words, command in COMMANDS.items() if not isinstance(command, click.Group)}

@@ -23,7 +23,7 @@ from tests.sources.carmen_text import drive, flaser, odom, pose_at, save
 
 RUN_FILES = {
     "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "mission.fcslam",
-    "mission.state", "pose_graph.g2o", "robots.csv", "trajectories",
+    "quality.json", "quality.png", "mission.state", "pose_graph.g2o", "robots.csv", "trajectories",
 }  # fmt: skip
 
 

@@ -115,5 +115,5 @@ def test_one_function_turns_ranges_into_points():
         if any(node.attr == "angles_rad" for node in calls):
             found.add(name)
     made_up_scans = {"robot/warmup.py", "service/warmup.py", "cluster/dask_cluster.py", "sources/contradictions.py"}
-    simulators = {name for name in found if name.startswith(("simulation/", "evaluation/"))}
+    simulators = {name for name in found if name.startswith("lab/")}
     assert found - simulators - made_up_scans == allowed - {"records.py"}

@@ -63,7 +63,7 @@ def serving(cloud=None, tls=None):
     server.daemon_threads = True
     if tls is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(tls / "own.crt", tls / "own.key")
+        context.load_cert_chain(tls / "cloud.pem", tls / "cloud.key")
         server.socket = context.wrap_socket(server.socket, server_side=True)
     thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()

@@ -1,16 +1,17 @@
 """HTTP one request at a time: what goes over the wire, and what each answer means."""
 
 import json
+from datetime import UTC, datetime
 
 import pytest
 
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
+from fcslam.service.credentials import make_credentials
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
 from fcslam.wire.http_transport import HttpResponse, HttpTransport, InstancesTransport, Refusal, addresses
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
-from tests.learning.federated.authority import certificates
 from tests.robot.fake_cloud import said
 from tests.robot.http_cloud import serving
 from tests.wire.examples import LIDAR_PLACE
@@ -179,12 +180,14 @@ def test_a_token_is_not_shown_to_the_network():
 
 @pytest.mark.slow
 def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_path):
-    ours, others = certificates(tmp_path / "ours"), certificates(tmp_path / "others")
+    ours, others = tmp_path / "ours", tmp_path / "others"
+    for folder in (ours, others):
+        make_credentials(folder, ["127.0.0.1"], {}, datetime.now(UTC))
     with serving(tls=ours) as cloud:
-        trusting = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ours / "ca.crt")
+        trusting = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ours / "ca.pem")
         assert len(trusting.send(PACKETS, -1).packets) == 1
         trusting.close()
-        for ca in (None, others / "ca.crt"):
+        for ca in (None, others / "ca.pem"):
             wary = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ca)
             with pytest.raises(CloudError, match="its certificate is not trusted"):
                 wary.send(PACKETS, -1)

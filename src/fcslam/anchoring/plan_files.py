@@ -6,13 +6,14 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
 from fcslam.records import FloatArray, frozen
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.ros_map import parse_ros_map
+from fcslam.untrusted import MOST_TEXT_BYTES, read_bytes, read_text
 
 DXF_CELL_M: Final = 0.02
 """Side of a cell in which a DXF drawing is drawn."""
@@ -76,14 +77,14 @@ def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
 def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
     if scale is not None:
         raise SourceError(f"{path}: a map of ROS has its own resolution; leave --plan-scale out")
-    description = path.read_text(encoding="utf-8", errors="replace")
     try:
-        content = yaml.safe_load(description)
-    except yaml.YAMLError:
+        description = read_text(path, most=MOST_TEXT_BYTES)
+        content = parse_yaml(description)
+    except ValueError:
         content = None
     if not isinstance(content, dict) or not isinstance(content.get("image"), str):
         raise SourceError(f"{path}: no map of map_server; it names no image")
-    plan = parse_ros_map(str(path), (path.parent / content["image"]).read_bytes(), description)
+    plan = parse_ros_map(str(path), read_bytes(path.parent / content["image"]), description)
     cells = np.where(plan.cells == Occupancy.OCCUPIED, plan.cells, Occupancy.FREE).astype(np.uint8)
     return OccupancyMap(cells, plan.resolution_m, plan.origin_xy)
 
@@ -91,7 +92,7 @@ def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
 def _drawn_plan(path: Path, scale: float | None) -> OccupancyMap:
     if scale is None:
         raise SourceError(f"{path}: a picture has no scale; give metres per pixel, as in --plan-scale 0.02")
-    data = path.read_bytes()
+    data = read_bytes(path)
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         pixels: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None

@@ -134,7 +134,7 @@ def run_mission(
         OutputError: a robot's name cannot be a file name.
     """
     onto = onto or EMPTY
-    _check_robots(sources)
+    check_robots(sources)
     recordings = [source.name for source in sources]
     known = [*onto.robots, *recordings]
     _check_known("a veto", (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)), known)
@@ -351,7 +351,12 @@ class _Meter:
         self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing, self._faults.copy()))
 
 
-def _check_robots(sources: Sequence[Source]) -> None:
+def check_robots(sources: Sequence[Source]) -> None:
+    """Check that each recording names a robot of its own.
+
+    Raises:
+        SourceError: two have one name, or a name is not one of a robot.
+    """
     names = [source.name for source in sources]
     for name in names:
         if names.count(name) > 1:

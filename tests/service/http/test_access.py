@@ -16,13 +16,14 @@ OPEN = {"/healthz", "/readyz", "/openapi.json"}
 VALUES = {
     "number": 1,
     "robot": "a", "k": "0", "suffix": "png", "z": "0", "x": "0", "y": "0", "session": "a", "name": "mission",
-    "channel": "camera", "version": "v1", "robot_i": "a", "stamp_i": "1.5", "robot_j": "b", "stamp_j": "2",
+    "channel": "camera", "version": "v1", "epoch": 0, "robot_i": "a", "stamp_i": "1.5", "robot_j": "b", "stamp_j": "2",
 }  # fmt: skip
 READERS = {Role.VIEWER, Role.ADMIN}
 RIGHTS = {"robots": {Role.ROBOT}, "decisions": {Role.ADMIN}, "missions": {Role.ADMIN}}
 """By tag; what is not listed is for readers."""
 EXCEPTIONS = {
     ("GET", "/api/v1/detectors/{channel}/{version}"): set(Role),
+    ("GET", "/api/v1/robots/{robot}/map"): set(Role),
     ("GET", "/api/v1/missions"): READERS,
     ("GET", "/api/v1/audit"): {Role.ADMIN},
 }

@@ -53,7 +53,7 @@ class Strangers:
     async def _turn(self, scope: Scope) -> bool:
         """Wait for the turn; false if the request has to make room."""
         loop = asyncio.get_running_loop()
-        turn = loop.create_future()
+        turn: asyncio.Future[bool] = loop.create_future()
         if not self._waiting:
             loop.call_later(1.0 / PER_S, self._next)
         self._waiting.setdefault((scope.get("client") or ("",))[0], deque()).append(turn)
