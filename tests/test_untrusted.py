@@ -265,7 +265,7 @@ def chunk(content, compression, stated):
     return magic + b"".join(bytes([kind]) + struct.pack("<Q", len(data)) + data for kind, data in records) + magic
 
 
-OPEN = """
+OPEN = r"""
 import re, sys, time
 from pathlib import Path
 from fcslam.errors import FcslamError
