@@ -1,0 +1,40 @@
+"""The routes of learning in a service."""
+
+import asyncio
+from types import SimpleNamespace
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from fcslam.learning.federated.relay import learning_router
+
+
+@pytest.fixture
+def asked(tmp_path):
+    """The status of a request of anna, while no process learns."""
+    state = SimpleNamespace(require=lambda *_: [], rate=SimpleNamespace(wait_s=lambda *_: 0.0))
+    app = FastAPI()
+    app.include_router(learning_router(state, tmp_path / "nobody"))
+
+    async def ask(operation):
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
+            return (await client.post(f"/api/v1/robots/anna/learning/{operation}")).status_code
+
+    return lambda operation: asyncio.run(ask(operation))
+
+
+def test_while_no_process_learns_a_robot_is_to_try_again(asked):
+    assert {asked(operation) for operation in ("next", "alive", "taught", "reply/7")} == {503}
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize(
+    "operation", ["..%2F..%2Fben%2Flearning%2Fnext", "next%2F..", "reply/7/..", "reply/" + "1" * 19]
+)
+def test_the_path_of_a_robot_leads_to_no_other(asked, operation):
+    """The service has checked the token of anna; the process behind it believes the path."""
+    assert asked(operation) in (404, 422)
