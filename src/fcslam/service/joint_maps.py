@@ -19,7 +19,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import StoreError
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.joint_tiles import TileHistory, frame_of
+from fcslam.maps.joint_tiles import TileBatch, TileHistory, frame_of
 from fcslam.runs.folder import identity
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.storage.files import write_file
@@ -161,15 +161,17 @@ class ServedJointMaps:
                 self._identity, self._maps, self._histories = known, maps, histories
             return self._maps
 
-    def tiles(self, maps: JointMaps, number: int) -> TileHistory | None:
-        """The tiles of a map; None if there is none."""
+    def since(self, maps: JointMaps, number: int, frame: str, version: int, limit_bytes: int) -> TileBatch | None:
+        """The changed tiles of a map, as ``TileHistory.since``; None if there is no such map."""
         with self._lock:
-            return self._histories.get(maps.frames.get(number, ""))
+            history = self._histories.get(maps.frames.get(number, ""))
+            return None if history is None else history.since(frame, version, limit_bytes)
 
     def say(self, robot: str, live: LivePose) -> None:
-        """Take the pose that a robot says it has."""
+        """Take the pose that a robot of the newest joint maps says it has."""
         with self._lock:
-            self._live[robot] = live
+            if any(session.robot == robot for session in self._maps.sessions):
+                self._live[robot] = live
 
     def pose(self, session: JointSession) -> tuple[tuple[float, float, float], float]:
         """The newest credible pose of a robot and when it was there, seconds since 1970.
