@@ -2,13 +2,14 @@
 
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fcslam.errors import CloudError, UnavailableError
 from fcslam.live.fleet_view import FleetView
-from fcslam.service.joint_maps import LivePose, ServedJointMaps
+from fcslam.service.joint_maps import JointMaps, JointSession, LivePose, ServedJointMaps
 from fcslam.wire.fleet_client import FleetClient
 from tests.service.http.desk import SCRIPT, A, B, Desk
 
@@ -91,6 +92,15 @@ def test_only_robots_of_the_maps_are_remembered(desk):
     for robot in ("a", "nobody"):
         joint.say(robot, LivePose(0, (0.0, 0.0, 0.0), 1.0))
     assert set(joint._live) == {"a"}
+
+
+def test_a_robot_is_believed_only_if_it_is_known_when_its_keyscan_came():
+    joint = ServedJointMaps()
+    session = JointSession("a", 0, 0, "", (1.0, 0.0, 0.0), 5.0, 0.0)
+    joint._maps = JointMaps([session], {}, {})
+    joint.say("a", LivePose(0, (2.0, 0.0, 0.0), 1e9))
+    assert joint.pose(session) == (session.pose, 0.0)
+    assert joint.pose(replace(session, heard_s=1e9 - 1.0)) == ((2.0, 0.0, 0.0), 1e9)
 
 
 def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):

@@ -120,7 +120,7 @@ def test_passes_and_the_last_look_are_counted():
 
 def test_what_no_edge_connects_with_the_first_keyscan_is_unknown_and_itself_as_good_as_alone():
     graph, poses = chain()
-    apart = poses + (30.0, 0.0, 0.0)
+    apart = poses + np.array((30.0, 0.0, 0.0))
     edges = [Edge(e.i + COUNT, e.j + COUNT, e.T_i_j, e.information, e.robust) for e in graph.edges]
     both = PoseGraph(np.concatenate((poses, apart)), [*graph.edges, *edges])
     paths = [path(poses), path(apart)._replace(variables=np.arange(COUNT, 2 * COUNT))]

@@ -140,7 +140,7 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     begins = np.unique(component, return_index=True)[1]
     weak = np.zeros((len(variables), 3))
     weak[begins[component[begins] != component[0]]] = UNKNOWN_INFORMATION
-    information += diags_array(weak.ravel())
+    information = csc_array(information + diags_array(weak.ravel()))
     chosen = _sampled(poses)
     covariance = np.zeros((3 * len(chosen), 3 * len(chosen)))
     if len(variables) > 1:

@@ -41,7 +41,7 @@ class JointSession:
     stamp: float
     """Of that keyscan, seconds."""
     heard_s: float
-    """When that took effect, seconds since 1970."""
+    """When that took effect, seconds since 1970; 0: not known."""
 
 
 class JointMaps:
@@ -180,7 +180,7 @@ class ServedJointMaps:
         confirms.
         """
         live = self._live.get(session.robot)
-        if live is None or live.map != session.map or live.said_s < session.heard_s:
+        if live is None or live.map != session.map or not 0.0 < session.heard_s <= live.said_s:
             return session.pose, session.heard_s
         apart_m = math.dist(live.pose[:2], session.pose[:2])
         is_credible = apart_m <= 1.0 + LONGEST_SPEED_MPS * (live.said_s - session.heard_s)
