@@ -1,11 +1,13 @@
 """Fixes place a map on the earth, through an antenna beside the base; those that contradict the others bend nothing."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
+from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.records import GnssFix, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.writer import write_bag
@@ -71,6 +73,25 @@ def test_fixes_that_leave_the_heading_open_place_nothing():
     placing = placed(result, fixes={"anna": fixes_of(true, (0.0, 0.0, 0.0), 8.0)})
     assert not json.loads(placing.files["map_georeference.json"])["georeferenced"]
     assert np.array_equal(placing.result.robots[0].T_map_base, result.robots[0].T_map_base)
+
+
+def test_fixes_of_several_robots_at_one_time_are_no_more_frequent_for_it():
+    """The second robot's errors are independent, so the heading is known better; pooled gaps would say the opposite."""
+    result, true = mapped()
+    (robot,), count = result.robots, len(true)
+    bert = replace(robot, robot="bert", variables=robot.variables + count)
+    edges = [Edge(e.i + count, e.j + count, e.T_i_j, e.information, e.robust) for e in result.graph.edges]
+    joined = Edge(0, count, np.zeros(3), np.eye(3) * 1e4, robust=False)
+    poses = np.concatenate((result.graph.poses(), robot.T_map_base))
+    graph = PoseGraph(poses, [*result.graph.edges, *edges, joined])
+    both = replace(result, robots=(robot, bert), graph=graph)
+    turns = []
+    for one, names in ((result, ["anna"]), (both, ["anna", "bert"])):
+        placing = placed(one, fixes=dict.fromkeys(names, fixes_of(true, (0.0, 0.0, 0.0), 2.0)))
+        turns.append(
+            float(json.loads(placing.files["map_georeference.json"])["reason"].split(" deg only")[0].split()[-1])
+        )
+    assert turns[1] < turns[0]
 
 
 def test_a_map_that_a_user_placed_stays_and_is_found_on_the_earth():

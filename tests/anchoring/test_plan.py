@@ -1,6 +1,7 @@
 """A map is aligned with the plan of its building, in its scale, and with no other; what differs is listed."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,8 +10,11 @@ import pytest
 from fcslam.anchoring.anchors import Anchors, anchored
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
+from fcslam.cli.map import _anchors
 from fcslam.cloud.report import fuse_members, keyscan_track
 from fcslam.errors import SourceError
+from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.lidar.field import SurfelField
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
 from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
@@ -167,6 +171,36 @@ def test_a_plan_that_cannot_be_used_gets_one_line(tmp_path):
         with pytest.raises(SourceError, match=text) as caught:
             read_plan(path, scale)
         assert "\n" not in str(caught.value)
+
+
+def test_a_plan_with_more_walls_than_a_field_holds_gets_one_line(tmp_path):
+    pixels = np.full((2000, 2000), 255, np.uint8)
+    pixels[::25, 50:-50] = 0
+    cv2.imwrite(str(tmp_path / "hatched.png"), pixels)
+    with pytest.raises(SourceError, match=r"hatched.png: has too many walls; at most 1.6 km can be used; crop it"):
+        _anchors(tmp_path / "hatched.png", 0.02, None)
+    assert _anchors(picture(tmp_path), 0.02, None).plan is not None
+
+
+def test_a_map_with_more_walls_than_a_field_holds_is_not_aligned(monkeypatch):
+    plan = plan_of()
+    monkeypatch.setattr(SurfelField, "is_full", True)
+    assert "too many walls" in report_of(placed(mapped()[0], plan))["reason"]
+
+
+def test_a_robot_whose_ranges_stay_with_it_is_placed_with_the_others_of_its_map():
+    result, true = mapped()
+    (robot,) = result.robots
+    silent = replace(robot, robot="bert", keyscans=(), variables=np.array([len(true)]), stamps=robot.stamps[:1],
+                     T_map_base=robot.T_map_base[:1], T_local_base=robot.T_local_base[:1])  # fmt: skip
+    poses = np.concatenate((result.graph.poses(), robot.T_map_base[:1]))
+    joined = Edge(0, len(true), np.zeros(3), np.eye(3) * 1e4, robust=False)
+    both = replace(result, robots=(robot, silent), graph=PoseGraph(poses, [*result.graph.edges, joined]))
+    placing = placed(both, plan_of())
+    assert report_of(placing)["scales"]["bert"] == 1.0
+    assert np.hypot(*(placing.result.robots[1].T_map_base[0, :2] - true[0, :2])) < 0.05
+    alone = replace(result, robots=(replace(robot, keyscans=()),))
+    assert report_of(placed(alone, plan_of()))["reason"] == "the map has no walls"
 
 
 def test_a_drawing_without_a_unit_gets_one_line(tmp_path):

@@ -2,12 +2,14 @@
 
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fcslam.errors import CloudError, UnavailableError
 from fcslam.live.fleet_view import FleetView
+from fcslam.service.joint_maps import JointMaps, JointSession, LivePose, ServedJointMaps
 from fcslam.wire.fleet_client import FleetClient
 from tests.service.http.desk import SCRIPT, A, B, Desk
 
@@ -56,6 +58,49 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
             before = first.received_bytes
             follow(first)
             assert first.received_bytes - before < 1000, "nothing changed, so no tile travels"
+
+
+def test_a_new_frame_shows_no_map_before_all_its_tiles_came(desk):
+    desk.send("a", A)
+    with closing(view(desk, "a", limit_kbps=0.1)) as fleet:
+        fleet.step()
+        assert fleet.version == 1
+        assert fleet.joint_map is None
+        assert fleet.map_index == 0
+        follow(fleet)
+        with closing(view(desk, "a", limit_kbps=1e6)) as at_once:
+            at_once.step()
+            assert known(fleet.joint_map) == known(at_once.joint_map)
+
+
+def test_what_the_cloud_says_counts_with_its_tiles(desk, monkeypatch):
+    desk.send("a", A)
+    with closing(view(desk, "a")) as fleet:
+        monkeypatch.setattr(fleet._clients[0], "tiles", lambda *_: (b"broken", ""))
+        with pytest.raises(UnavailableError, match="broken"):
+            fleet.step()
+        assert fleet.robots() == []
+        assert fleet.news == []
+
+
+def test_only_robots_of_the_maps_are_remembered(desk):
+    joint = ServedJointMaps()
+    joint.follow(desk.state.mission.joint_maps)
+    joint.say("nobody", LivePose(0, (0.0, 0.0, 0.0), 1.0))
+    desk.send("a", A)
+    joint.follow(desk.state.mission.joint_maps)
+    for robot in ("a", "nobody"):
+        joint.say(robot, LivePose(0, (0.0, 0.0, 0.0), 1.0))
+    assert set(joint._live) == {"a"}
+
+
+def test_a_robot_is_believed_only_if_it_is_known_when_its_keyscan_came():
+    joint = ServedJointMaps()
+    session = JointSession("a", 0, 0, "", (1.0, 0.0, 0.0), 5.0, 0.0)
+    joint._maps = JointMaps([session], {}, {})
+    joint.say("a", LivePose(0, (2.0, 0.0, 0.0), 1e9))
+    assert joint.pose(session) == (session.pose, 0.0)
+    assert joint.pose(replace(session, heard_s=1e9 - 1.0)) == ((2.0, 0.0, 0.0), 1e9)
 
 
 def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):

@@ -114,11 +114,35 @@ def test_passes_and_the_last_look_are_counted():
     cells = certify(graph, [later], room(poses))["cells"]
     assert {cell["passes"] for cell in cells} <= {0, 1, 2}
     assert sum(cell["passes"] == 2 for cell in cells) > 5, "around both ends of the gap"
-    assert max(cell["last_seen"] for cell in cells) == 139.0
+    assert max(cell["last_seen"] for cell in cells if cell["passes"]) == 139.0
+    assert all((cell["last_seen"] is None) == (cell["passes"] == 0) for cell in cells)
+
+
+def test_what_no_edge_connects_with_the_first_keyscan_is_unknown_and_itself_as_good_as_alone():
+    graph, poses = chain()
+    apart = poses + np.array((30.0, 0.0, 0.0))
+    edges = [Edge(e.i + COUNT, e.j + COUNT, e.T_i_j, e.information, e.robust) for e in graph.edges]
+    both = PoseGraph(np.concatenate((poses, apart)), [*graph.edges, *edges])
+    paths = [path(poses), path(apart)._replace(variables=np.arange(COUNT, 2 * COUNT))]
+    alone, places = covariances(graph, [path(poses)]), covariances(both, paths)
+    second = places.variables >= COUNT
+    assert second.any()
+    assert places.absolute_m()[~second] == pytest.approx(alone.absolute_m(), rel=1e-6)
+    assert (places.absolute_m()[second] > 10.0).all()
+    own = covariances(PoseGraph(apart, graph.edges), [path(apart)])
+    assert places.relative_m(10.0)[second] == pytest.approx(own.relative_m(10.0), rel=1e-3)
+
+
+def test_a_place_without_neighbours_is_as_good_as_the_nearest_one_says():
+    poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (50.0, 0.0, 0.0)])
+    covariance = np.diag((0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 16.0, 9.0, 0.0))
+    assert relative_error(poses, covariance, 10.0)[2] == pytest.approx(np.sqrt(25.0 + 2.0), abs=1e-3)
+    assert relative_error(poses[:1], covariance[:3, :3], 10.0)[0] == FLOOR_M
 
 
 def test_it_is_written_as_json_and_as_a_picture():
     graph, poses = chain()
     certificate = certify(graph, [path(poses)], room(poses))
-    assert json.loads(certificate_json({0: certificate}))["0"]["verdict"].endswith("m2 are good to 0.05 m within 10 m")
+    content = json.loads(certificate_json({0: certificate}), parse_constant=pytest.fail)
+    assert content["0"]["verdict"].endswith("m2 are good to 0.05 m within 10 m")
     assert certificate_png(certificate, room(poses)).startswith(b"\x89PNG")

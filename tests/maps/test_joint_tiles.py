@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fcslam.maps.joint_tiles import TILE, TileBatch, TiledMap, TileHistory, decode_batch, padded
+from fcslam.maps.joint_tiles import TILE, TileBatch, TiledMap, TileHistory, decode_batch, frame_of, padded
 from fcslam.runs.map_files import OccupancyMap
 
 
@@ -66,6 +66,24 @@ def test_in_another_frame_earlier_tiles_count_no_longer():
     assert known_cells(tiled.occupancy()) == known_cells(newest)
 
 
+def test_versions_of_another_history_of_the_same_frame_count_no_longer():
+    before, after, tiled = TileHistory(), TileHistory(), TiledMap()
+    before.update("frame", occupancy(0, 3 * TILE, 70, 0, 0))
+    fetch(before, tiled)
+    newest = occupancy(1, 4 * TILE, 70, 0, 0)
+    after.update("frame", newest)
+    fetch(after, tiled)
+    assert known_cells(tiled.occupancy()) == known_cells(newest)
+
+
+def test_a_placed_map_keeps_its_frame_when_a_solution_moves_it_a_little():
+    frame = frame_of((3.0, -0.0, 0.0), "a", 0.05)
+    assert frame_of((3.004, 0.003, -0.0008), "a", 0.05) == frame
+    others = [((7.0, 0.0, 0.0), "a", 0.05), ((3.0, 0.0, 0.5), "a", 0.05), ((3.0, 0.0, 0.0), "b", 0.05),
+              ((3.0, 0.0, 0.0), "a", 0.1)]  # fmt: skip
+    assert frame not in {frame_of(*other) for other in others}
+
+
 @pytest.mark.parametrize("data", [
     b"", b"[]\n", b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[[0,0,9]]}\nabc',
     b'{"frame":"a","version":1,"resolution":-1,"complete":true,"tiles":[]}\n',
@@ -84,7 +102,7 @@ def test_a_broken_tile_and_a_map_without_end_are_refused_and_nothing_changes():
     tile = next(iter(history.since("", 0, 10**6).tiles.values()))
     for tiles in ({(0, 0): b"no zstd"}, {(10**6, 10**6): tile}):
         with pytest.raises(ValueError, match=r"a (broken tile|map of more than)"):
-            tiled.add(TileBatch("frame", 9, 0.05, True, tiles))
+            tiled.add(TileBatch(tiled.frame, 9, 0.05, True, tiles))
         assert known_cells(tiled.occupancy()) == before
 
 

@@ -198,6 +198,25 @@ def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud, monkeypa
     assert [str(closure) for closure in run.closures] == [str(closure) for closure in expected.closures]
 
 
+def test_when_robots_were_heard_survives_a_restart_and_a_replay_is_not_hearing_them(cloud):
+    packets = two_robots()
+    cloud.put(packets[:-1])
+    cloud.work()
+    cloud.now += SNAPSHOT_EVERY_S
+    cloud.work()
+    heard = cloud.worker._heard
+    assert set(heard) == {("a", 0), ("b", 0)}
+    cloud.restart()
+    assert cloud.worker._heard == heard
+    cloud.folder.snapshot.unlink()
+    cloud.restart()
+    cloud.work()
+    assert cloud.worker._heard == {}
+    cloud.put(packets[-1:])
+    cloud.work()
+    assert set(cloud.worker._heard) == {(packets[-1].robot, 0)}
+
+
 @pytest.mark.parametrize("fault", ["damage", "other packets", "other program"])
 def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, monkeypatch, tmp_path, caplog, fault):
     packets = two_robots()

@@ -16,6 +16,7 @@ from fcslam.cloud.report import Track
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
 from fcslam.records import FloatArray, GnssFix, frozen
@@ -81,7 +82,10 @@ def anchored(
         part, is_placed = _part(result, k), k in placed
         alignment = None
         if anchors.plan is not None:
-            alignment = align_to_plan(anchors.plan, map_submap(part.robots), is_placed)
+            building = map_submap(part.robots) if any(robot.keyscans for robot in part.robots) else None
+            is_full = building is not None and building.field.is_full
+            if building is not None and not is_full:
+                alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
                 fit = fit_to_plan(alignment.plan, part.robots, part.graph, alignment.T_plan_map)
                 part = _Part(fit.robots, fit.graph)
@@ -89,7 +93,9 @@ def anchored(
                 reports.append(_plan_report(k, alignment, compared, fit.scales))
                 pictures.append(fuse(part.robots))
             else:
-                reports.append({"map": k, "aligned": False, "reason": _why(alignment)})
+                reports.append(
+                    {"map": k, "aligned": False, "reason": f"it {TOO_MANY_WALLS}" if is_full else _why(alignment)}
+                )
         in_plan = alignment is not None and not alignment.refusal
         own = {robot.robot: fixes[robot.robot] for robot in part.robots if fixes.get(robot.robot)}
         found = georeferenced(part.robots, part.graph, own, tracks, is_fixed=in_plan or is_placed)
@@ -183,7 +189,7 @@ def _plan_report(
         "aligned": True,
         "walls_seen": round(alignment.explained, 3),
         "confirmed_m": round(compared.confirmed_m, 1),
-        "mean_off_m": round(compared.mean_off_m, 4),
+        "mean_off_m": round(compared.mean_off_m, 4) if compared.confirmed_m else None,
         "scales": {robot: round(scale, 5) for robot, scale in scales.items()},
         "deviations": deviations,
     }
@@ -204,7 +210,7 @@ def _geo_report(found: Georeference) -> dict[str, object]:
 
 
 def _json(content: object) -> bytes:
-    return (json.dumps(content, indent=2) + "\n").encode()
+    return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
 
 
 def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:

@@ -106,7 +106,8 @@ def georeferenced(
     Returns:
         The map and where it lies; None if it has no fix.
     """
-    placed = [found for robot in robots for found in _at_scans(robot, fixes.get(robot.robot, ()), tracks)]
+    by_robot = [_at_scans(robot, fixes.get(robot.robot, ()), tracks) for robot in robots]
+    placed = [found for its in by_robot for found in its]
     if not placed:
         return None
     kept = [fix for _, _, fix in placed]
@@ -117,7 +118,8 @@ def georeferenced(
     middle = np.median([(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in kept], axis=0)
     projection: Any = Proj(proj="aeqd", lat_0=middle[0], lon_0=middle[1], ellps="WGS84")
     east, north = projection([fix.longitude_deg for fix in kept], [fix.latitude_deg for fix in kept])
-    interval_s = float(np.median(np.diff(np.sort([fix.stamp for fix in kept])))) if len(kept) > 1 else CORRELATED_S
+    gaps_s = np.concatenate([np.diff(np.sort([fix.stamp for _, _, fix in its])) for its in by_robot])
+    interval_s = float(np.median(gaps_s)) if len(gaps_s) else CORRELATED_S
     measured = _Measured(
         np.array([variable for variable, _, _ in placed]), np.array([arm for _, arm, _ in placed]),
         np.column_stack((east, north)), np.array([fix.sigma_m for fix in kept]),

@@ -45,7 +45,7 @@ class PlanFit:
 
 
 def map_submap(robots: Sequence[MappedRobot]) -> Submap:
-    """The whole map of robots that share one."""
+    """The whole map of robots that share one; one of them has a keyscan."""
     scans = [
         (keyscan_points(keyscan, robot.lasers), robot.T_map_base[row])
         for robot in robots
@@ -63,7 +63,10 @@ def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGr
         graph: the constraints of these robots alone.
         T_plan_map: where the map lies in the plan, shape (3,), metres and radians.
     """
-    found = {robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map).scale for robot in robots}
+    found = {
+        robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map).scale if robot.keyscans else 1.0
+        for robot in robots
+    }
     middle = np.append(plan.submap.surface.points.mean(axis=0), 0.0)
     # A robot's poses grow about the middle of the plan; solving puts them right.
     scaled = [scaled_robot(robot, found[robot.robot]) for robot in robots]

@@ -235,11 +235,15 @@ def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None) -> "
     from fcslam.anchoring.anchors import Anchors
     from fcslam.anchoring.plan import BuildingPlan
     from fcslam.anchoring.plan_files import read_plan
-    from fcslam.errors import InputError
+    from fcslam.errors import InputError, SourceError
+    from fcslam.lidar.field import TOO_MANY_WALLS
 
     if plan is None and scale is not None:
         raise InputError("--plan-scale belongs to --plan; name the plan, or leave the scale out")
-    return Anchors(None if plan is None else BuildingPlan(read_plan(plan, scale)), align is AlignTo.WALLS)
+    building = None if plan is None else BuildingPlan(read_plan(plan, scale))
+    if building is not None and building.submap.field.is_full:
+        raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
+    return Anchors(building, align is AlignTo.WALLS)
 
 
 @contextmanager

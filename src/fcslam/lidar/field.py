@@ -31,6 +31,7 @@ MERGED: Final = 4
 """Columns of a surfel that later ones serve to merge returns."""
 MOST_SURFELS: Final = 32767
 """Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
+TOO_MANY_WALLS: Final = f"has too many walls; at most {1e-3 * MERGE_M * MOST_SURFELS:.1f} km can be used"
 
 MOST_NEW_TILES: Final = 9
 """Largest number of tiles within reach of one surfel."""
@@ -101,6 +102,11 @@ class SurfelField:
         """Label of the surfel nearest to the cell of each point (N, 2), metres, or ``EMPTY``; shape (N,)."""
         labels: NDArray[np.int32] = _labels_at(points, self.arrays)
         return labels
+
+    @property
+    def is_full(self) -> bool:
+        """Whether later returns may be left out."""
+        return bool(self.arrays.used[1] == MOST_SURFELS)
 
     def compact(self) -> None:
         """Free unused storage of a complete field, which takes no more scans."""

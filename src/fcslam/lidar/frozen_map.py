@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from fcslam.errors import SourceError
-from fcslam.lidar.field import CELL_M, MOST_SURFELS, TABLE, TILE, SurfelField
+from fcslam.lidar.field import CELL_M, TABLE, TILE, TOO_MANY_WALLS, SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
 from fcslam.records import FloatArray
@@ -48,8 +48,8 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
         raise SourceError(f"{name}: extends over {(high - low).max():.0f} m; at most {WIDEST_M:.0f} m can be used")
     field = SurfelField(0.5 * (low + high))
     field.insert(surface, np.zeros(3))
-    if field.arrays.used[1] == MOST_SURFELS:
-        raise SourceError(f"{name}: has too many walls; at most {0.05e-3 * MOST_SURFELS:.1f} km can be used")
+    if field.is_full:
+        raise SourceError(f"{name}: {TOO_MANY_WALLS}")
     surfels = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
     field.compact()
     return Submap(field, surfels, _free_space(occupancy))

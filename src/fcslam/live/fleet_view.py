@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import FcslamError, UnavailableError
-from fcslam.maps.joint_tiles import TiledMap, decode_batch
+from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
 from fcslam.runs.map_files import OccupancyMap
@@ -60,11 +60,13 @@ class FleetView:
         """
         self._clients, self._robot, self._own_pose, self._clock = clients, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments
-        self._limit_bytes = max(1, int(1e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS)))
+        self._limit_bytes = min(max(1, int(1e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS))), LARGEST_ANSWER)
         self._tiled, self._etag = TiledMap(), ""
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
         self._map: OccupancyMap | None = None
+        self._is_settling = False
+        """In a new frame, some tiles are missing yet."""
         self.drawn_s = -np.inf
         """Stamp of the robot's newest keyscan that is in ``joint_map``; minus infinity without one."""
         self.news: list[str] = []
@@ -97,7 +99,7 @@ class FleetView:
 
     @property
     def joint_map(self) -> OccupancyMap | None:
-        """The joint map of the newest tiles, in its own frame; None before the first."""
+        """The joint map of the newest tiles, in its own frame; None before all tiles of that frame came."""
         return self._map
 
     @property
@@ -130,23 +132,25 @@ class FleetView:
         """
         client, own = self._clients[self._current], self._own_pose()
         pose = None if own is None or not np.isfinite(own[1]).all() else tuple(own[1].tolist())
-        before = self._members()
-        self._reply = client.exchange(self._robot, None if own is None else own[0], pose), self._clock()
-        self._tell(before, self._members())
-        stamp = next((one.stamp for one in self._reply[0].robots if one.robot == self._robot), -np.inf)
+        reply = client.exchange(self._robot, None if own is None else own[0], pose), self._clock()
+        stamp = next((one.stamp for one in reply[0].robots if one.robot == self._robot), -np.inf)
         found = client.tiles(self._robot, self._etag, self._limit_bytes)
         is_complete = True
         if found is not None:
             try:
                 batch = decode_batch(found[0])
+                is_new = batch.frame != self._tiled.frame
                 self._tiled.add(batch)
                 is_complete = batch.is_complete
             except ValueError as error:
                 self._etag = ""
                 raise UnavailableError(f"the cloud's reply is broken: {error}") from error
             self._etag = found[1]
-            self._map = self._tiled.occupancy()
+            self._is_settling = (self._is_settling or is_new) and not is_complete
+            self._map = None if self._is_settling else self._tiled.occupancy()
             self.version += 1
+        before, self._reply = self._members(), reply
+        self._tell(before, self._members())
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
 

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array
+from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
@@ -46,6 +46,8 @@ OPEN_LENGTH_M: Final = 3.0
 AGAIN_M: Final = 0.01
 AGAIN_PER_M: Final = 0.001
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
+UNKNOWN_INFORMATION: Final = 1e-4
+"""Of where keyscans begin that no edge connects with the first one."""
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 
 
@@ -110,7 +112,7 @@ def certify(
         {
             "x": round(float(x), 3), "y": round(float(y), 3), "error": round(float(math.hypot(absolute[k], along)), 4),
             "neighbours": round(float(local[k]), 4), "bound_95": round(float(bound[k]), 4), "good": bool(is_good[k]),
-            "passes": int(count), "last_seen": round(float(seen), 3),
+            "passes": int(count), "last_seen": round(float(seen), 3) if count else None,
         }
         for (x, y), k, along, count, seen in zip(centres, nearest, lever, passes, seen_s, strict=True)
     ]  # fmt: skip
@@ -130,46 +132,42 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     """A sample of the keyscans of one map with the covariance of their errors; the first keyscan has none."""
     poses = np.concatenate([path.T_map_base for path in paths])
     variables = np.concatenate([path.variables for path in paths])
-    first = int(variables[0])
-    member = np.zeros(len(graph), bool)
-    member[variables] = True
     rows = np.full(len(graph), -1)
     rows[variables] = np.arange(len(variables))
     information = _information(graph, poses, rows)
     # What no edge connects with the first keyscan is held weakly, so that it counts as unknown.
-    connected = (
-        connected_components(information, directed=False)[1][::3]
-        == connected_components(information, directed=False)[1][3 * rows[first]]
-    )
-    kept = np.flatnonzero(np.arange(len(variables)) != rows[first])
-    kept = kept[connected[kept]]
-    chosen = _sampled(poses, connected)
-    at = np.full(len(variables), -1)
-    at[kept] = np.arange(len(kept))
+    component = connected_components(information, directed=False)[1][::3]
+    begins = np.unique(component, return_index=True)[1]
+    weak = np.zeros((len(variables), 3))
+    weak[begins[component[begins] != component[0]]] = UNKNOWN_INFORMATION
+    information = csc_array(information + diags_array(weak.ravel()))
+    chosen = _sampled(poses)
     covariance = np.zeros((3 * len(chosen), 3 * len(chosen)))
-    if len(kept):
-        columns = (3 * kept[:, None] + np.arange(3)).ravel()
-        solver = splu(csc_array(information[columns][:, columns]))
-        inside = chosen[at[chosen] >= 0]
-        wanted = (3 * at[inside][:, None] + np.arange(3)).ravel()
-        target = (3 * np.flatnonzero(at[chosen] >= 0)[:, None] + np.arange(3)).ravel()
+    if len(variables) > 1:
+        solver = splu(csc_array(information[3:, 3:]))
+        wanted = (3 * chosen[1:, None] + np.arange(3)).ravel() - 3
         for begin in range(0, len(wanted), 192):
             part = wanted[begin : begin + 192]
-            unit = np.zeros((3 * len(kept), len(part)))
+            unit = np.zeros((3 * len(variables) - 3, len(part)))
             unit[part, np.arange(len(part))] = 1.0
-            covariance[np.ix_(target, target[begin : begin + 192])] = solver.solve(unit)[wanted]
+            covariance[3:, 3 + begin : 3 + begin + len(part)] = solver.solve(unit)[wanted]
     covariance = SCALE**2 * (covariance + covariance.T) / 2.0
     return Places(variables[chosen], poses[chosen], covariance)
 
 
 def relative_error(poses: FloatArray, covariance: FloatArray, within_m: float) -> FloatArray:
-    """Root mean square error of the positions within a distance of each place as seen from it, shape (P,), metres."""
+    """Root mean square error of the positions within a distance of each place as seen from it, shape (P,), metres.
+
+    Of a place without any so near, that of the nearest one.
+    """
     result = np.full(len(poses), FLOOR_M)
     blocks = covariance.reshape(len(poses), 3, len(poses), 3).transpose(0, 2, 1, 3)
     tree = cKDTree(poses[:, :2])
     for k in range(len(poses)):
         others = np.array(tree.query_ball_point(poses[k, :2], within_m), np.int64)
         near = np.sort(others[others != k])
+        if not len(near) and len(poses) > 1:
+            near = np.asarray(tree.query(poses[k, :2], [2])[1])
         if len(near):
             apart = poses[near, :2] - poses[k, :2]
             swing = apart @ _S.T  # change of the other's position by a turn of this place
@@ -185,7 +183,9 @@ def relative_error(poses: FloatArray, covariance: FloatArray, within_m: float) -
 
 def certificate_json(certificates: Mapping[int, Mapping[str, Any]]) -> bytes:
     """The content of ``quality.json``: the certificate of each map, by its number."""
-    return (json.dumps({str(k): one for k, one in certificates.items()}, separators=(",", ":")) + "\n").encode()
+    return (
+        json.dumps({str(k): one for k, one in certificates.items()}, separators=(",", ":"), allow_nan=False) + "\n"
+    ).encode()
 
 
 def certificate_png(certificate: Mapping[str, Any], occupancy: OccupancyMap) -> bytes:
@@ -222,14 +222,14 @@ def _information(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -
     return csc_array(coo_array((blocks.ravel(), (at[0].ravel(), at[1].ravel())), shape=(size, size)))
 
 
-def _sampled(poses: FloatArray, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _sampled(poses: FloatArray) -> NDArray[np.int64]:
     """Keyscans about a metre apart, the first one among them; farther apart if they are too many."""
     spacing_m = CELL_M
     while True:
         squares = np.floor(poses[:, :2] / spacing_m).astype(np.int64)
-        chosen = np.sort(np.unique(squares[allowed], axis=0, return_index=True)[1])
+        chosen = np.sort(np.unique(squares, axis=0, return_index=True)[1])
         if len(chosen) <= MOST_PLACES:
-            return np.flatnonzero(allowed)[chosen]
+            return chosen
         spacing_m *= 1.5
 
 

@@ -5,6 +5,7 @@ A tile has ``TILE`` by ``TILE`` cells, four to a byte, compressed by zstd. Tile 
 
 import hashlib
 import json
+import secrets
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
@@ -24,6 +25,8 @@ _PACKED: Final = TILE * TILE // 4
 _SHIFTS: Final = np.arange(0, 8, 2, dtype=np.uint8)
 LARGEST_GRID: Final = 64_000_000
 """Cells of a map that a robot puts together; more are refused."""
+LARGEST_ANSWER: Final = 1_000_000
+"""Bytes of the tiles of one answer; a request for more is refused."""
 _EMPTY: Final = b""
 
 Number = tuple[int, int]
@@ -34,7 +37,8 @@ class TileBatch(NamedTuple):
     """An answer to a robot."""
 
     frame: str
-    """Identifies the coordinate frame and the resolution. In another frame, earlier tiles count no longer."""
+    """Identifies the history of tiles, which has one coordinate frame and resolution. In another frame, earlier tiles
+    count no longer."""
     version: int
     """Of the newest change that the robot has with these tiles."""
     resolution_m: float
@@ -78,6 +82,7 @@ class TileHistory:
     """The tiles of one map and when each changed last."""
 
     def __init__(self) -> None:
+        self._tag = secrets.token_hex(4)  # versions of two histories of one frame must not be compared
         self.frame = ""
         self._version = 0
         self._resolution_m = 1.0
@@ -85,7 +90,8 @@ class TileHistory:
         """Version of the last change and content, in the order of these versions."""
 
     def update(self, frame: str, occupancy: OccupancyMap) -> None:
-        """Take the map as it is now; ``frame`` as in ``TileBatch``."""
+        """Take the map as it is now; ``frame`` identifies its coordinate frame and resolution."""
+        frame += self._tag
         if frame != self.frame:
             self.frame, self._tiles, self._version = frame, {}, 0
         self._resolution_m = occupancy.resolution_m
@@ -191,8 +197,8 @@ def padded(occupancy: OccupancyMap) -> OccupancyMap:
 
 
 def frame_of(origin: Sequence[float], session: str, resolution_m: float) -> str:
-    """Identifies a frame by the session that begins it, by the pose (x, y, theta) where it begins, and by the
-    resolution of the grid."""
+    """Identifies a frame by the session that begins it, by about the pose (x, y, theta) where it begins, and by the
+    resolution of the grid. Where a user placed the map, each solution moves that pose a little; the frame stays."""
     x, y, theta = origin
-    text = f"{session} {x:.3f} {y:.3f} {theta:.4f} {resolution_m:g}"
+    text = f"{session} {round(x) + 0} {round(y) + 0} {round(theta, 1) + 0.0:.1f} {resolution_m:g}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]

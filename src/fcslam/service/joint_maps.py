@@ -19,7 +19,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import StoreError
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.joint_tiles import TileHistory, frame_of
+from fcslam.maps.joint_tiles import TileBatch, TileHistory, frame_of
 from fcslam.runs.folder import identity
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.storage.files import write_file
@@ -41,7 +41,7 @@ class JointSession:
     stamp: float
     """Of that keyscan, seconds."""
     heard_s: float
-    """When that took effect, seconds since 1970."""
+    """When that took effect, seconds since 1970; 0: not known."""
 
 
 class JointMaps:
@@ -161,15 +161,17 @@ class ServedJointMaps:
                 self._identity, self._maps, self._histories = known, maps, histories
             return self._maps
 
-    def tiles(self, maps: JointMaps, number: int) -> TileHistory | None:
-        """The tiles of a map; None if there is none."""
+    def since(self, maps: JointMaps, number: int, frame: str, version: int, limit_bytes: int) -> TileBatch | None:
+        """The changed tiles of a map, as ``TileHistory.since``; None if there is no such map."""
         with self._lock:
-            return self._histories.get(maps.frames.get(number, ""))
+            history = self._histories.get(maps.frames.get(number, ""))
+            return None if history is None else history.since(frame, version, limit_bytes)
 
     def say(self, robot: str, live: LivePose) -> None:
-        """Take the pose that a robot says it has."""
+        """Take the pose that a robot of the newest joint maps says it has."""
         with self._lock:
-            self._live[robot] = live
+            if any(session.robot == robot for session in self._maps.sessions):
+                self._live[robot] = live
 
     def pose(self, session: JointSession) -> tuple[tuple[float, float, float], float]:
         """The newest credible pose of a robot and when it was there, seconds since 1970.
@@ -178,7 +180,7 @@ class ServedJointMaps:
         confirms.
         """
         live = self._live.get(session.robot)
-        if live is None or live.map != session.map or live.said_s < session.heard_s:
+        if live is None or live.map != session.map or not 0.0 < session.heard_s <= live.said_s:
             return session.pose, session.heard_s
         apart_m = math.dist(live.pose[:2], session.pose[:2])
         is_credible = apart_m <= 1.0 + LONGEST_SPEED_MPS * (live.said_s - session.heard_s)

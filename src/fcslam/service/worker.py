@@ -259,6 +259,7 @@ class Worker:
             "edits": self._newest_edit,
             "hash": self._read_hash.hex(),
             "times": [(*session, time_s) for session, time_s in self._times.items()],
+            "heard": [(*session, time_s) for session, time_s in self._heard.items()],
         }
         try:
             write_state(self._folder.snapshot, self._fits(), state)
@@ -291,6 +292,7 @@ class Worker:
         self._fleet, self._log = fleet, log
         self._arrivals, self._edits, self._read_hash = state["arrivals"], edits, read_hash
         self._times = {(robot, epoch): time_s for robot, epoch, time_s in state["times"]}
+        self._heard = {(robot, epoch): time_s for robot, epoch, time_s in state["heard"]}
 
     def _fits(self) -> str:
         return f"{code_version()} {self._config.model_dump_json()}"
@@ -318,7 +320,8 @@ class Worker:
             raise
         else:
             self._times[packet.robot, packet.epoch] = packet.time
-            self._heard[packet.robot, packet.epoch] = time.time()
+            if self._applied > self._resumed_at:  # else it took effect before, at a time that only a snapshot knows
+                self._heard[packet.robot, packet.epoch] = time.time()
 
     def _refuse(self, packet: StoredPacket, reason: str) -> None:
         self._store.refuse(packet.robot, packet.epoch, packet.sequence, reason)

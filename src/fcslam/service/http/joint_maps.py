@@ -11,6 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.config import Settings
 from fcslam.lidar.occupancy import FARTHEST_M
+from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.runs import Run, separations
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
@@ -20,8 +21,6 @@ from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import LivePose, ServedJointMaps
 from fcslam.service.summaries import run_of
 
-LARGEST_ANSWER = 1_000_000
-"""Bytes of the tiles of one answer."""
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
 
 
@@ -84,10 +83,11 @@ def joint_map_router(state: ServiceState) -> APIRouter:
 
     def exchange(robot: str, own: OwnPose) -> FleetPoses:
         now_s = time.time()
+        maps = joint.follow(state.mission.joint_maps)
         if own.map is not None and own.pose is not None:
             joint.say(robot, LivePose(own.map, own.pose, now_s))
         robots = []
-        for session in joint.follow(state.mission.joint_maps).sessions:
+        for session in maps.sessions:
             pose, said_s = joint.pose(session)
             robots.append(
                 FleetRobot(robot=session.robot, map=session.map, floor=session.floor, pose=list(pose),
@@ -109,11 +109,11 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         """The tiles of the map that a robot is in, changed since those whose ETag it sends; at most ``limit`` bytes."""
         maps = joint.follow(state.mission.joint_maps)
         number = next((session.map for session in maps.sessions if session.robot == robot), None)
-        tiles = None if number is None else joint.tiles(maps, number)
-        if tiles is None:
+        frame, _, text = known.strip('"').partition("-")
+        version = int(text) if text.isascii() and text.isdigit() else 0
+        batch = None if number is None else joint.since(maps, number, frame, version, limit)
+        if batch is None:
             raise HTTPException(404, f"robot '{robot}' is in no map yet")
-        frame, _, version = known.strip('"').partition("-")
-        batch = tiles.since(frame, int(version) if version.isascii() and version.isdigit() else 0, limit)
         headers = {"ETag": f'"{batch.frame}-{batch.version}"', "Cache-Control": "private, no-cache"}
         if not batch.tiles and frame == batch.frame:
             return Response(status_code=304, headers=headers)
