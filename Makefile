@@ -132,7 +132,7 @@ scale-test: $(INSTALLED)
 	    $(AS_ROOT) true 2>/dev/null && command -v apt-get >/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends postgresql; } >/dev/null 2>&1 || \
 	    echo "No PostgreSQL. To have it: sudo apt-get install postgresql"; \
 	}
-	@$(PYTEST) -rs tests/cluster tests/service/shared tests/service/test_mission_store.py tests/cli/test_serve_shared.py tests/test_scale_page.py
+	@$(PYTEST) -rs tests/cluster tests/service/shared tests/mission/test_mission_store.py tests/cli/test_serve_shared.py tests/test_scale_page.py
 
 fuzz: $(INSTALLED)
 	@folder=$$(mktemp -d) && trap 'rm -r "$$folder"' EXIT && \
