@@ -139,13 +139,18 @@ def read_arrays(path: Path, within: Path | None = None) -> Arrays:
             raise ValueError(f"no archive of arrays: {error}") from error
 
 
-def open_unpacked(path: Path, within: Path | None = None) -> BinaryIO:
+def open_unpacked(path: Path, by_name: bool = False) -> BinaryIO:
     """Open a file that may be compressed by gzip, xz or bzip2, as its first bytes say, to read what it holds.
 
+    Args:
+        path: of the file.
+        by_name: whether a file named as a compressed one must be compressed.
+
     Raises:
-        OSError: as ``open_file``. Reading raises ``LimitError`` if the file expands beyond the limit.
+        OSError: as ``open_file``, or the name says otherwise. Reading raises ``LimitError`` if the file expands beyond
+            the limit.
     """
-    file = open_file(path, within)
+    file = open_file(path)
     magic = file.read(6)
     file.seek(0)
     size = os.fstat(file.fileno()).st_size
@@ -155,7 +160,7 @@ def open_unpacked(path: Path, within: Path | None = None) -> BinaryIO:
         unpacking = lzma.LZMAFile(file)  # noqa: SIM115  _Limited closes it
     elif magic.startswith(b"BZh"):
         unpacking = bz2.BZ2File(file)
-    elif path.suffix in _COMPRESSED:
+    elif by_name and path.suffix in _COMPRESSED:
         file.close()
         raise OSError(f"not a {path.suffix} file")
     else:

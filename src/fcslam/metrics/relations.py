@@ -192,7 +192,7 @@ def read_relations(path: Path) -> Relations:
         EvaluationError: the file cannot be read, has no relation, or a line is not eight finite numbers.
     """
     try:
-        with open_unpacked(path) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
+        with open_unpacked(path, by_name=True) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
     except (OSError, EOFError, UnicodeDecodeError, zlib.error, lzma.LZMAError) as error:
         raise EvaluationError(f"{path}: cannot read the relations ({error})") from error
