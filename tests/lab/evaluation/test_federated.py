@@ -88,7 +88,7 @@ def with_shapes(finished, folder):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_path):
     whole = finished[1]
 
@@ -121,7 +121,7 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
             run_study(study(robots, tmp_path / "torn", **changed))
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_arms_and_seeds_may_be_added_to_a_study(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     run_study(study(robots, tmp_path, seeds=1, arms={"averaged": {"seeds": 1}}))
@@ -156,7 +156,7 @@ def test_nobody_reads_what_a_study_is_while_another_begins_it(robots, tmp_path, 
     assert (tmp_path / "study.yaml").read_bytes() == content
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_robots_own_networks_may_have_fewer_seeds_and_images(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     settings = {"local_seeds": 1, "trained": 3, "arms": {}}
