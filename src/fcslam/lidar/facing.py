@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
@@ -30,6 +30,8 @@ SCANS_WATCHED: Final = 60
 """Scans of a live laser that are compared."""
 FEWEST_PAIRS: Final = 10
 """Fewer pairs say nothing."""
+FEW_PAIRS: Final = 20
+"""About so many pairs decide whether another mounting is worth the search with all pairs."""
 FEWEST_POINTS: Final = 20
 """Fewer common points of two scans are not compared."""
 NOISE_M: Final = 0.1
@@ -137,7 +139,19 @@ def turn_remedy(turn: float, beams: Beams) -> str:
     return f"{wheels}, or the angles of the beams, which then span {span_deg / turn:.0f} deg and not {span_deg:.0f}"
 
 
-Pair = tuple[LaserScan, LaserScan]
+class Pair(NamedTuple):
+    """Two scans of one laser with a motion between them."""
+
+    before: LaserScan
+    after: LaserScan
+    points: FloatArray
+    """Of the later scan in the frame of an upright laser, shape (N, 2), metres."""
+
+    @classmethod
+    def of(cls, before: LaserScan, after: LaserScan) -> Self:
+        """A pair of scans."""
+        at_laser = replace(after.laser, T_base_laser=(0.0, 0.0, 0.0))
+        return cls(before, after, point_scan(after.ranges_m, at_laser).points)
 
 
 def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
@@ -146,10 +160,39 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     Args:
         scans: of one laser, with odometry; as many are read as are needed.
     """
-    trial = _Trial(islice(scans, MOST_SCANS))
+    trial = _Trial(*_pairs(islice(scans, MOST_SCANS)))
     as_stated = trial.agreements(Facing())
     if len(trial.pairs) < FEWEST_PAIRS or trial.mean(as_stated) > ENOUGH_AGREEMENT:
         return None
+    few = trial.thinned()
+    if few.mean(few.agreements(_best(few)[0])) - few.mean(few.agreements(Facing())) < 0.5 * LEAST_GAIN:
+        return None
+    best, scores = _best(trial)
+    square_deg = 90 * round(best.turned_deg / 90)
+    if abs(best.turned_deg - square_deg) <= SQUARE_DEG:
+        best = best._replace(turned_deg=square_deg)
+    upright = best._replace(upside_down=False)
+    if best.upside_down and not trial.leads(trial.agreements(best), trial.agreements(upright), LEAST_LEAD):
+        best = upright  # moves alone do not tell
+    found = trial.agreements(best)
+    far = [each for each in scores if abs(math.remainder(each.turned_deg - best.turned_deg, 360)) > STEPS_DEG[0]]
+    if best.distance == 1.0:
+        far += [each for each in scores if each.distance != 1.0]
+    if best.turn == 1.0:
+        far += [each for each in scores if each.turn != 1.0]
+    is_certain = trial.leads(found, as_stated, LEAST_GAIN) and all(
+        trial.leads(found, scores[each], LEAST_LEAD) for each in far
+    )
+    least = LEAST_AGREEMENT if best.turn == 1.0 else LEAST_TURNED  # where angles are wrong, moves never agree
+    if not is_certain or trial.mean(found) < least:
+        return None
+    turned_deg = math.remainder(best.turned_deg, 360)
+    beams = trial.pairs[0][0].laser.beams
+    return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated), beams)
+
+
+def _best(trial: "_Trial") -> tuple[Facing, dict[Facing, FloatArray]]:
+    """The mounting with the largest agreement, and the agreements of those that were tried first."""
     coarse, fine = STEPS_DEG
     scores = {
         facing: trial.agreements(facing)
@@ -165,28 +208,7 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
         near = [best._replace(distance=best.distance * 1.04**step) for step in range(-5, 6)]
     elif best.turn != 1.0:
         near = [best._replace(turn=best.turn * 1.04**step) for step in range(-4, 5)]
-    best = max(near, key=lambda facing: trial.mean(trial.agreements(facing)))
-    square_deg = 90 * round(best.turned_deg / 90)
-    if abs(best.turned_deg - square_deg) <= SQUARE_DEG:
-        best = best._replace(turned_deg=square_deg)
-    upright = best._replace(upside_down=False)
-    if best.upside_down and not trial.leads(trial.agreements(best), trial.agreements(upright), LEAST_LEAD):
-        best = upright  # moves alone do not tell
-    found = trial.agreements(best)
-    far = [each for each in scores if abs(math.remainder(each.turned_deg - best.turned_deg, 360)) > coarse]
-    if best.distance == 1.0:
-        far += [each for each in scores if each.distance != 1.0]
-    if best.turn == 1.0:
-        far += [each for each in scores if each.turn != 1.0]
-    is_certain = trial.leads(found, as_stated, LEAST_GAIN) and all(
-        trial.leads(found, scores[each], LEAST_LEAD) for each in far
-    )
-    least = LEAST_AGREEMENT if best.turn == 1.0 else LEAST_TURNED  # where angles are wrong, moves never agree
-    if not is_certain or trial.mean(found) < least:
-        return None
-    turned_deg = math.remainder(best.turned_deg, 360)
-    beams = trial.pairs[0][0].laser.beams
-    return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated), beams)
+    return max(near, key=lambda facing: trial.mean(trial.agreements(facing))), scores
 
 
 class FacingWatch:
@@ -206,11 +228,16 @@ class FacingWatch:
 class _Trial:
     """Pairs of scans on which mountings are compared; those with a turn count as much as those with a move."""
 
-    def __init__(self, scans: Iterable[LaserScan]) -> None:
-        moves, turns = _pairs(scans)
+    def __init__(self, moves: list[Pair], turns: list[Pair]) -> None:
+        self._moves, self._turns = moves, turns
         kinds = [moves, turns] if min(len(moves), len(turns)) >= FEWEST_PAIRS // 2 else [[*moves, *turns]]
         self.pairs = [pair for kind in kinds for pair in kind]
         self._weights = np.array([1.0 / len(kind) for kind in kinds for _ in kind])
+
+    def thinned(self) -> "_Trial":
+        """About ``FEW_PAIRS`` of the pairs."""
+        step = max(1, len(self.pairs) // FEW_PAIRS)
+        return _Trial(self._moves[::step], self._turns[::step])
 
     def agreements(self, facing: Facing) -> FloatArray:
         """Agreement of each pair with a mounting; NaN if too few points are common."""
@@ -246,7 +273,7 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[Pair], list[Pair]]:
         if has_moved or has_turned:
             pairs = turns if has_turned else moves
             if len(pairs) < MOST_PAIRS:
-                pairs.append((first, scan))
+                pairs.append(Pair.of(first, scan))
             first = scan
         if len(moves) == len(turns) == MOST_PAIRS:
             break
@@ -261,12 +288,11 @@ def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
 
 def _agreement(pair: Pair, facing: Facing) -> float:
     """Mean agreement, 0 to 1, of the points of the later scan with the earlier one; NaN if too few are in its view."""
-    before, after = pair
+    before, after, in_laser = pair
     T_base_laser = se2.compose(before.laser.T_base_laser, (0.0, 0.0, math.radians(facing.turned_deg)))
     moved = se2.between(before.T_odom_base, after.T_odom_base) * (facing.distance, facing.distance, facing.turn)
     T_before_after = se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
     sign = -1.0 if facing.upside_down else 1.0
-    in_laser = point_scan(after.ranges_m, replace(after.laser, T_base_laser=(0.0, 0.0, 0.0))).points
     points = se2.transform(T_before_after, in_laser * (1.0, sign))
     beams = before.laser.beams
     middle_rad = beams.angle_min_rad + 0.5 * beams.span_rad

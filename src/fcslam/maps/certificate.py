@@ -48,6 +48,7 @@ AGAIN_PER_M: Final = 0.001
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 UNKNOWN_INFORMATION: Final = 1e-4
 """Of where keyscans begin that no edge connects with the first one."""
+_SYMMETRIC: Final[dict[str, Any]] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 
 
@@ -143,16 +144,28 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     information = csc_array(information + diags_array(weak.ravel()))
     chosen = _sampled(poses)
     covariance = np.zeros((3 * len(chosen), 3 * len(chosen)))
-    if len(variables) > 1:
-        solver = splu(csc_array(information[3:, 3:]))
+    if len(chosen) > 1:
         wanted = (3 * chosen[1:, None] + np.arange(3)).ravel() - 3
-        for begin in range(0, len(wanted), 192):
-            part = wanted[begin : begin + 192]
-            unit = np.zeros((3 * len(variables) - 3, len(part)))
-            unit[part, np.arange(len(part))] = 1.0
-            covariance[3:, 3 + begin : 3 + begin + len(part)] = solver.solve(unit)[wanted]
-    covariance = SCALE**2 * (covariance + covariance.T) / 2.0
+        covariance[3:, 3:] = _marginal(csc_array(information[3:, 3:]), wanted)
+    covariance *= SCALE**2
     return Places(variables[chosen], poses[chosen], covariance)
+
+
+def _marginal(information: csc_array, wanted: NDArray[np.int64]) -> FloatArray:
+    """Covariance of the variables ``wanted``: the inverse of the Schur complement of all others, shape (W, W).
+
+    The others are eliminated first. The last block of the factors L U then is the Schur complement.
+    """
+    others = np.setdiff1d(np.arange(information.shape[0]), wanted)
+    if len(others):
+        inner = splu(csc_array(information[others][:, others]), permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC)
+        others = others[np.argsort(inner.perm_c)]
+    order = np.concatenate((others, wanted))
+    factors = splu(csc_array(information[order][:, order]), permc_spec="NATURAL", **_SYMMETRIC)
+    last = slice(len(others), None)
+    schur = factors.L[last, last].toarray() @ factors.U[last, last].toarray()
+    inverse: FloatArray = np.linalg.inv(schur)
+    return 0.5 * (inverse + inverse.T)
 
 
 def relative_error(poses: FloatArray, covariance: FloatArray, within_m: float) -> FloatArray:
