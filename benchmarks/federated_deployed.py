@@ -138,7 +138,7 @@ def compare(report: common.Report, folder: Path) -> None:
     (folder / "tiny.yaml").write_text(TINY)
     options = ["--config", folder / "tiny.yaml", "--public", drawn(folder / "public", 4, 99), "--device", "cpu"]
     embedded, rest = folder / "embedded", [folder / robot for robot in ROBOTS if robot != KILLED]
-    common.run_fcslam("federate", "local", *rest, "-o", embedded, *options)
+    common.run_fcslam("learn", "federate", "local", *rest, "-o", embedded, *options)
     began = time.perf_counter()
     deployed = deploy(folder, options)
     wall_s = time.perf_counter() - began

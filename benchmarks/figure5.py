@@ -3,7 +3,7 @@
     python benchmarks/figure5.py [--fleets FOLDER]
 
 Three robots with LiDAR and camera drive 60 m each in the default simulated building from unknown starts. Each fleet is
-mapped by the paper's system (`fcslam map --preset paper`) and by the defaults; `fcslam evaluate fleet --figure` draws
+mapped by the paper's system (`fcslam map --config paper`) and by the defaults; `fcslam evaluate fleet --figure` draws
 both into docs/images. A join is false if it is off by 0.5 m or 10 deg. ATE is that of the worst robot, each map moved
 onto the truth as a whole.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 import common
 import simulated_fleet
 
-SYSTEMS = {"paper": ("--preset", "paper"), "default": ()}
+SYSTEMS = {"paper": ("--config", "paper"), "default": ()}
 """Options of `fcslam map`, by the name in the pictures' files."""
 PICTURES = common.REPOSITORY / "docs" / "images"
 COLUMNS = {"seed": "", "system": "", "maps": ".0f", "false joins, of 3": ".0f", "worst ATE, m": ".3f", "F1": ".3f",

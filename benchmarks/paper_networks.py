@@ -9,7 +9,7 @@ keypoints of the detector that comes with fcslam and Harris's corners. Each trai
 one thread; with the paper's losses, --collapsing-minutes may be fewer, as its codes collapse soon. The folder
 --training keeps what is done; the same command continues.
 
-Validation: pairs of held-out images, as at the end of `fcslam train`. `benchmarks/homography.py` evaluates the networks
+Validation: pairs of held-out images, as at the end of `fcslam learn train`. `benchmarks/homography.py` evaluates the networks
 on other scenes.
 """
 
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def label(roots: Iterable[Path], teacher: Path) -> None:
-    """Write the keypoints of the bundled detector for each image, as `fcslam train --teacher` reads them."""
+    """Write the keypoints of the bundled detector for each image, as `fcslam learn train --teacher` reads them."""
     detector = OnnxDetector(OnnxConfig())
     for file in find_images(list(roots)):
         target = teacher / f"{file.name}.npz"

@@ -2,7 +2,7 @@
 
     python benchmarks/paper_steps.py --paper VGG.onnx --vgg VGG.onnx --keep steps.jsonl
 
-The first row is `fcslam map --preset paper`. Each row below changes one thing and keeps it. Three robots with LiDAR and
+The first row is `fcslam map --config paper`. Each row below changes one thing and keeps it. Three robots with LiDAR and
 camera drive 60 m each in a simulated building from unknown starts; the seeds were not used while settings were chosen.
 --paper is a network with the paper's encoder that was trained with eqs. (1)-(3), --vgg the same encoder with our losses
 (`benchmarks/paper_networks.py` trains both); without them, their rows are left out.

@@ -3,7 +3,7 @@
     python benchmarks/words.py
 
 The recordings of `fcslam demo`: three robots with LiDAR and camera, 60 m each. The shared vocabulary is trained on the
-places of a fleet in another building (seed 20). Each row is the real command; "words" is `--preset paper` with
+places of a fleet in another building (seed 20). Each row is the real command; "words" is `--config paper` with
 `robot.sends: words`. Kilobytes are those of all three robots. ATE is that of the worst robot, each map moved onto the
 truth as a whole. A join is wrong if it is off by 0.5 m or 10 deg.
 """
@@ -39,8 +39,8 @@ def main() -> None:
         file = folder / "words.yaml"
         file.write_text(yaml.safe_dump(shared), encoding="utf-8")
         rows.append(row("ranges, LiDAR and camera descriptors (default)", folder, fleet))
-        rows.append(row("ranges and camera descriptors (preset paper)", folder, fleet, "--preset", "paper"))
-        rows.append(row("words and their own map", folder, fleet, "--preset", "paper", "--config", file))
+        rows.append(row("ranges and camera descriptors (preset paper)", folder, fleet, "--config", "paper"))
+        rows.append(row("words and their own map", folder, fleet, "--config", "paper", "--config", file))
     report.table("Bytes of three robots", COLUMNS, rows)
     report.write()
 
@@ -50,7 +50,7 @@ def vocabulary(folder: Path, fleets: Path) -> Path:
     fleet = common.simulated(fleets / "other", "--robots", simulated_fleet.ROBOTS, "--seed", OTHER_SEED)
     run, words = folder / "other-run", folder / "shared.words"
     common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--output", run)
-    common.run_fcslam("vocabulary", run, "--output", words)
+    common.run_fcslam("learn", "vocabulary", run, "--output", words)
     return words
 
 

@@ -60,14 +60,14 @@ the code.
 Write the complete default configuration to a file, change it, and give it to a command:
 
 ```sh
-fcslam config dump > mission.yaml
+fcslam setup config > mission.yaml
 fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 ```
 
 - A file needs only the keys that you change. Missing keys have their default values.
 - An unknown key or a value out of range is an error. The message names the nearest known key.
 - Every run folder contains the complete configuration of the run, `config.yaml`.
-- `fcslam map --preset paper` begins with [the paper's settings](../results/paper.md) in place of the defaults. The keys
+- `fcslam map --config paper` begins with [the paper's settings](../results/paper.md) in place of the defaults. The keys
   of `--config` override them.
 - In Python, `fcslam.map_recordings(..., config={"map": {"resolution_m": 0.1}})` takes the same keys.
 
@@ -110,7 +110,7 @@ Training on one machine and on several robots has configuration files of its own
 
 ## Training
 
-`fcslam train --config` reads these keys from a YAML file.
+`fcslam learn train --config` reads these keys from a YAML file.
 """
 
 FEDERATED = """\

@@ -278,7 +278,7 @@ def test_the_page_recovers_when_the_service_is_killed_and_comes_back(page, packe
 @pytest.fixture(scope="module")
 def credentials(tmp_path_factory):
     folder = tmp_path_factory.mktemp("credentials")
-    assert main(["certificates", "-o", str(folder), "--robot=robot_1", "--robot=robot_2", "--viewer=eye"]) == 0
+    assert main(["setup", "certificates", "-o", str(folder), "--robot=robot_1", "--robot=robot_2", "--viewer=eye"]) == 0
     return folder
 
 
@@ -321,7 +321,7 @@ def test_a_token_that_expires_is_asked_for_again_and_nothing_is_lost(page, packe
         page.get_by_label("Token").fill(eye)
         page.keyboard.press("Enter")
         says(page, "#robots", "robot_1")
-        assert main(["tokens", "revoke", "--tokens", str(tokens), "eye"]) == 0
+        assert main(["setup", "tokens", "revoke", "--tokens", str(tokens), "eye"]) == 0
         service.process.send_signal(signal.SIGHUP)
         page.get_by_role("button", name="robot_1").click()
         says(page, "#status", "needs a token")

@@ -55,13 +55,13 @@ def test_config_dump_prints_the_mission_configuration(capsys, monkeypatch):
     mission = types.ModuleType("fcslam.mission.mission")
     mission.MissionConfig = MissionConfig
     monkeypatch.setitem(sys.modules, "fcslam.mission.mission", mission)
-    assert main(["config", "dump"]) == 0
+    assert main(["setup", "config"]) == 0
     assert capsys.readouterr().out == "# of everything random\nseed: 7\n"
 
 
 def test_config_dump_of_a_preset_is_a_configuration_file(capsys, tmp_path):
     file = tmp_path / "paper.yaml"
-    assert main(["config", "dump", "--preset", "paper"]) == 0
+    assert main(["setup", "config", "--config", "paper"]) == 0
     file.write_text(capsys.readouterr().out)
     assert load(MissionConfig, file) == load(MissionConfig, Preset.PAPER.file)
     assert load(MissionConfig, file) != MissionConfig()

@@ -1,4 +1,4 @@
-"""`fcslam federate`: a whole run of real robots, its resuming, and what bad input is answered."""
+"""`fcslam learn federate`: a whole run of real robots, its resuming, and what bad input is answered."""
 
 import contextlib
 import csv
@@ -42,7 +42,7 @@ def fleet(tmp_path_factory):
 def federate(fleet, output, *more, robots=("one", "two", "bare")):
     folders = [str(fleet / robot) for robot in robots]
     settings = ["--config", str(fleet / "tiny.yaml"), "--device", "cpu"]
-    return main(["federate", "local", *folders, "--output", str(output), *settings, *more])
+    return main(["learn", "federate", "local", *folders, "--output", str(output), *settings, *more])
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_a_run_folder_holds_everything(run, fleet):
 def test_the_delivered_detectors_run(run, fleet, tmp_path):
     run, _ = run
     for name in ("detector.onnx", "detector-int8.onnx"):
-        arguments = ["extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
+        arguments = ["learn", "extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
         assert main([*arguments, "--weights", str(run / name)]) == 0
         assert len(list((tmp_path / name).rglob("*.npz"))) == 3
 
@@ -104,22 +104,22 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["federate", "local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
-        (["federate", "local", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
-        (["federate", "local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
-        (["federate", "local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
-        (["federate", "local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
-        (["federate", "local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is not a checkpoint"),
-        (["federate", "serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is not a HOST:PORT"),
-        (["federate", "serve", "a:1", "-o", "{out}"], "give --tokens"),
-        (["federate", "serve", "a:1", "-o", "{out}", *SERVE_FILES], "give --tokens"),
-        (["federate", "serve", "a:1", "-o", "{out}", "--insecure", *TOKENS, *SERVE_FILES], "or --insecure"),
-        (["federate", "serve", "a:1", "-o", "{out}", *TOKENS, *SERVE_FILES], "no certificate with its key"),
-        (["federate", "join", "http://a:1", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
-        (["federate", "join", "a", "{fleet}/one", "-o", "{out}"], "is not the address of a cloud"),
-        (["federate", "join", "https://a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give a PEM"),
-        (["federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--name", ""], "give another --name"),
-        (["federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--token-file", "{fleet}/no"], "no token"),
+        (["learn", "federate", "local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
+        (["learn", "federate", "local", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
+        (["learn", "federate", "local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
+        (["learn", "federate", "local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
+        (["learn", "federate", "local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
+        (["learn", "federate", "local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is not a checkpoint"),
+        (["learn", "federate", "serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is not a HOST:PORT"),
+        (["learn", "federate", "serve", "a:1", "-o", "{out}"], "give --tokens"),
+        (["learn", "federate", "serve", "a:1", "-o", "{out}", *SERVE_FILES], "give --tokens"),
+        (["learn", "federate", "serve", "a:1", "-o", "{out}", "--insecure", *TOKENS, *SERVE_FILES], "or --insecure"),
+        (["learn", "federate", "serve", "a:1", "-o", "{out}", *TOKENS, *SERVE_FILES], "no certificate with its key"),
+        (["learn", "federate", "join", "http://a:1", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
+        (["learn", "federate", "join", "a", "{fleet}/one", "-o", "{out}"], "is not the address of a cloud"),
+        (["learn", "federate", "join", "https://a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give a PEM"),
+        (["learn", "federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--name", ""], "give another --name"),
+        (["learn", "federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--token-file", "{fleet}/no"], "no token"),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
@@ -147,9 +147,9 @@ def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
 )
 def test_each_subcommand_has_its_own_options_only(arguments, fleet, tmp_path, capsys):
     given = [word.format(fleet=fleet, out=tmp_path / "out") for word in arguments]
-    assert main(["federate", *given]) == BAD_INPUT
+    assert main(["learn", "federate", *given]) == BAD_INPUT
     error = capsys.readouterr().err
-    assert "Usage: fcslam federate" in error
+    assert "Usage: fcslam learn federate" in error
     assert "Traceback" not in error
 
 

@@ -111,10 +111,10 @@ def completed(line):
     ("line", "offered"),
     [
         ("fcslam ma", ["map"]),
-        ("fcslam federate ", ["local", "serve", "join"]),
+        ("fcslam learn federate ", ["local", "serve", "join"]),
         ("fcslam map --no-f", ["--no-fuse"]),
         ("fcslam simulate --building of", ["office"]),
-        ("fcslam extract pho", []),
+        ("fcslam learn extract pho", []),
         ("fcslam map --output ru", []),
     ],
 )

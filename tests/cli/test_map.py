@@ -141,7 +141,7 @@ def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsy
 @pytest.mark.slow
 def test_the_configuration_goes_round(logs, run, tmp_path, capsys):
     """A dumped configuration is a valid one, and the run's own gives the run again, byte for byte."""
-    assert main(["config", "dump"]) == 0
+    assert main(["setup", "config"]) == 0
     (tmp_path / "dumped.yaml").write_text(capsys.readouterr().out)
     assert run_map(logs[0], "--config", tmp_path / "dumped.yaml", "--output", tmp_path / "one") == 0
     assert (tmp_path / "one" / "config.yaml").read_text() == dump(MissionConfig())
@@ -377,12 +377,12 @@ def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, l
 def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log, capsys):
     run, file = tmp_path / "run", tmp_path / "own.yaml"
     file.write_text("fleet: {matcher: {delta: 1.5}}")
-    assert run_map(log, "--preset", "paper", "--config", file, "--output", run) == 0
+    assert run_map(log, "--config", "paper", "--config", file, "--output", run) == 0
     fleet = yaml.safe_load((run / "config.yaml").read_text())["fleet"]
     assert (fleet["matcher"]["decision"], fleet["matcher"]["delta"]) == ("similarity", 1.5)
     assert (fleet["fusion"], fleet["matcher"]["vocabulary"]["strategy"]) == ("two_point", "rebuild")
     capsys.readouterr()
-    assert run_map(log, "--preset", "paper", "--fusion", "joint", "--output", tmp_path / "other") == 2
+    assert run_map(log, "--config", "paper", "--fusion", "joint", "--output", tmp_path / "other") == 2
     assert capsys.readouterr().err.splitlines() == [
         "fcslam: the command line: fleet: matcher.decision similarity measures no transform, which the joint "
         "graph needs; set fusion to two_point, first_two or n_point"

@@ -1,4 +1,4 @@
-"""`fcslam serve` and `fcslam certificates`: what is refused at once, and a real service behind TLS."""
+"""`fcslam serve` and `fcslam setup certificates`: what is refused at once, and a real service behind TLS."""
 
 import json
 import os
@@ -39,7 +39,7 @@ API = "/api/v1"
 def credentials(tmp_path_factory):
     folder = tmp_path_factory.mktemp("credentials")
     names = [f"--robot=robot_{k}" for k in (1, 2, 3)]
-    assert main(["certificates", "-o", str(folder), "--host", "cloud.test", *names, "--admin", "boss"]) == 0
+    assert main(["setup", "certificates", "-o", str(folder), "--host", "cloud.test", *names, "--admin", "boss"]) == 0
     return folder
 
 
@@ -62,7 +62,7 @@ def test_only_robots_have_certificates_of_their_own(credentials):
 def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials, tmp_path):
     mine = shutil.copytree(credentials, tmp_path / "credentials")  # the other tests share theirs
     before = {name: (mine / name).read_bytes() for name in ("ca.pem", "ca.key", "tokens/boss")}
-    assert main(["certificates", "-o", str(mine), "--robot", "new", "--robot", "robot_1"]) == 0
+    assert main(["setup", "certificates", "-o", str(mine), "--robot", "new", "--robot", "robot_1"]) == 0
     assert {name: (mine / name).read_bytes() for name in before} == before
     names = [entry["name"] for entry in yaml.safe_load((mine / "tokens.yaml").read_text())["tokens"]]
     assert names == ["robot_1", "robot_2", "robot_3", "boss", "new"]
@@ -70,7 +70,7 @@ def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials, tmp_pat
 
 @pytest.mark.parametrize("wrong", [["--robot", "a", "--viewer", "a"], ["--robot", "a+1"], ["--robot", "../a"]])
 def test_names_that_cannot_be_are_refused(tmp_path, wrong, capsys):
-    assert main(["certificates", "-o", str(tmp_path / "out"), *wrong]) == 2
+    assert main(["setup", "certificates", "-o", str(tmp_path / "out"), *wrong]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 

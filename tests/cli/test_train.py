@@ -1,4 +1,4 @@
-"""`fcslam train`: one small run from images to files, and what it says of bad input."""
+"""`fcslam learn train`: one small run from images to files, and what it says of bad input."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def photos(tmp_path):
 
 
 def complaint(capsys, *arguments):
-    assert main(["train", *map(str, arguments), *OPTIONS, "--quiet"]) == BAD_INPUT
+    assert main(["learn", "train", *map(str, arguments), *OPTIONS, "--quiet"]) == BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
     return line
 
@@ -36,7 +36,7 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
     settings = tmp_path / "settings.yaml"
     settings.write_text("{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1}")
     output = photos / "out"  # what is in there is no image to train on
-    arguments = ["train", str(photos), "-o", str(output), "--config", str(settings), *OPTIONS]
+    arguments = ["learn", "train", str(photos), "-o", str(output), "--config", str(settings), *OPTIONS]
     assert main(arguments) == 0
     captured = capsys.readouterr()
     made = ["detector.onnx", "detector-int8.onnx", "training.png", "card.md"]
@@ -75,7 +75,7 @@ def test_training_starts_from_given_weights(file, photos, tmp_path, capsys):
         f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1, learning_rate: {LAST_RATE}}}"
     )
     first, second, third = (tmp_path / name for name in ("first", "second", "third"))
-    arguments = ["train", str(photos), "--config", str(settings), *OPTIONS, "--output"]
+    arguments = ["learn", "train", str(photos), "--config", str(settings), *OPTIONS, "--output"]
     assert main([*arguments, str(first)]) == 0
     assert main([*arguments, str(second), "--start", str(first / file)]) == 0
     assert not (second / "shapes").exists()

@@ -76,7 +76,7 @@ def test_the_proof_depends_on_every_bit(monkeypatch):
 
 
 def test_the_authority_of_a_cluster_signs_no_robots_certificate(tmp_path):
-    assert main(["certificates", "--output", str(tmp_path), "--robot", "anna", "--cluster"]) == 0
+    assert main(["setup", "certificates", "--output", str(tmp_path), "--robot", "anna", "--cluster"]) == 0
     authority = x509.load_pem_x509_certificate((tmp_path / "cluster" / "ca.pem").read_bytes())
     member = x509.load_pem_x509_certificate((tmp_path / "cluster" / "member.pem").read_bytes())
     member.verify_directly_issued_by(authority)

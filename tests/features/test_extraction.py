@@ -46,7 +46,7 @@ def images(tmp_path, image):
 
 def test_every_sort_of_image_gives_the_same_features(images, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["extract", str(images), "-o", str(out), "--detector", "orb", "--keypoints", "200"]) == 0
+    assert main(["learn", "extract", str(images), "-o", str(out), "--detector", "orb", "--keypoints", "200"]) == 0
     shown = capsys.readouterr()
     assert "features of 8 images, 2 of them without a keypoint, 3 files skipped" in shown.out
     assert shown.err.count("skipped: ") == 3
@@ -63,7 +63,7 @@ def test_every_sort_of_image_gives_the_same_features(images, tmp_path, capsys):
 
 
 def test_the_file_is_as_documented(images, tmp_path):
-    main(["extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb"])
+    main(["learn", "extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb"])
     with np.load(tmp_path / "grey.npz", allow_pickle=False) as archive:
         assert {name: (archive[name].dtype.str, archive[name].ndim) for name in archive.files} == {
             "keypoints": ("<f4", 2),
@@ -76,7 +76,7 @@ def test_the_file_is_as_documented(images, tmp_path):
 
 
 def test_nms_keeps_boxes_apart(images, tmp_path):
-    main(["extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb", "--nms", "8"])
+    main(["learn", "extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb", "--nms", "8"])
     points = read_features(tmp_path / "grey.npz")[0].keypoints_px
     gaps = np.abs(points[:, None] - points)
     common = np.prod(np.clip(8 - gaps, 0, None), axis=2)
@@ -97,7 +97,7 @@ def test_larger_images_are_shrunk_and_keypoints_are_in_their_own_pixels(image):
 def test_networks_extract_as_well(images, tmp_path, capsys):
     pytest.importorskip("onnxruntime")
     tiny_network(tmp_path / "n.onnx")
-    assert main(["extract", str(images), "-o", str(tmp_path / "out"), "--weights", str(tmp_path / "n.onnx")]) == 0
+    assert main(["learn", "extract", str(images), "-o", str(tmp_path / "out"), "--weights", str(tmp_path / "n.onnx")]) == 0
     assert "tiny-1: features of 8 images, 3 files skipped" in capsys.readouterr().out
 
 
@@ -112,16 +112,16 @@ def test_networks_extract_as_well(images, tmp_path, capsys):
     ],
 )
 def test_mistakes_are_told(images, tmp_path, capsys, arguments, message):
-    assert main(["extract", *(word.format(folder=tmp_path) for word in arguments)]) == 2
+    assert main(["learn", "extract", *(word.format(folder=tmp_path) for word in arguments)]) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_two_images_of_one_name_are_told_apart(tmp_path, image, capsys):
     for name in ("a.png", "a.jpg"):
         cv2.imwrite(str(tmp_path / name), image)
-    assert main(["extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
+    assert main(["learn", "extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
     assert "a.png: has the features' name in common with" in capsys.readouterr().err
-    assert main(["extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
+    assert main(["learn", "extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
     assert "features of 1 images, 1 files skipped" in capsys.readouterr().out  # its own output is no input
 
 
@@ -195,7 +195,7 @@ def test_taking_some_takes_all_that_is_known_of_them(image):
 
 def test_scales_of_the_command_line(images, tmp_path, capsys):
     tiny_network(tmp_path / "n.onnx")
-    given = ["extract", str(images / "grey.png"), "--weights", str(tmp_path / "n.onnx"), "--keypoints", "50", "-o"]
+    given = ["learn", "extract", str(images / "grey.png"), "--weights", str(tmp_path / "n.onnx"), "--keypoints", "50", "-o"]
     for scales in ("1", "0.5", "1,0.5"):
         assert main([*given, str(tmp_path / scales), "--scales", scales]) == 0
     one, half, both = (read_features(tmp_path / scales / "grey.npz")[0] for scales in ("1", "0.5", "1,0.5"))

@@ -6,7 +6,7 @@ import re
 import httpx
 from fastapi import FastAPI
 
-from fcslam.page.routes import ASSETS, DOCUMENTATION, FILES, documentation_router, page_router
+from fcslam.page.routes import ASSETS, FILES, page_router
 
 LARGEST_BYTES = 150_000
 
@@ -14,14 +14,13 @@ LARGEST_BYTES = 150_000
 def test_the_page_is_served_and_forbids_scripts_and_hosts_that_are_not_its_own() -> None:
     app = FastAPI(docs_url=None)
     app.include_router(page_router())
-    app.include_router(documentation_router())
 
     async def get(path: str) -> httpx.Response:
         transport = httpx.ASGITransport(app=app)
         async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
             return await client.get(path)
 
-    for path, (name, media_type) in (FILES | DOCUMENTATION).items():
+    for path, (name, media_type) in FILES.items():
         answer = asyncio.run(get(path))
         assert answer.status_code == 200
         assert answer.headers["content-type"].startswith(media_type)

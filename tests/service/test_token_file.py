@@ -1,4 +1,4 @@
-"""`fcslam tokens`: tokens are added, replaced and revoked; the file always is one that the service can read."""
+"""`fcslam setup tokens`: tokens are added, replaced and revoked; the file always is one that the service can read."""
 
 import os
 from datetime import UTC, datetime
@@ -12,7 +12,7 @@ from fcslam.service.http.authentication import Authenticator, Identity, Role, re
 @pytest.fixture
 def tokens(tmp_path):
     def run(*arguments, name="tokens.yaml"):
-        return main(["tokens", *arguments, "--tokens", str(tmp_path / name)])
+        return main(["setup", "tokens", *arguments, "--tokens", str(tmp_path / name)])
 
     run.path, run.folder = tmp_path / "tokens.yaml", tmp_path
     return run

@@ -33,6 +33,7 @@ from fcslam.cli import changes as changed
 from fcslam.cli import convert as conversion
 from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
+from fcslam.cli import play as playback
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
 from fcslam.cli.examples import examples
@@ -43,13 +44,7 @@ BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
 OF_THE_SERVICE = {"cryptography", "fastapi", "httpx", "prometheus_client", "starlette", "uvicorn"}
 """Packages of the extra ``service``: mapping recordings needs none of them."""
 PROGRAM = "fcslam"
-MAPS, ROBOTS, SIMULATION, LEARNING, SETUP = (
-    "Maps",
-    "Robots and service",
-    "Simulation and measurements",
-    "Cameras and learning",
-    "Setup",
-)
+MAPS, ROBOTS, STUDY, MORE = "Maps", "Robots and service", "Simulation and measurements", "More"
 """Groups of the commands in `fcslam --help`."""
 COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
@@ -73,13 +68,23 @@ app.command(
     ),
 )(mapping.map_recordings)
 app.command(
-    "localize",
+    "info",
     rich_help_panel=MAPS,
     epilog=examples(
-        "fcslam localize today.bag --map runs/building",
-        "fcslam localize today.bag --map office.yaml --initial-pose 2,3.5,1.57",
+        "fcslam info robot1.bag",
+        "fcslam info robot1.mcap --json",
     ),
-)(localization.localize)
+)(info.info)
+app.command(
+    "show",
+    rich_help_panel=MAPS,
+    epilog=examples(
+        "fcslam show runs/building",
+        "fcslam show runs/building --html report.html",
+        "fcslam show runs/building/mission.fcslam --port 8350 --no-open",
+    ),
+)(show.show)
+app.add_typer(edit.app, name="edit", rich_help_panel=MAPS)
 app.command(
     "changes",
     rich_help_panel=MAPS,
@@ -88,9 +93,6 @@ app.command(
         "fcslam changes runs/building --since 2026-11-20 -o changes/week",
     ),
 )(changed.changes)
-app.command("info", rich_help_panel=MAPS, epilog=examples("fcslam info robot1.bag", "fcslam info robot1.mcap --json"))(
-    info.info
-)
 app.command(
     "convert",
     rich_help_panel=MAPS,
@@ -100,40 +102,39 @@ app.command(
     ),
 )(conversion.convert)
 app.command(
-    "simulate",
-    rich_help_panel=SIMULATION,
-    epilog=examples(
-        "fcslam simulate --building office --no-camera",
-        "fcslam simulate --lighting day --lighting evening --moved-furniture 0.3",
-        "fcslam simulate --robots 20 --building office -o office --resume",
-    ),
-)(simulate.simulate)
-app.command("extract", rich_help_panel=LEARNING, epilog=examples("fcslam extract photos -o features --keypoints 1000"))(
-    extract.extract
-)
-app.command(
-    "demo",
-    rich_help_panel=SIMULATION,
-    epilog=examples("fcslam demo --live", "fcslam demo --robots 4 --no-camera -o demo4"),
-)(demo.demo)
-app.command(
-    "train", rich_help_panel=LEARNING, epilog=examples("fcslam train photos -o detector", "fcslam train photos --quick")
-)(train.train)
-app.command(
     "robot",
     rich_help_panel=ROBOTS,
     epilog=examples(
-        "fcslam robot robot1.clf.gz --server http://127.0.0.1:8340 --state state",
-        "fcslam robot robot1.bag --server https://cloud:8340 --state s --token-file t",
         "fcslam robot ros2:/robot1 -o runs/robot1",
-        "fcslam robot ros2:/robot1 --localize runs/building",
+        "fcslam robot ros2:/robot1 --server https://cloud:8340 --state s --token-file t",
+        "fcslam robot anna=ros1:/robot1 --scan-topic /front/scan",
         "fcslam robot --explain-traffic",
     ),
 )(robots.robot)
 app.command(
+    "play",
+    rich_help_panel=ROBOTS,
+    epilog=examples(
+        "fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state",
+        "fcslam play robot1.bag --server https://cloud:8340 --state s --token-file t",
+    ),
+)(playback.play)
+app.command(
+    "localize",
+    rich_help_panel=ROBOTS,
+    epilog=examples(
+        "fcslam localize today.bag --map runs/building",
+        "fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57",
+        "fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy",
+    ),
+)(localization.localize)
+app.command(
     "record",
     rich_help_panel=ROBOTS,
-    epilog=examples("fcslam record ros2:/robot1 -o day.mcap", "fcslam record ros1:/ -o day.bag --duration 600"),
+    epilog=examples(
+        "fcslam record ros2:/robot1 -o day.mcap",
+        "fcslam record ros1:/ -o day.bag --duration 600",
+    ),
 )(live.record)
 app.command(
     "serve",
@@ -144,30 +145,68 @@ app.command(
     ),
 )(serve.serve)
 app.command(
-    "show",
-    rich_help_panel=MAPS,
+    "demo",
+    rich_help_panel=STUDY,
     epilog=examples(
-        "fcslam show runs/building",
-        "fcslam show runs/building --html report.html",
-        "fcslam show runs/building/mission.fcslam --port 8350 --no-open",
+        "fcslam demo --live",
+        "fcslam demo --robots 4 --no-camera -o demo4",
     ),
-)(show.show)
+)(demo.demo)
 app.command(
-    "certificates",
-    rich_help_panel=ROBOTS,
-    epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),
-)(certificates.certificates)
-app.command(
+    "simulate",
+    rich_help_panel=STUDY,
+    epilog=examples(
+        "fcslam simulate --building office --no-camera",
+        "fcslam simulate --lighting day --lighting evening --moved-furniture 0.3",
+        "fcslam simulate --robots 20 --building office -o office --resume",
+    ),
+)(simulate.simulate)
+app.add_typer(evaluate.app, name="evaluate", rich_help_panel=STUDY)
+learn = typer.Typer(no_args_is_help=True, help="Train the detector of the cameras, alone or together, and use it.")
+learn.command(
+    "train",
+    epilog=examples(
+        "fcslam learn train photos -o detector",
+        "fcslam learn train photos --quick",
+    ),
+)(train.train)
+learn.add_typer(federate.app, name="federate")
+learn.command(
+    "extract",
+    epilog=examples(
+        "fcslam learn extract photos -o features --keypoints 1000",
+    ),
+)(extract.extract)
+learn.command(
     "vocabulary",
-    rich_help_panel=LEARNING,
-    epilog=examples("fcslam vocabulary runs/building -o building.words"),
+    epilog=examples(
+        "fcslam learn vocabulary runs/building -o building.words",
+    ),
 )(vocabulary.vocabulary)
-app.command("warm-up", rich_help_panel=SETUP, epilog=examples("fcslam warm-up"))(warming.warm_up)
-app.add_typer(edit.app, name="edit", rich_help_panel=MAPS)
-app.add_typer(federate.app, name="federate", rich_help_panel=LEARNING)
-app.add_typer(tokens.app, name="tokens", rich_help_panel=ROBOTS)
-app.add_typer(evaluate.app, name="evaluate", rich_help_panel=SIMULATION)
-app.add_typer(config.app, name="config", rich_help_panel=SETUP)
+app.add_typer(learn, name="learn", rich_help_panel=MORE)
+setup = typer.Typer(no_args_is_help=True, help="Configuration, credentials, and compiling ahead of the first run.")
+setup.command(
+    "config",
+    epilog=examples(
+        "fcslam setup config > mission.yaml",
+        "fcslam map robot1.bag robot2.bag --config mission.yaml",
+        "fcslam setup config paper > paper.yaml",
+    ),
+)(config.config)
+setup.command(
+    "certificates",
+    epilog=examples(
+        "fcslam setup certificates --host cloud.local --robot robot1 --admin boss",
+    ),
+)(certificates.certificates)
+setup.add_typer(tokens.app, name="tokens")
+setup.command(
+    "warm-up",
+    epilog=examples(
+        "fcslam setup warm-up",
+    ),
+)(warming.warm_up)
+app.add_typer(setup, name="setup", rich_help_panel=MORE)
 
 
 def _finite(text: str) -> float:

@@ -1,4 +1,4 @@
-"""`fcslam certificates`: credentials for a service with TLS, for development and closed networks."""
+"""`fcslam setup certificates`: credentials for a service with TLS, for development and closed networks."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,29 +1,17 @@
-"""`fcslam config`: the configuration as a file."""
+"""`fcslam setup config`: the configuration as a file."""
+
+from typing import Annotated
 
 import typer
 
-from fcslam.cli.examples import examples
-from fcslam.cli.mission_options import PresetName, mission_config
-
-_DUMP = "fcslam config dump > mission.yaml"
-
-app = typer.Typer(no_args_is_help=True)
+from fcslam.cli.mission_options import mission_config
+from fcslam.lab.presets import Preset
 
 
-@app.callback(epilog=examples(_DUMP))
-def config() -> None:
-    """Print the configuration of a mission."""
+def config(
+    preset: Annotated[Preset | None, typer.Argument(help="A preset in place of the defaults.")] = None,
+) -> None:
+    """Print a complete configuration of a mission as YAML. A comment above each key explains it."""
+    from fcslam.config import dump
 
-
-@app.command(
-    epilog=examples(
-        _DUMP,
-        "fcslam map robot1.bag robot2.bag --config mission.yaml",
-        "fcslam config dump --preset paper > paper.yaml",
-    )
-)
-def dump(preset: PresetName = None) -> None:
-    """Print a complete configuration as YAML, the default one or a preset. A comment above each key explains it."""
-    from fcslam.config import dump as as_yaml
-
-    typer.echo(as_yaml(mission_config(None, preset=preset)), nl=False)
+    typer.echo(dump(mission_config(None if preset is None else [preset])), nl=False)

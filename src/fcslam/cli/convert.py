@@ -10,17 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.groups import with_groups
 from fcslam.cli.options import Force, Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
-    BaseFrame,
-    CameraTopic,
-    CloudHeights,
-    LaserPose,
-    OdomFrame,
-    OdomTopic,
-    ScanTopic,
-    bag_options,
+    BagFlags,
     open_recording,
     print_faults,
     print_notes,
@@ -38,6 +32,7 @@ _FOLDER_MARKS = {"": "metadata.yaml", _RECORDING: "meta.yaml"}
 """The file that marks a folder as a recording, which ``--force`` may replace; by suffix of the folder."""
 
 
+@with_groups
 def convert(
     recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Recording to read.")],
     output: Annotated[
@@ -49,21 +44,13 @@ def convert(
         ),
     ],
     *,
-    scan_topic: ScanTopic = None,
-    odom_topic: OdomTopic = None,
-    odom_frame: OdomFrame = None,
-    base_frame: BaseFrame = None,
-    camera_topic: CameraTopic = None,
-    laser_pose: LaserPose = None,
-    cloud_band: CloudHeights = None,
+    bags: BagFlags,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the scans, odometry and images of a recording in another format."""
     console = notices(quiet)
-    source = open_recording(
-        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
-    )
+    source = open_recording(recording, bags.options())
     _prepare(output, force)
     survey = source.survey()
     print_notes(console, survey.notes)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet
+from fcslam.cli.options import BuildingSeed, NoCamera, Quiet
 from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.show import Live, OpenBrowser, Port, live_page
-from fcslam.lab.simulation.options import Building, Scanner
+from fcslam.cli.show import Live, live_page
+from fcslam.lab.simulation.options import Scanner
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,8 +31,6 @@ def demo(
     ] = Path("demo"),
     robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 3,
     seed: BuildingSeed = 1,
-    building: BuildingKind = Building.DEFAULT,
-    path_length: PathLength = 60.0,
     no_camera: NoCamera = False,
     learn: Annotated[
         bool,
@@ -41,8 +39,6 @@ def demo(
         ),
     ] = False,
     live: Live = False,
-    port: Port = 0,
-    open_browser: OpenBrowser = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
@@ -60,9 +56,7 @@ def demo(
         _check_learning(no_camera)
     camera = None if no_camera else CameraSettings()
     settings = SimulationSettings(
-        building=building,
         robots=robots,
-        path_length_m=path_length,
         lidar=SCANNERS[Scanner.LD19],
         camera=camera,
     )
@@ -72,7 +66,7 @@ def demo(
     prepare_fleet_folder(output / RECORDINGS, settings, seed, resume=False)
     console = notices(quiet)
     stages = _Stages(console, 5 if learn else 4)
-    stages.begin(f"simulate: {robots} robots drive {path_length:g} m each; their starts are unknown")
+    stages.begin(f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
     sources = [open_source(place) for place in recordings]
     config = MissionConfig(seed=seed)
@@ -80,7 +74,7 @@ def demo(
         stages.begin("learn: the robots train the detector together, and no image leaves its robot")
         config = _with_detector(config, learn_together(sources, config, output / LEARNING, console))
     stages.begin("map each robot, recognise places, fuse the maps")
-    with live_page(output / RUN, port, open_browser) if live else nullcontext() as page:
+    with live_page(output / RUN, 0) if live else nullcontext() as page:
         map_sources(sources, config, output / RUN, console, force=True, page=page)
         stages.begin("evaluate: compare with the truth")
         _evaluate(output, console)

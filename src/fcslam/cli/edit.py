@@ -32,7 +32,6 @@ _NEGATIVE = {"ignore_unknown_options": True}
 
 Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, in whose map you read the coordinates.")]
-Author = Annotated[str | None, typer.Option(help="Name of the editor.", show_default="your user name")]
 MapIndex = Annotated[int, typer.Option("--map", min=0, help="Number of the map, as in map_1.png.")]
 Polygon = Annotated[
     str, typer.Argument(metavar="CORNERS", help='Corners in the map, metres: "X,Y X,Y X,Y". Two are a rectangle.')
@@ -65,13 +64,11 @@ def list_edits(mission: Mission) -> None:
 
 
 @app.command(epilog=examples("fcslam edit undo runs/building 2"))
-def undo(
-    mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of the edit.")], *, author: Author = None
-) -> None:
+def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of the edit.")]) -> None:
     """Undo an edit. The map is then what it would have been without it."""
     from fcslam.records import Undo
 
-    _append(mission, Undo(number), author)
+    _append(mission, Undo(number))
 
 
 @app.command(
@@ -88,8 +85,6 @@ def veto(
             help="Both ends, as in closures.csv. Without stamps: all closures between the two sessions.",
         ),
     ],
-    *,
-    author: Author = None,
 ) -> None:
     """Exclude a closure, or all closures between two sessions."""
     from fcslam.errors import InputError
@@ -97,22 +92,21 @@ def veto(
 
     match ends:
         case [session_i, session_j]:
-            _decide(mission, Veto(session_i, session_j), author)
+            _decide(mission, Veto(session_i, session_j))
         case [session_i, stamp_i, session_j, stamp_j]:
-            _decide(mission, Veto(session_i, session_j, (_number(stamp_i), _number(stamp_j))), author)
+            _decide(mission, Veto(session_i, session_j, (_number(stamp_i), _number(stamp_j))))
         case _:
             raise InputError("give two sessions, or two sessions each with a stamp: anna 1010.25 ben 1010.251")
 
 
 @app.command(epilog=examples("fcslam edit pin runs/building anna 1010.25 ben 1010.251"))
 def pin(
-    mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ, *,
-    author: Author = None,
+    mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ,
 ) -> None:  # fmt: skip
     """Accept a closure of closures.csv, whatever the other evidence says. It joins maps."""
     from fcslam.records import Pin
 
-    _decide(mission, Pin(session_i, session_j, (stamp_i, stamp_j)), author)
+    _decide(mission, Pin(session_i, session_j, (stamp_i, stamp_j)))
 
 
 @app.command(epilog=examples("fcslam edit close runs/building anna 1010.25 ben 1010.251 --pose 0.5,0,3.1"))
@@ -127,7 +121,6 @@ def close(
     tolerance: Annotated[
         str, typer.Option(metavar="M,RAD", help="Standard deviations of the pose (metres, radians).")
     ] = "0.2,0.1",
-    author: Author = None,
 ) -> None:
     """Add a closure: where session J was at a time, seen from session I at another. It joins maps."""
     from fcslam.cli.recordings import pose as read_pose
@@ -138,7 +131,7 @@ def close(
     if len(deviations) != 2:
         raise InputError(f"--tolerance {tolerance!r}: give metres and radians, as in --tolerance 0.2,0.1")
     T_i_j, (metres, radians) = read_pose("--pose", pose), map(_number, deviations)
-    _append(mission, ManualClosure(session_i, stamp_i, session_j, stamp_j, T_i_j, (metres, radians)), author)
+    _append(mission, ManualClosure(session_i, stamp_i, session_j, stamp_j, T_i_j, (metres, radians)))
 
 
 @app.command(
@@ -154,7 +147,6 @@ def remove(
     *,
     first_s: Annotated[float | None, typer.Option("--from", help="Stamp at which the stretch begins.")] = None,
     last_s: Annotated[float | None, typer.Option("--to", help="Stamp at which it ends.")] = None,
-    author: Author = None,
 ) -> None:
     """Remove a robot, a session, or a stretch of a session from the map."""
     from fcslam.cloud.sessions import robot_and_epoch
@@ -162,10 +154,10 @@ def remove(
 
     robot, epoch = robot_and_epoch(session)
     if first_s is None and last_s is None:
-        _append(mission, Removal(robot, None if session == robot else epoch), author)
+        _append(mission, Removal(robot, None if session == robot else epoch))
     else:
         stretch = (-math.inf if first_s is None else first_s, math.inf if last_s is None else last_s)
-        _append(mission, Cut(session, *_bounded(stretch)), author)
+        _append(mission, Cut(session, *_bounded(stretch)))
 
 
 @app.command(context_settings=_NEGATIVE, epilog=examples("fcslam edit floor runs/building anna+1 2"))
@@ -173,13 +165,11 @@ def floor(
     mission: Mission,
     session: Session,
     name: Annotated[str, typer.Argument(metavar="FLOOR", help="1 to 16 letters, digits and . _ + -")],
-    *,
-    author: Author = None,
 ) -> None:
     """Say which floor a session is on, whatever it named. It leaves the maps of other floors."""
     from fcslam.records import FloorLabel
 
-    _append(mission, FloorLabel(session, name), author)
+    _append(mission, FloorLabel(session, name))
 
 
 @app.command(
@@ -188,27 +178,27 @@ def floor(
         'fcslam edit erase runs/building "1,2 3,4"', 'fcslam edit erase runs/building "0,0 2,0 1,2" --map 1'
     ),
 )
-def erase(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
+def erase(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
     """Make a part of the map unknown."""
     from fcslam.records import RegionUse
 
-    _draw(run, RegionUse.ERASE, "", corners, map_index, author)
+    _draw(run, RegionUse.ERASE, "", corners, map_index)
 
 
 @app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit free runs/building "1,2 3,4"'))
-def free(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
+def free(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
     """Mark a part of the map as free, where something stood only for a while."""
     from fcslam.records import RegionUse
 
-    _draw(run, RegionUse.FREE, "", corners, map_index, author)
+    _draw(run, RegionUse.FREE, "", corners, map_index)
 
 
 @app.command("keep-out", context_settings=_NEGATIVE, epilog=examples('fcslam edit keep-out runs/building "1,2 3,4"'))
-def keep_out(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
+def keep_out(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
     """Forbid a part of the map: map_keepout.pgm and map_keepout.yaml, the mask of Nav2's keepout filter."""
     from fcslam.records import RegionUse
 
-    _draw(run, RegionUse.KEEP_OUT, "", corners, map_index, author)
+    _draw(run, RegionUse.KEEP_OUT, "", corners, map_index)
 
 
 @app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit area runs/building "Room 12" "1,2 3,4"'))
@@ -218,12 +208,11 @@ def area(
     corners: Polygon,
     *,
     map_index: MapIndex = 0,
-    author: Author = None,
 ) -> None:
     """Name a part of the map: map_areas.geojson."""
     from fcslam.records import RegionUse
 
-    _draw(run, RegionUse.AREA, name, corners, map_index, author)
+    _draw(run, RegionUse.AREA, name, corners, map_index)
 
 
 @app.command(
@@ -254,7 +243,6 @@ def place(
         typer.Option(metavar="X,Y=U,V", help="A point of the map and where it shall be (metres); give two or more."),
     ] = None,
     map_index: MapIndex = 0,
-    author: Author = None,
 ) -> None:
     """Choose the map's coordinate frame: by walls or a motion, by a pose, or by points, for example of a floor plan."""
     from fcslam.cli.recordings import pose as read_pose
@@ -271,15 +259,15 @@ def place(
         )
     if at is not None and pose is not None:
         session, _, stamp = at.rpartition(",")
-        _append(run, Placement(session, _number(stamp), read_pose("--pose", pose)), author)
+        _append(run, Placement(session, _number(stamp), read_pose("--pose", pose)))
         return
     opened, mission = _opened(run)
     if not match:
         T_new_map = _turned(opened, map_index, to_walls, rotate, _point("--shift", shift))
-        _append(run, moved_map(opened, mission, map_index, T_new_map), author)
+        _append(run, moved_map(opened, mission, map_index, T_new_map))
         return
     T_new_map, off_m = _matched(match)
-    _append(run, moved_map(opened, mission, map_index, T_new_map), author)
+    _append(run, moved_map(opened, mission, map_index, T_new_map))
     typer.echo(f"the points fit to {off_m:.3f} m", err=True)
 
 
@@ -306,17 +294,17 @@ def _turned(run: "Run", map_index: int, to_walls: bool, degrees: float, shift: t
     return np.array((*shift, math.radians(degrees) - walls_rad))
 
 
-def _decide(mission: Path, decision: "Veto | Pin", author: str | None) -> None:
+def _decide(mission: Path, decision: "Veto | Pin") -> None:
     """Append a decision about closures; a run folder says which closures there are."""
     from fcslam.mission.map_edits import check_closure
     from fcslam.runs import open_run
 
     if mission.is_dir():
         check_closure(open_run(mission), decision)
-    _append(mission, decision, author)
+    _append(mission, decision)
 
 
-def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: int, author: str | None) -> None:
+def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: int) -> None:
     from fcslam.mission.map_edits import region_in_map
 
     points = [_point("a corner", corner) for corner in corners.split()]
@@ -324,7 +312,7 @@ def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: in
         (left, low), (right, high) = points
         points = [(left, low), (right, low), (right, high), (left, high)]
     run, mission = _opened(folder)
-    _append(folder, region_in_map(run, mission, map_index, use, name, points), author)
+    _append(folder, region_in_map(run, mission, map_index, use, name, points))
 
 
 def _opened(folder: Path) -> "tuple[Run, SavedMission]":
@@ -338,11 +326,11 @@ def _opened(folder: Path) -> "tuple[Run, SavedMission]":
     return open_run(folder), read_mission(folder)
 
 
-def _append(path: Path, content: "Change | Undo", author: str | None) -> None:
+def _append(path: Path, content: "Change | Undo") -> None:
     """Append an edit, and say what to do next."""
     from fcslam.mission.mission_file import edit_mission
 
-    (edit,) = edit_mission(path, [content], author or _user(), time.time())
+    (edit,) = edit_mission(path, [content], _user(), time.time())
     typer.echo(f"edit {edit.number}; to apply it: fcslam map --onto {path} -o NEW", err=True)
 
 

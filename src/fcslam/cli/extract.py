@@ -1,4 +1,4 @@
-"""`fcslam extract`: keypoints and descriptors of images."""
+"""`fcslam learn extract`: keypoints and descriptors of images."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,22 +27,12 @@ def extract(
     keypoints: Annotated[
         int, typer.Option(min=1, max=2000, help="Number of keypoints to keep of each image, strongest first.")
     ] = 1000,
-    nms: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=64.0,
-            help="Side of the boxes of non-maximum suppression, in pixels; 0 keeps all keypoints.",
-            show_default="4 for onnx, 0 for orb",
-        ),
-    ] = None,
     scales: Annotated[
         str, typer.Option(metavar="S,S,...", help="Scales of the image pyramid of a network.")
     ] = "1,0.71,0.5",
     longest_side: Annotated[
         int, typer.Option(min=16, max=16384, help="Shrink larger images to this longest side, in pixels.")
     ] = 2048,
-    threads: Annotated[int, typer.Option(min=1, max=64, help="Number of threads of the network.")] = 1,
     quiet: Quiet = False,
 ) -> None:
     """Find keypoints in images and describe each with 256 bits."""
@@ -58,16 +48,14 @@ def extract(
     kind = DetectorKind.ONNX if is_network else DetectorKind.ORB
     if weights is not None and not is_network:
         raise FeatureError(f"{weights}: detector orb has no weights; leave --weights out, or --detector")
-    nms_px = 4.0 if nms is None else nms
-    onnx = OnnxConfig(weights=weights, most_features=keypoints, nms_px=nms_px, threads=threads)
+    onnx = OnnxConfig(weights=weights, most_features=keypoints)
     onnx = changed(onnx, {"scales": scales.split(",")}, "the command line")
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images
     output = output or new_folder(FEATURES)
     console, done, empty = notices(quiet), 0, 0
-    # a network suppresses non-maxima itself, before it keeps the strongest keypoints
-    outcomes = extract_all(files, root, output, finder, longest_side, 0.0 if is_network else nms or 0.0)
+    outcomes = extract_all(files, root, output, finder, longest_side)
     with ProgressDisplay(console) as display:
         extracted_one = display.start("extracting", len(files))
         for outcome in outcomes:

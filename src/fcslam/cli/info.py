@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.groups import with_groups
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
-    BaseFrame,
-    CameraTopic,
-    CloudHeights,
-    LaserPose,
-    OdomFrame,
-    OdomTopic,
-    ScanTopic,
-    bag_options,
+    BagFlags,
 )
 from fcslam.errors import printable
 
@@ -31,6 +25,7 @@ if TYPE_CHECKING:
 GAPS_SHOWN = 3
 
 
+@with_groups
 def info(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
     *,
@@ -43,18 +38,12 @@ def info(
             "a bag.",
         ),
     ] = False,
-    scan_topic: ScanTopic = None,
-    odom_topic: OdomTopic = None,
-    odom_frame: OdomFrame = None,
-    base_frame: BaseFrame = None,
-    camera_topic: CameraTopic = None,
-    laser_pose: LaserPose = None,
-    cloud_band: CloudHeights = None,
+    bags: BagFlags,
 ) -> None:
     """Say what is in a recording, and whether it can be mapped; if not, why, and the exit code is 1."""
     from fcslam.sources.inspection import inspect
 
-    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
+    options = bags.options()
     found = _with_contradictions(inspect(recording, options), options)
     console = answers()
     if as_json:

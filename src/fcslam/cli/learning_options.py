@@ -1,46 +1,40 @@
 """Options of a robot that learns with its fleet, and their checks before anything starts."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from fcslam.cli.server_options import ServerFlags
     from fcslam.learning.federated.learning_beside import RobotLearningPlan
     from fcslam.robot.frontend import RobotConfig
 
+_LEARNING = "Learning"
+
 LearnConfig = Annotated[
     Path | None,
-    typer.Option(help="YAML file of settings of learning; see docs/howto/federated.md.", rich_help_panel="Learning"),
+    typer.Option(help="YAML file of settings of learning; see docs/howto/federated.md.", rich_help_panel=_LEARNING),
 ]
 
 
-class RobotLearning(NamedTuple):
-    """The options of a robot that learns; it shows the service who it is as it does for its packets."""
+@dataclass(frozen=True)
+class LearningFlags:
+    """Whether and how a robot learns with its fleet."""
 
-    learn: bool
-    config: Path | None
-    token_file: Path | None
-    ca: Path | None
-    own: tuple[Path, Path] | None
-    """Its certificate and the key."""
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn", rich_help_panel=_LEARNING,
+            help="Train the detector with the fleet on what the camera saw again: after a recording, and while a live "
+            "robot stands still. No image leaves.",
+        ),
+    ] = False  # fmt: skip
+    learn_config: LearnConfig = None
 
-    def checked(self, localizes: bool) -> "RobotLearning":
-        """The same options; settings without --learn are refused, and --learn of a robot that localises.
-
-        Raises:
-            InputError: there are some.
-        """
-        from fcslam.errors import InputError
-
-        if not self.learn and self.config is not None:
-            raise InputError("--learn-config needs --learn")
-        if self.learn and localizes:
-            raise InputError("--learn is for a robot that maps; leave out --localize or --learn")
-        return self
-
-    def plan(self, settings: "RobotConfig", service: str | None, state: Path | None) -> "RobotLearningPlan | None":
-        """Where and how the robot learns, with the service at this address; None: it does not.
+    def plan(self, settings: "RobotConfig", server: "ServerFlags", state: Path | None) -> "RobotLearningPlan | None":
+        """Where and how the robot learns, with this service; None: it does not.
 
         ``state`` is its state folder.
 
@@ -49,23 +43,31 @@ class RobotLearning(NamedTuple):
             InputError: something is missing, or does not fit.
             TrainingError: a library is missing.
         """
+        from fcslam.errors import InputError
+
         if not self.learn:
+            if self.learn_config is not None:
+                raise InputError("--learn-config needs --learn")
             return None
         from fcslam.cli.training_options import require_training_libraries
         from fcslam.config import load
-        from fcslam.errors import InputError
         from fcslam.features.detector_kinds import DetectorKind
         from fcslam.learning.federated.learning_beside import RobotLearningPlan
         from fcslam.learning.federated.live_settings import RobotLearningSettings
         from fcslam.records import Channel
         from fcslam.wire.http_transport import addresses
 
-        if service is None or state is None:
+        access = server.access()
+        if access is None or state is None:
             raise InputError(
                 "a robot learns with the fleet of a service, from keyframes on its disk: give --server and --state"
             )
         if Channel.CAMERA not in settings.channels or settings.views.detector is not DetectorKind.ONNX:
             raise InputError("--learn trains the camera's network; robot.channels or robot.views.detector leave it out")
-        chosen = RobotLearningSettings() if self.config is None else load(RobotLearningSettings, self.config)
+        chosen = RobotLearningSettings()
+        if self.learn_config is not None:
+            chosen = load(RobotLearningSettings, self.learn_config)
         require_training_libraries("flwr", extra="federated")
-        return RobotLearningPlan(addresses(service)[0], chosen, state, self.token_file, self.ca, self.own)
+        return RobotLearningPlan(
+            addresses(access.url)[0], chosen, state, server.token_file, server.ca, access.certificate
+        )

@@ -1,4 +1,4 @@
-"""A live robot on a ROS network, for `fcslam robot` and `fcslam record`."""
+"""A live robot on a ROS network, for `fcslam robot`, `fcslam localize` and `fcslam record`."""
 
 import logging
 import sys
@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.groups import with_groups
 from fcslam.cli.options import Force, Quiet
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
-from fcslam.cli.recordings import CameraTopic, OdomTopic, ScanTopic, bag_options, print_faults
-from fcslam.cli.ros_options import DomainId, stopping
+from fcslam.cli.recordings import TopicFlags, print_faults
+from fcslam.cli.ros_options import stopping
 from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
+    from fcslam.ros.addresses import RosAddress
     from fcslam.ros.parameters import NodeParameters
     from fcslam.sources import BagOptions
 
@@ -38,18 +40,35 @@ SWITCH_INTERVAL_S = 0.001
 """Time after which a thread that publishes yields to the one that maps; Python's own is 5 ms."""
 
 
-def map_live(
-    address: str,
-    name: str | None,
+def named_address(argument: str, otherwise: str) -> "tuple[str, RosAddress]":
+    """Name and address of a live robot, given as ADDRESS or NAME=ADDRESS.
+
+    Raises:
+        InputError: it is not an address; the error says ``otherwise``.
+        NetworkError: its namespace cannot be used.
+    """
+    from fcslam.errors import InputError
+    from fcslam.ros.addresses import is_address, parse_address
+
+    name, equals, address = argument.partition("=")
+    address = address if equals else name
+    if not is_address(address):
+        raise InputError(f"{argument}: is not the address of a live robot, as ros2:/robot1 is; {otherwise}")
+    place = parse_address(address)
+    return name if equals else place.robot, place
+
+
+def drive_live(
+    name: str,
+    place: "RosAddress",
     start: "Callable[..., Robot | LocalizedRobot]",
     options: "BagOptions",
-    domain: int | None,
     parameters: "NodeParameters",
     output: Path | None,
     console: "Console",
-    learning: "RobotLearningPlan | None",
+    learning: "RobotLearningPlan | None" = None,
 ) -> None:
-    """Run the robot at ``address`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
+    """Run the robot at ``place`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
     With a plan for ``learning``, it learns while it stands still.
 
     Raises:
@@ -57,11 +76,10 @@ def map_live(
     """
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind
-    from fcslam.ros.addresses import open_network, parse_address
+    from fcslam.ros.addresses import open_network
     from fcslam.ros.node import RobotNode, await_sensors
     from fcslam.runs import prepare_output
 
-    place = parse_address(address)
     output = new_folder(RUNS) if output is None else output
     prepare_output(output, force=False)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -75,9 +93,9 @@ def map_live(
             notify(event.text)
 
     with (
-        closing(open_network(place, domain)) as network,
+        closing(open_network(place)) as network,
         compiled(console),
-        start(name or place.robot, on_event=tell) as robot,
+        start(name, on_event=tell) as robot,
     ):
         topics = await_sensors(network, place.namespace, options, parameters.topic_timeout)
         for note in topics.notes:
@@ -164,6 +182,7 @@ def _watch(
     return watch
 
 
+@with_groups
 def record(
     source: Annotated[
         str,
@@ -178,39 +197,33 @@ def record(
     duration: Annotated[
         float | None, typer.Option(min=0.1, help="Time to record, in seconds.", show_default="until Ctrl-C")
     ] = None,
-    domain: DomainId = None,
-    scan_topic: ScanTopic = None,
-    odom_topic: OdomTopic = None,
-    camera_topic: CameraTopic = None,
+    topics: TopicFlags,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Record the sensors of a live robot: everything that `fcslam map` needs."""
     from threading import Timer
 
-    from fcslam.errors import InputError
-    from fcslam.ros.addresses import is_address, open_network, parse_address
+    from fcslam.ros.addresses import open_network
     from fcslam.ros.node import await_sensors
     from fcslam.ros.parameters import NodeParameters
     from fcslam.ros.record import record as record_messages
     from fcslam.sources import BagOptions
 
     console = notices(quiet)
-    if not is_address(source):
-        raise InputError(f"{source}: is not an address of a live robot; give one as in ros2:/robot1")
-    place = parse_address(source)
+    _, place = named_address(source, otherwise="a recording is there already")
     _prepare(output, place.network, force)
-    options = bag_options(scan_topic, odom_topic, camera_topic, None) or BagOptions()
+    options = topics.options() or BagOptions()
     stop = Event()
-    with closing(open_network(place, domain)) as network:
-        topics = await_sensors(network, place.namespace, options, NodeParameters().topic_timeout)
-        print_line(console, f"records {', '.join(topics.kinds)}; Ctrl-C ends the recording")
+    with closing(open_network(place)) as network:
+        found = await_sensors(network, place.namespace, options, NodeParameters().topic_timeout)
+        print_line(console, f"records {', '.join(found.kinds)}; Ctrl-C ends the recording")
         timer = Timer(duration or 0.0, stop.set)
         timer.daemon = True
         with stopping(stop.set):
             if duration is not None:
                 timer.start()
-            counts = record_messages(network, topics, output, stop, lambda line: print_line(console, line))
+            counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
         timer.cancel()
     print_line(answers(), f"{_listed(counts)}: {output}")
 

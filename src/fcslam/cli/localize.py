@@ -1,43 +1,38 @@
-"""`fcslam localize`: a recording and a finished map in, the poses of the robot in the map out."""
+"""`fcslam localize`: a robot and a finished map in, the poses of the robot in the map out."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFile, mission_config
+from fcslam.cli.groups import with_groups
+from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
-from fcslam.cli.recordings import (
-    BaseFrame,
-    CameraTopic,
-    CloudHeights,
-    InitialPose,
-    LaserPose,
-    OdomFrame,
-    OdomTopic,
-    ScanTopic,
-    bag_options,
-    open_recording,
-    pose,
-    print_faults,
-    print_notes,
-)
+from fcslam.cli.recordings import BagFlags, open_recording, pose, print_faults, print_notes
+from fcslam.cli.ros_options import RosFlags
+from fcslam.cli.server_options import AccessFlags
 from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission.localization import LocalizationProgress
     from fcslam.runs import Run
+    from fcslam.wire.http_transport import Server
 
 
+@with_groups
 def localize(
-    recording: Annotated[
+    source: Annotated[
         str,
         typer.Argument(
-            metavar="RECORDING",
-            help="The robot's recording. The file names the robot; NAME=RECORDING gives another name.",
+            metavar="SOURCE",
+            help="The robot's recording, or a live robot as ros2:/NAMESPACE. The file or the namespace names the "
+            "robot; NAME=SOURCE gives another name.",
         ),
     ],
     *,
@@ -46,11 +41,19 @@ def localize(
         typer.Option(
             "--map",
             metavar="MAP",
-            help="Run folder, mission file, or the YAML file of a ROS map.",
+            help="Run folder, mission file, or the YAML file of a ROS map. With --server, a folder for a copy of the "
+            "cloud's maps; if the cloud cannot be reached, an earlier copy is used.",
         ),
     ],
     output: Annotated[Path | None, output_option("Run folder to write.", RUNS)] = None,
-    initial_pose: InitialPose = None,
+    initial_pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,THETA",
+            help="About where the robot starts in the map (metres, radians).",
+            show_default="anywhere",
+        ),
+    ] = None,
     floor: Annotated[
         str, typer.Option(help="Floor that the robot is on.", show_default="that of the map, if it has one only")
     ] = "",
@@ -62,14 +65,10 @@ def localize(
             "map before stays beside it as map_before.",
         ),
     ] = False,
-    config: ConfigFile = None,
-    scan_topic: ScanTopic = None,
-    odom_topic: OdomTopic = None,
-    odom_frame: OdomFrame = None,
-    base_frame: BaseFrame = None,
-    camera_topic: CameraTopic = None,
-    laser_pose: LaserPose = None,
-    cloud_band: CloudHeights = None,
+    config: ConfigFiles = None,
+    access: AccessFlags,
+    bags: BagFlags,
+    ros: RosFlags,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -79,26 +78,55 @@ def localize(
     """
     from fcslam.api import localize as localize_recording
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.errors import InputError
     from fcslam.runs import prepare_output
+    from fcslam.storage.files import keep_private
 
+    settings, console = mission_config(config), notices(quiet)
+    initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
+    server, is_live = access.access(), _is_live(source)
+    if is_live and update:
+        raise InputError("--update draws what a recording saw; record the drive, and localise the recording")
+    if server is not None:
+        keep_private()
+        _fetch(map_path, server, console)
+    if is_live:
+        from fcslam.cli.live import drive_live, named_address
+        from fcslam.live.localized_robot import LocalizedRobot
+        from fcslam.sources import BagOptions
+
+        name, place = named_address(source, otherwise="")
+        start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
+        drive_live(name, place, start, bags.options() or BagOptions(), ros.parameters(), output, console)
+        return
     output = output or new_folder(RUNS)
     prepare_output(output, force)
-    settings = mission_config(config)
-    initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
-    source = open_recording(
-        recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
-    )
-    survey = source.survey()
-    console = notices(quiet)
+    recording = open_recording(source, bags.options())
+    survey = recording.survey()
     print_notes(console, survey.notes)
     with compiled(console), ProgressDisplay(console) as display:
         run = localize_recording(
-            source, map_path, initial_pose=initial, config=settings, progress=_watch(display, survey.scan_count),
+            recording, map_path, initial_pose=initial, config=settings, progress=_watch(display, survey.scan_count),
             floor=floor, update=update,
         )  # fmt: skip
         run.save(output, force)
-    print_faults(console, {source.name: source.faults})
-    _report(run, source.name, output)
+    print_faults(console, {recording.name: recording.faults})
+    _report(run, recording.name, output)
+
+
+def _is_live(source: str) -> bool:
+    from fcslam.ros.addresses import is_address
+
+    return is_address(source.rpartition("=")[2])
+
+
+def _fetch(folder: Path, server: "Server", console: "Console") -> None:
+    """Copy the maps of the cloud to ``folder``, or say why an earlier copy is used."""
+    from fcslam.live.served_map import fetch_maps
+
+    trouble = fetch_maps(folder, server)
+    copied = f"copied the maps of {server.url} to {folder}"
+    print_line(console, f"{trouble}; the robot uses the earlier copy in {folder}" if trouble else copied)
 
 
 def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationProgress], None]":

@@ -12,16 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import (
-    ConfigFile,
-    Fusion,
-    MissionSeed,
-    NoFuse,
-    PresetName,
-    Starts,
-    StartSigma,
-    mission_config,
-)
+from fcslam.cli.groups import with_groups
+from fcslam.cli.mission_options import MissionFlags
 from fcslam.cli.options import (
     Force,
     Quiet,
@@ -30,19 +22,12 @@ from fcslam.cli.options import (
 )
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
-    BaseFrame,
-    CameraTopic,
-    CloudHeights,
-    LaserPose,
-    OdomFrame,
-    OdomTopic,
-    ScanTopic,
-    bag_options,
+    BagFlags,
     open_recordings,
     print_faults,
     print_notes,
 )
-from fcslam.cli.show import Live, OpenBrowser, Port, live_page
+from fcslam.cli.show import Live, Port, live_page
 from fcslam.cli.warm_up import compiled, cores
 
 if TYPE_CHECKING:
@@ -66,6 +51,7 @@ class AlignTo(StrEnum):
     WALLS = "walls"
 
 
+@with_groups
 def map_recordings(
     logs: Annotated[
         list[str] | None,
@@ -95,8 +81,6 @@ def map_recordings(
             "repeated.",
         ),
     ] = None,
-    no_fuse: NoFuse = False,
-    fusion: Fusion = None,
     veto: Annotated[
         Path | None,
         typer.Option(
@@ -119,21 +103,10 @@ def map_recordings(
         AlignTo | None,
         typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y."),
     ] = None,
-    config: ConfigFile = None,
-    preset: PresetName = None,
-    scan_topic: ScanTopic = None,
-    odom_topic: OdomTopic = None,
-    odom_frame: OdomFrame = None,
-    base_frame: BaseFrame = None,
-    camera_topic: CameraTopic = None,
-    laser_pose: LaserPose = None,
-    cloud_band: CloudHeights = None,
-    seed: MissionSeed = None,
-    start: Starts = None,
-    start_sigma: StartSigma = None,
+    mission: MissionFlags,
+    bags: BagFlags,
     live: Live = False,
     port: Port = 0,
-    open_browser: OpenBrowser = None,
     force: Force = False,
     quiet: Quiet = False,
     workers: WorkersOption = "1",
@@ -152,12 +125,10 @@ def map_recordings(
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = None if onto is None else read_mission(onto)
-        settings = mission_config(
-            config, seed, no_fuse, fusion, continued_config(earlier), preset, start or (), start_sigma
-        )
+        settings = mission.settings(continued_config(earlier))
         vetoes = read_vetoes(veto) if veto else ()
         anchors = _anchors(plan, plan_scale, align)
-        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose, odom_frame, base_frame, cloud_band)
+        options = bags.options()
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
@@ -165,7 +136,7 @@ def map_recordings(
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers)
-    with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:
+    with verifying(chosen) as verify, live_page(output, port) if live else nullcontext() as page:
         map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors, verify, anchors)
 
 

@@ -1,12 +1,12 @@
 """Options that choose the configuration of a mission, and the configuration that follows from them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
@@ -14,85 +14,77 @@ if TYPE_CHECKING:
 
 _FROM_CONFIG = "that of the configuration"
 
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option("--config", "-c", help="Configuration file (YAML); `fcslam config dump` prints the default one."),
-]
-PresetName = Annotated[
-    Preset | None,
-    typer.Option(
-        "--preset",
-        help="Named configuration. paper: FC-SLAM to the letter; words alone decide, a new vocabulary at every place, "
-        "rigid maps. Keys of --config override it.",
-        show_default="none",
-    ),
-]
-MissionSeed = Annotated[
-    int | None, typer.Option("--seed", min=0, help="Seed of all random draws.", show_default=_FROM_CONFIG)
-]
-NoFuse = Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone and fuse no maps.")]
-Fusion = Annotated[
-    FusionStrategy | None,
-    typer.Option(
-        help="How maps are fused. joint: one robust pose graph of all robots. two_point, first_two, n_point: "
-        "rigid maps, aligned on the two most similar, the first two, or all of their matched points.",
-        show_default=_FROM_CONFIG,
-    ),
-]
-
-Starts = Annotated[
+ConfigFiles = Annotated[
     list[str] | None,
     typer.Option(
-        "--start",
-        metavar="NAME=X,Y,THETA",
-        help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
-        "forces nothing. Can be repeated.",
-    ),
-]
-StartSigma = Annotated[
-    str | None,
-    typer.Option(
-        metavar="M,RAD",
-        help="Standard deviations of the starts: of x and y, and of the heading.",
-        show_default=_FROM_CONFIG,
+        "--config",
+        "-c",
+        metavar="FILE|PRESET",
+        help="Configuration file (YAML; `fcslam setup config` prints the default one) or the preset `paper`: FC-SLAM "
+        "to the letter. Can be repeated; a later one overrides keys of an earlier one.",
     ),
 ]
 
 
-def mission_config(
-    file: Path | None,
-    seed: int | None = None,
-    no_fuse: bool = False,
-    fusion: FusionStrategy | None = None,
-    default: "MissionConfig | None" = None,
-    preset: Preset | None = None,
-    starts: Sequence[str] = (),
-    start_sigma: str | None = None,
-) -> "MissionConfig":
-    """The configuration in ``file`` over the preset, or else the default one, with the changes of the command line.
+@dataclass(frozen=True)
+class MissionFlags:
+    """The configuration of a mission, and what is often changed in it."""
 
-    Raises:
-        ConfigError: the file cannot be read or is invalid, or options of the command line do not fit the rest.
-    """
-    from fcslam.cli.recordings import pose
-    from fcslam.config import changed, load
-    from fcslam.errors import ConfigError
-    from fcslam.mission.mission import MissionConfig
+    config: ConfigFiles = None
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all random draws.", show_default=_FROM_CONFIG)] = None
+    no_fuse: Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone and fuse no maps.")] = False
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=X,Y,THETA",
+            help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
+            "forces nothing. Can be repeated.",
+        ),
+    ] = None
+    start_sigma: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M,RAD",
+            help="Standard deviations of the starts: of x and y, and of the heading.",
+            show_default=_FROM_CONFIG,
+        ),
+    ] = None
 
-    config = default if default is not None and file is None and preset is None else MissionConfig()
-    for chosen in (None if preset is None else preset.file, file):
-        config = config if chosen is None else load(MissionConfig, chosen, over=config)
-    if no_fuse and fusion is not None:
-        raise ConfigError("--no-fuse fuses no maps, so --fusion has no effect; give only one of them")
-    fleet: dict[str, object] = {"join_maps": False} if no_fuse else {}
-    fleet |= {"fusion": fusion} if fusion is not None else {}
-    if starts:
-        named = [start.partition("=")[::2] for start in starts]
-        fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+    def settings(self, default: "MissionConfig | None") -> "MissionConfig":
+        """The configuration; without a file or preset, ``default`` with the changes of the command line.
+
+        Raises:
+            ConfigError: a file cannot be used, a robot is given two starts, or a number cannot be used.
+            InputError: a start is not a pose.
+        """
+        from fcslam.cli.recordings import pose
+        from fcslam.config import changed
+        from fcslam.errors import ConfigError
+
+        named = [start.partition("=")[::2] for start in self.start or ()]
         if len(dict(named)) < len(named):
             raise ConfigError("--start: a robot is given two starts; give one for each")
-    if start_sigma is not None:
-        fleet["start_sigma"] = start_sigma.split(",")
-    changes: dict[str, object] = {"fleet": fleet} if fleet else {}
-    changes |= {"seed": seed} if seed is not None else {}
-    return changed(config, changes, "the command line")
+        fleet: dict[str, object] = {"join_maps": False} if self.no_fuse else {}
+        if named:
+            fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+        if self.start_sigma is not None:
+            fleet["start_sigma"] = self.start_sigma.split(",")
+        changes: dict[str, object] = {"fleet": fleet} if fleet else {}
+        changes |= {} if self.seed is None else {"seed": self.seed}
+        return changed(mission_config(self.config, default), changes, "the command line")
+
+
+def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None" = None) -> "MissionConfig":
+    """The configuration of files and presets, the first one over the default; without any, ``default`` if it is given.
+
+    Raises:
+        ConfigError: a file cannot be read or is invalid.
+    """
+    from fcslam.config import load
+    from fcslam.mission.mission import MissionConfig
+
+    config = default if default is not None and not chosen else MissionConfig()
+    presets = {preset.value: preset.file for preset in Preset}
+    for one in chosen or ():
+        config = load(MissionConfig, presets.get(one, Path(one)), over=config)
+    return config

@@ -5,8 +5,6 @@ from typing import Annotated, Any
 
 import typer
 
-from fcslam.lab.simulation.options import Building
-
 Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print neither progress nor notices on stderr, only errors.")
 ]
@@ -14,12 +12,7 @@ Force = Annotated[bool, typer.Option("--force", "-f", help="Replace the output i
 Csv = Annotated[
     Path | None, typer.Option(help="Also write the numbers to this file: as JSON if it ends in .json, else as CSV.")
 ]
-WrongM = Annotated[float, typer.Option(min=0.0, help="Translation error above which a closure is wrong, in metres.")]
-WrongDeg = Annotated[float, typer.Option(min=0.0, help="Rotation error above which a closure is wrong, in degrees.")]
-
 BuildingSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the building, the routes and the noise.")]
-BuildingKind = Annotated[Building, typer.Option("--building", help="Kind of building.")]
-PathLength = Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Distance that each robot drives, in metres.")]
 NoCamera = Annotated[bool, typer.Option("--no-camera", help="Simulate LiDARs only. This needs no GL library.")]
 
 _WORKERS = "Workers"

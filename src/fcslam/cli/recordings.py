@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,92 +22,85 @@ if TYPE_CHECKING:
 
 _BAGS = "ROS bags"
 
-ScanTopic = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--scan-topic", metavar="TOPIC", rich_help_panel=_BAGS,
-        help="Topic of the laser scans; repeat it if the robot has several lasers.",
-    ),
-]  # fmt: skip
-OdomTopic = Annotated[
-    str | None,
-    typer.Option(
-        "--odom-topic",
-        metavar="TOPIC",
-        help="Topic of the odometry; /tf reads it from tf, none maps without it.",
-        rich_help_panel=_BAGS,
-    ),
-]
-OdomFrame = Annotated[
-    str | None,
-    typer.Option(
-        "--odom-frame", metavar="FRAME", rich_help_panel=_BAGS,
-        help="Read the odometry from tf, where its parent frame has this name.",
-    ),
-]  # fmt: skip
-BaseFrame = Annotated[
-    str | None,
-    typer.Option(
-        "--base-frame", metavar="FRAME", rich_help_panel=_BAGS,
-        help="Frame of the robot whose pose the odometry is.",
-    ),
-]  # fmt: skip
-CameraTopic = Annotated[
-    str | None,
-    typer.Option("--camera-topic", metavar="TOPIC", help="Topic of the camera images.", rich_help_panel=_BAGS),
-]
-LaserPose = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--laser-pose",
-        metavar="X,Y,THETA[,upside-down]",
-        help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf. Give one for "
-        "each --scan-topic, in the same order.",
-        rich_help_panel=_BAGS,
-    ),
-]
+
+@dataclass(frozen=True)
+class TopicFlags:
+    """The topics of a robot."""
+
+    scan_topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TOPIC", rich_help_panel=_BAGS,
+            help="Topic of the laser scans; repeat it if the robot has several lasers.",
+        ),
+    ] = None  # fmt: skip
+    odom_topic: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC", rich_help_panel=_BAGS,
+            help="Topic of the odometry; /tf reads it from tf, none maps without it.",
+        ),
+    ] = None  # fmt: skip
+    camera_topic: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Topic of the camera images.", rich_help_panel=_BAGS)
+    ] = None
+
+    def options(self) -> "BagOptions | None":
+        """As the readers of bags take them; None if none is given."""
+        from fcslam.sources import BagOptions
+
+        options = BagOptions(tuple(self.scan_topic or ()), self.odom_topic, self.camera_topic)
+        return None if options == BagOptions() else options
 
 
-CloudHeights = Annotated[
-    str | None,
-    typer.Option(
-        "--cloud-band", metavar="LOW,HIGH[,BODY]", rich_help_panel=_BAGS,
-        help="Heights above the floor (metres) of the points of a 3D LiDAR or depth camera that count; 0.1,0.6 if not "
-        "given. Points within BODY metres (0.4) of the base are of the robot.",
-    ),
-]  # fmt: skip
-InitialPose = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,THETA",
-        help="About where the robot starts in the map (metres, radians).",
-        show_default="anywhere",
-    ),
-]
+@dataclass(frozen=True)
+class BagFlags(TopicFlags):
+    """The topics, frames and mounting of the sensors of a robot."""
 
+    odom_frame: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FRAME", rich_help_panel=_BAGS,
+            help="Read the odometry from tf, where its parent frame has this name.",
+        ),
+    ] = None  # fmt: skip
+    base_frame: Annotated[
+        str | None,
+        typer.Option(metavar="FRAME", rich_help_panel=_BAGS, help="Frame of the robot whose pose the odometry is."),
+    ] = None
+    laser_pose: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y,THETA[,upside-down]", rich_help_panel=_BAGS,
+            help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf. Give one for "
+            "each --scan-topic, in the same order.",
+        ),
+    ] = None  # fmt: skip
+    cloud_band: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW,HIGH[,BODY]", rich_help_panel=_BAGS,
+            help="Heights above the floor (metres) of the points of a 3D LiDAR or depth camera that count; 0.1,0.6 if "
+            "not given. Points within BODY metres (0.4) of the base are of the robot.",
+        ),
+    ] = None  # fmt: skip
 
-def bag_options(
-    scan_topics: list[str] | None, odom_topic: str | None, camera_topic: str | None, laser_poses: list[str] | None,
-    odom_frame: str | None = None, base_frame: str | None = None,
-    cloud_band: str | None = None,
-) -> "BagOptions | None":  # fmt: skip
-    """The options of bags; None if none is given.
+    def options(self) -> "BagOptions | None":
+        """As the readers of bags take them; None if none is given.
 
-    Raises:
-        InputError: one of ``laser_poses`` is not a pose, or ``cloud_band`` is not a band.
-    """
-    from fcslam.sources import BagOptions
+        Raises:
+            InputError: a laser pose is not a pose, or the band is not a band.
+        """
+        from fcslam.sources import BagOptions
 
-    options = BagOptions(
-        tuple(scan_topics or ()),
-        odom_topic,
-        camera_topic,
-        tuple(map(_laser_pose, laser_poses or ())),
-        odom_frame,
-        base_frame,
-        cloud_band=_cloud_band(cloud_band),
-    )
-    return None if options == BagOptions() else options
+        options = replace(
+            super().options() or BagOptions(),
+            laser_poses=tuple(map(_laser_pose, self.laser_pose or ())),
+            odom_frame=self.odom_frame,
+            base_frame=self.base_frame,
+            cloud_band=_cloud_band(self.cloud_band),
+        )
+        return None if options == BagOptions() else options
 
 
 def _laser_pose(text: str) -> "GivenPose":

@@ -8,11 +8,10 @@ import typer
 
 from fcslam.cli.learning_options import LearnConfig
 from fcslam.cli.listening import check_tls, is_loopback, listen
-from fcslam.cli.mission_options import ConfigFile, PresetName, mission_config
+from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
-from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +35,7 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 chooses a free one.")] = 8340,
     tokens: Annotated[
-        Path | None, typer.Option(help="File of tokens and roles; `fcslam certificates` makes one.")
+        Path | None, typer.Option(help="File of tokens and roles; `fcslam setup certificates` makes one.")
     ] = None,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Accept requests from other machines without authentication.")
@@ -55,15 +54,7 @@ def serve(
             rich_help_panel=_TLS,
         ),
     ] = None,
-    config: ConfigFile = None,
-    preset: PresetName = None,
-    learning: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Output folder of `fcslam federate serve` on this machine; the page shows its rounds.",
-        ),
-    ] = None,
+    config: ConfigFiles = None,
     learn: Annotated[
         bool,
         typer.Option(
@@ -73,7 +64,6 @@ def serve(
         ),
     ] = False,
     learn_config: LearnConfig = None,
-    docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
     store: Annotated[
         str | None,
@@ -108,7 +98,7 @@ def serve(
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
     from fcslam.errors import ServiceError
-    from fcslam.page.routes import documentation_router, page_router, report_router
+    from fcslam.page.routes import page_router, report_router
     from fcslam.service.http.app import create_app
     from fcslam.service.shared.missions import NAMED
     from fcslam.service.warmup import warm_up_decoding
@@ -123,12 +113,12 @@ def serve(
     if chosen.is_cluster:
         with verifying(chosen):  # refused here, not by the worker of each mission
             pass
-    plan = learning_plan(learn, learn_config, learning or data / "learning", store)
-    learning = learning if plan is None else plan.output
+    plan = learning_plan(learn, learn_config, data / "learning", store)
+    learning = None if plan is None else plan.output
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
-        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config, preset)
+        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
         if store is None:
             state = _state(data, authenticator, given, learning, chosen)
         else:
@@ -138,7 +128,7 @@ def serve(
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
-        routers = [page_router(), report_router(state), *([documentation_router()] if docs else [])]
+        routers = [page_router(), report_router(state)]
         if plan is not None:
             from fcslam.learning.federated.relay import learning_router
 
@@ -240,8 +230,8 @@ def _state(
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
 
 
-def _cloud_config(file: Path | None, preset: Preset | None) -> "CloudConfig":
+def _cloud_config(chosen: list[str] | None) -> "CloudConfig":
     from fcslam.cloud.settings import CloudConfig
 
-    config = mission_config(file, preset=preset)
+    config = mission_config(chosen)
     return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)

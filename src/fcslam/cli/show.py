@@ -29,10 +29,6 @@ HOST = "127.0.0.1"
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")]
 Live = Annotated[bool, typer.Option("--live", help="Show the map on a page while it grows, and after that the run.")]
-OpenBrowser = Annotated[
-    bool | None,
-    typer.Option("--open/--no-open", help="Open the page in a browser.", show_default="if this machine has a display"),
-]
 
 
 def show(
@@ -44,7 +40,12 @@ def show(
         Path | None, typer.Option(metavar="FILE", help="Write the page as one file to send, and serve nothing.")
     ] = None,
     port: Port = 0,
-    open_browser: OpenBrowser = None,
+    open_browser: Annotated[
+        bool | None,
+        typer.Option(
+            "--open/--no-open", help="Open the page in a browser.", show_default="if this machine has a display"
+        ),
+    ] = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -114,7 +115,7 @@ def _check_size(run: Path) -> None:
 
 
 @contextmanager
-def live_page(run: Path, port: int, open_browser: bool | None) -> "Iterator[LiveMap]":
+def live_page(run: Path, port: int) -> "Iterator[LiveMap]":
     """Serve the page of a run while it is mapped, and in the end until Ctrl-C if there is a terminal for that.
 
     Raises:
@@ -123,7 +124,7 @@ def live_page(run: Path, port: int, open_browser: bool | None) -> "Iterator[Live
     from fcslam.page import live_map
 
     with listen(HOST, port) as listening, live_map.live_page(listening, run.name) as live:
-        _announce(f"fcslam shows the map of {run} while it grows", listening, open_browser)
+        _announce(f"fcslam shows the map of {run} while it grows", listening, None)
         yield live
         if sys.stdin.isatty():
             typer.echo("The page shows the finished run; Ctrl-C ends it")

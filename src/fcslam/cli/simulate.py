@@ -1,6 +1,5 @@
 """`fcslam simulate`: recordings of a fleet that drives in a simulated building."""
 
-import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet, output_option
+from fcslam.cli.options import BuildingSeed, NoCamera, Quiet, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
@@ -21,16 +20,23 @@ if TYPE_CHECKING:
     from fcslam.records import RecordedItem
 
 
+OUTDOORS_M = 30.0
+"""Range of the instantaneous scanner outdoors, unless a configuration says more."""
+
+
 def simulate(
     *,
     output: Annotated[
         Path | None,
         output_option("Folder for the recordings. It must be new or empty, except with --resume.", RECORDINGS),
     ] = None,
-    robots: Annotated[int, typer.Option(min=1, max=100, help="Number of robots.")] = 3,
+    robots: Annotated[int | None, typer.Option(min=1, max=100, help="Number of robots.", show_default="3")] = None,
     seed: BuildingSeed = 1,
-    building: BuildingKind = Building.DEFAULT,
-    path_length: PathLength = 60.0,
+    building: Annotated[Building | None, typer.Option(help="Kind of building.", show_default="default")] = None,
+    path_length: Annotated[
+        float | None,
+        typer.Option(min=1.0, max=10_000.0, help="Distance that each robot drives, in metres.", show_default="60"),
+    ] = None,
     lighting: Annotated[
         list[Lighting] | None,
         typer.Option(
@@ -39,92 +45,69 @@ def simulate(
         ),
     ] = None,
     moved_furniture: Annotated[
-        float,
+        float | None,
         typer.Option(
-            min=0.0,
-            max=1.0,
+            min=0.0, max=1.0, show_default="0",
             help="Share of the furniture, or in a yard of the cars, that moves between drives.",
         ),
-    ] = 0.0,
+    ] = None,
     scanner: Annotated[
-        Scanner,
+        Scanner | None,
         typer.Option(
-            help="Scanner of each robot. One with the name of a product spins and measures each beam at its own time."
-        ),
-    ] = Scanner.INSTANT,
-    lidar_range: Annotated[
-        float | None,
-        typer.Option(
-            min=1.0,
-            max=500.0,
-            help="Range of the LiDARs, in metres.",
-            show_default="the scanner's; outdoors 30 if it does not spin",
+            help="Scanner of each robot. One with the name of a product spins and measures each beam at its own time.",
+            show_default="instant",
         ),
     ] = None,
-    lidar_rate: Annotated[
+    turn_rate: Annotated[
         float | None,
-        typer.Option(min=0.1, max=100.0, help="Scans of a LiDAR per second.", show_default="the scanner's"),
+        typer.Option(min=0.1, max=6.0, help="Rate at which the robots turn, in rad/s.", show_default="0.9"),
     ] = None,
-    beams: Annotated[
-        int | None, typer.Option(min=8, max=10_000, help="Beams of a scan.", show_default="the scanner's")
-    ] = None,
-    field_of_view: Annotated[
-        float | None,
-        typer.Option(
-            min=10.0,
-            max=360.0,
-            help="Angle that a scan covers, in degrees, centred ahead.",
-            show_default="the scanner's",
-        ),
-    ] = None,
-    turn_rate: Annotated[float, typer.Option(min=0.1, max=6.0, help="Rate at which the robots turn, in rad/s.")] = 0.9,
     odometry: Annotated[
-        OdometryKind, typer.Option(help="Kind of wheel odometry, or what is wrong with it.")
-    ] = OdometryKind.DEFAULT,
-    slope: Annotated[
-        float, typer.Option(min=0.0, max=0.3, help="Slope of a yard (root mean square) or ramp (steepest).")
-    ] = 0.01,
-    bumps: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of the ground of a yard or ramp that is a bump.")
-    ] = 0.0,
+        OdometryKind | None,
+        typer.Option(help="Kind of wheel odometry, or what is wrong with it.", show_default="default"),
+    ] = None,
     no_camera: NoCamera = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", "-c",
+            help="Settings of the simulation (YAML), such as range, rate and beams of the scanner, or the slope of a "
+            "yard; each simulation writes its own to simulation.yaml. Options override them.",
+        ),
+    ] = None,
     bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted simulation in --output with the same settings.")
     ] = False,
     quiet: Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
+    from fcslam.config import load
     from fcslam.errors import OutputError
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.odometry import KINDS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
-    from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
     if resume and output is None:
         raise OutputError("--resume continues a simulation in its folder; give --output")
-    lidar = SCANNERS[scanner]
-    if lidar_range is None and building.is_outdoors and not lidar.spin:
-        lidar_range = 30.0
+    settings = SimulationSettings() if config is None else load(SimulationSettings, config)
     given = {
-        "beams": beams,
-        "field_of_view_rad": None if field_of_view is None else math.radians(field_of_view),
-        "max_range_m": lidar_range,
-        "rate_hz": lidar_rate,
+        "robots": robots,
+        "building": building,
+        "path_length_m": path_length,
+        "lighting": tuple(lighting) if lighting else None,
+        "moved_furniture": moved_furniture,
+        "turn_rate_rad_s": turn_rate,
+        "lidar": None if scanner is None else SCANNERS[scanner],
     }
-    settings = SimulationSettings(
-        building=building,
-        robots=robots,
-        path_length_m=path_length,
-        lighting=tuple(lighting or (Lighting.DAY,)),
-        moved_furniture=moved_furniture,
-        turn_rate_rad_s=turn_rate,
-        lidar=lidar.model_copy(update={key: value for key, value in given.items() if value is not None}),
-        slope=slope,
-        bumps=bumps,
-        drift=KINDS[odometry],
-        camera=None if no_camera else CameraSettings(),
-    )
+    settings = settings.model_copy(update={key: value for key, value in given.items() if value is not None})
+    if odometry is not None:
+        settings = settings.model_copy(update={"drift": KINDS[odometry]})  # none is a kind, too
+    if settings.building.is_outdoors and settings.lidar == SCANNERS[Scanner.INSTANT]:
+        settings = settings.model_copy(update={"lidar": settings.lidar.model_copy(update={"max_range_m": OUTDOORS_M})})
+    if no_camera:
+        settings = settings.model_copy(update={"camera": None})
     fleet = simulate_fleet(settings, seed)
     output = output or new_folder(RECORDINGS)
     prepare_fleet_folder(output, settings, seed, resume)

@@ -1,4 +1,4 @@
-"""`fcslam tokens`: who may ask a service."""
+"""`fcslam setup tokens`: who may ask a service."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,10 +13,10 @@ from fcslam.cli.examples import examples
 app = typer.Typer(
     no_args_is_help=True,
     help="List, add, rotate and revoke tokens of a service.",
-    epilog=examples("fcslam tokens list --tokens tokens.yaml"),
+    epilog=examples("fcslam setup tokens list --tokens tokens.yaml"),
 )
 
-_FILE = typer.Option("--tokens", help="File of tokens, as `fcslam certificates` makes it.")
+_FILE = typer.Option("--tokens", help="File of tokens, as `fcslam setup certificates` makes it.")
 _OUTPUT = typer.Option("--output", "-o", help="File to write the token into, readable by you only.")
 _EXPIRES = typer.Option(formats=["%Y-%m-%d"], help="Day (UTC) on which the token ends; without it, it never does.")
 _RELOAD = "to make it count, send the service SIGHUP (systemctl reload fcslam-cloud)"
@@ -27,7 +27,7 @@ Output = Annotated[Path, _OUTPUT]
 Expires = Annotated[datetime | None, _EXPIRES]
 
 
-@app.command("list", epilog=examples("fcslam tokens list --tokens tokens.yaml"))
+@app.command("list", epilog=examples("fcslam setup tokens list --tokens tokens.yaml"))
 def list_tokens(*, tokens: TokensFile) -> None:
     """Print name, role and end of every token, not the tokens, which nobody stores."""
     from fcslam.cli.output import answers, print_line
@@ -39,7 +39,7 @@ def list_tokens(*, tokens: TokensFile) -> None:
         print_line(console, f"{entry.name}  {entry.role}  {ends}")
 
 
-@app.command(epilog=examples("fcslam tokens add ben --role robot --tokens tokens.yaml -o ben"))
+@app.command(epilog=examples("fcslam setup tokens add ben --role robot --tokens tokens.yaml -o ben"))
 def add(
     name: Name,
     *,
@@ -67,7 +67,7 @@ def add(
     typer.echo(f"{output}: the token of {role} {name}; {_RELOAD}", err=True)
 
 
-@app.command(epilog=examples("fcslam tokens rotate boss --tokens tokens.yaml -o boss.token"))
+@app.command(epilog=examples("fcslam setup tokens rotate boss --tokens tokens.yaml -o boss.token"))
 def rotate(name: Name, *, tokens: TokensFile, output: Output, expires: Expires = None) -> None:
     """Replace a token by a new one."""
     from fcslam.service.token_file import rotate_token
@@ -77,7 +77,7 @@ def rotate(name: Name, *, tokens: TokensFile, output: Output, expires: Expires =
     typer.echo(f"{output}: the new token of {name}; {_RELOAD}", err=True)
 
 
-@app.command(epilog=examples("fcslam tokens revoke robot3 --tokens tokens.yaml"))
+@app.command(epilog=examples("fcslam setup tokens revoke robot3 --tokens tokens.yaml"))
 def revoke(name: Name, *, tokens: TokensFile) -> None:
     """Remove a token."""
     from fcslam.service.token_file import revoke_token

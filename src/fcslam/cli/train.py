@@ -1,4 +1,4 @@
-"""`fcslam train`: train a detector on a folder of images."""
+"""`fcslam learn train`: train a detector on a folder of images."""
 
 import time
 from pathlib import Path
@@ -13,7 +13,6 @@ from fcslam.cli.training_options import (
     Device,
     Quick,
     Start,
-    TrainingSeed,
     compute_budget,
     require_training_libraries,
 )
@@ -55,7 +54,6 @@ def train(
             show_default="that of the settings",
         ),
     ] = None,
-    seed: TrainingSeed = None,
     teacher: Annotated[
         Path | None, typer.Option(help="Folder with the keypoints of a teacher network; see docs/howto/training.md.")
     ] = None,
@@ -67,7 +65,7 @@ def train(
     """Train a detector of keypoints with 256-bit descriptors on images without labels."""
     from fcslam.cli.progress import ProgressDisplay
 
-    settings = _settings(config, quick, {"encoder": encoder, "steps": steps, "seed": seed})
+    settings = _settings(config, quick, {"encoder": encoder, "steps": steps})
     require_training_libraries()
     from fcslam.learning.artifacts import write_training_artifacts
     from fcslam.learning.stages import train_detector

@@ -1,4 +1,4 @@
-"""`fcslam vocabulary`: the words that robots and cloud share, so that robots send words in place of descriptors."""
+"""`fcslam learn vocabulary`: the words that robots and cloud share, so that robots send words in place of descriptors."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +9,7 @@ from fcslam.cli.options import Quiet
 from fcslam.cli.output import answers, print_line
 
 MOST_WORDS = 4096
+SEED = 0
 
 
 def vocabulary(
@@ -19,7 +20,6 @@ def vocabulary(
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File for the vocabulary.")],
     words: Annotated[int, typer.Option(min=2, max=65536, help="Most words of each channel.")] = MOST_WORDS,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 0,
     quiet: Quiet = False,
 ) -> None:
     """Train the words that robots send in place of descriptors (robot.sends: words)."""
@@ -45,7 +45,7 @@ def vocabulary(
                 "runs of one"
             )
         ((version, descriptors),) = by_version.items()
-        trained = train_words(channel, version, np.concatenate(descriptors), words, seed)
+        trained = train_words(channel, version, np.concatenate(descriptors), words, SEED)
         vocabularies.append(trained)
         if not quiet:
             count, where = len(trained.centres), f"{len(descriptors)} places of {version}"

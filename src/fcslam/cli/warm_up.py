@@ -1,4 +1,4 @@
-"""`fcslam warm-up`, and how other commands wait for code that is not compiled yet."""
+"""`fcslam setup warm-up`, and how other commands wait for code that is not compiled yet."""
 
 import os
 from collections.abc import Iterator

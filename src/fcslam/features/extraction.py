@@ -9,7 +9,6 @@ import numpy as np
 from fcslam.errors import FeatureError, OutputError
 from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures, in_original, shrink
 from fcslam.features.files import read_grey, write_features
-from fcslam.features.nms import box_nms
 from fcslam.records import frozen
 
 
@@ -36,7 +35,7 @@ def find_files(images: Path) -> list[Path]:
 
 
 def extract_all(
-    files: list[Path], root: Path, output: Path, detector: FeatureDetector, longest_side_px: int, nms_px: float
+    files: list[Path], root: Path, output: Path, detector: FeatureDetector, longest_side_px: int
 ) -> Iterator[Extraction]:
     """Write the features of each image below ``output``, at the image's path relative to ``root``.
 
@@ -56,7 +55,6 @@ def extract_all(
             yield Extraction(path, 0, str(error))
             continue
         features = extract(image, detector, longest_side_px)
-        features = features.take(box_nms(features.keypoints_px, nms_px))
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:

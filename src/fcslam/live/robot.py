@@ -64,7 +64,7 @@ from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesTransport, addresses
+from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesTransport, Server, addresses
 from fcslam.wire.messages import Hello, Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
@@ -77,6 +77,8 @@ LARGEST_BACKLOG = 200
 time never has as many."""
 
 
+LARGEST_OUTBOX_BYTES = 256_000_000
+"""Limit of the packets that wait for the server; above three quarters, places are left out."""
 MOST_DRAWN = 20_000
 """Most keyscans that wait to be drawn by the cloud: hours of an outage."""
 
@@ -139,13 +141,8 @@ class Robot(LiveTracker):
         laser: Lasers | None = None,
         *,
         camera: CameraModel | None = None,
-        server: str | BatchTransport | None = None,
+        server: str | Server | BatchTransport | None = None,
         state: StrPath | None = None,
-        token: str | None = None,
-        ca: StrPath | None = None,
-        certificate: tuple[StrPath, StrPath] | None = None,
-        budget_kbps: float | None = None,
-        outbox_mb: float = 256.0,
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         own_map: bool = True,
         floor: str = "",
@@ -162,15 +159,10 @@ class Robot(LiveTracker):
             name: of the robot; letters, digits and ``. _ -``.
             laser: its LiDAR, or several by name. None: only ``add`` is used.
             camera: its camera, if it has one.
-            server: address of an `fcslam serve` with the robot's fleet, or those of its instances with commas between
-                them, or a transport of your own. None: the robot maps alone.
+            server: the `fcslam serve` of the robot's fleet: its address, or a ``Server`` with token, certificates and
+                limit, or a transport of your own. None: the robot maps alone.
             state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
                 With a server it holds the packets that the server has not confirmed. None: nothing is kept.
-            token: the robot's bearer token.
-            ca: PEM file of the authority that signed the server's certificate. None: the authorities of the system.
-            certificate: PEM files of the robot's certificate and key, which replace the token.
-            budget_kbps: limit of the uplink, kB per second by the stamps. None: everything is sent.
-            outbox_mb: limit of the packets that wait for the server, MB; above three quarters, places are left out.
             config: as in ``map_recordings``.
             own_map: whether the robot has a map of its own; a robot with a server may do without.
             floor: floor of the building, 1 to 16 letters, digits and ``. _ + -``. Places of different floors are never
@@ -217,19 +209,18 @@ class Robot(LiveTracker):
                 executor = worker_process()
                 stack.callback(executor.shutdown, cancel_futures=True)
             folder = _state_folder(state, server is not None, stack)
-            outbox, transport = None, None if isinstance(server, str) else server
+            access = Server(server) if isinstance(server, str) else server
+            outbox, transport = None, None if isinstance(access, Server) else access
+            budget_kbps = access.budget_kbps if isinstance(access, Server) else None
             if folder is not None:
-                outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, int(1e6 * outbox_mb))))
-            if isinstance(server, str) and outbox is not None:
-                own = None if certificate is None else (Path(certificate[0]), Path(certificate[1]))
-                ca_file = None if ca is None else Path(ca)
-                instances = [
-                    stack.enter_context(closing(HttpTransport(url, name, outbox.agent, token, ca_file, own)))
-                    for url in addresses(server)
-                ]
-                transport = InstancesTransport(instances)
+                outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, LARGEST_OUTBOX_BYTES)))
+            if isinstance(access, Server) and outbox is not None:
+                urls, shown = addresses(access.url), (access.token, access.ca, access.certificate)
+                transport = InstancesTransport(
+                    [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, *shown))) for url in urls]
+                )
                 if own_map:
-                    followed = [FleetClient(url, token, ca_file, own) for url in addresses(server)]
+                    followed = [FleetClient(url, *shown) for url in urls]
                     self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
             known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
             keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None

@@ -11,22 +11,19 @@ from fcslam.records import frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
 from fcslam.runs.map_files import area_of, map_stem, parse_map
-from fcslam.wire.http_transport import addresses
+from fcslam.wire.http_transport import Server, addresses
 from fcslam.wire.map_client import MapClient, ServedMap
 
 _ATTEMPTS: Final = 3
 """The cloud may draw its maps again while the robot reads them."""
 
 
-def fetch_maps(
-    folder: Path, server: str, token: str | None = None, ca: Path | None = None, own: tuple[Path, Path] | None = None
-) -> str | None:
+def fetch_maps(folder: Path, server: Server) -> str | None:
     """Copy the maps of a cloud into a run folder, whole or not at all: their files, robots and floors.
 
     Args:
         folder: the folder; an earlier copy in it is replaced.
-        server: address of the cloud, or those of its instances with commas between them.
-        token, ca, own: as for ``fcslam.Robot``, with the rights of a viewer.
+        server: the cloud; its token has the rights of a viewer.
 
     Returns:
         None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
@@ -38,8 +35,8 @@ def fetch_maps(
     """
     prepare_output(folder, force=True)
     troubles = []
-    for address in addresses(server):
-        with closing(MapClient(address, token, ca, own)) as client:
+    for address in addresses(server.url):
+        with closing(MapClient(address, server.token, server.ca, server.certificate)) as client:
             try:
                 _read(client, address).save(folder, force=True)
                 return None

@@ -1,7 +1,7 @@
 """The files of the page. They hold no data of a mission, so nobody needs a token for them."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from hashlib import sha256
 
 from fastapi import APIRouter, Request
@@ -19,12 +19,6 @@ FILES = {
     **{f"/{name}": (name, "text/javascript") for name in MODULES},
     "/page.css": ("page.css", "text/css"),
 }
-DOCUMENTATION = {
-    "/docs": ("docs.html", "text/html"),
-    "/docs.js": ("docs.js", "text/javascript"),
-    "/docs.css": ("docs.css", "text/css"),
-}
-"""FastAPI's own page would load scripts from another host."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -36,7 +30,10 @@ HEADERS = {
 
 def page_router() -> APIRouter:
     """The page at ``/``, its script and its style."""
-    return _router(FILES)
+    router = APIRouter(include_in_schema=False)
+    for path, (name, media_type) in FILES.items():
+        router.add_api_route(path, _sender(name, media_type), methods=["GET"], response_class=Response)
+    return router
 
 
 def report_router(state: ViewerState) -> APIRouter:
@@ -53,18 +50,6 @@ def report_router(state: ViewerState) -> APIRouter:
         headers = {"Content-Disposition": 'attachment; filename="report.html"', "X-Content-Type-Options": "nosniff"}
         return Response(report, media_type="text/html", headers=headers)
 
-    return router
-
-
-def documentation_router() -> APIRouter:
-    """The REST interface as a page at ``/docs``, which reads ``/openapi.json``."""
-    return _router(DOCUMENTATION)
-
-
-def _router(files: Mapping[str, tuple[str, str]]) -> APIRouter:
-    router = APIRouter(include_in_schema=False)
-    for path, (name, media_type) in files.items():
-        router.add_api_route(path, _sender(name, media_type), methods=["GET"], response_class=Response)
     return router
 
 

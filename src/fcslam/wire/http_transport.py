@@ -58,6 +58,22 @@ class HttpResponse:
 
 
 @dataclass(frozen=True, slots=True)
+class Server:
+    """A cloud, how a robot shows it who it is, and how much the robot may send."""
+
+    url: str
+    """Address of the cloud, or those of its instances with commas between them."""
+    token: str | None = None
+    """The robot's bearer token."""
+    ca: Path | None = None
+    """PEM file of the authority that signed the cloud's certificate; None: the authorities of the system."""
+    certificate: tuple[Path, Path] | None = None
+    """PEM files of the robot's certificate and key, which replace the token."""
+    budget_kbps: float | None = None
+    """Limit of the uplink, kB per second by the stamps; None: everything is sent."""
+
+
+@dataclass(frozen=True, slots=True)
 class CloudState:
     """The packets that the cloud has of a robot."""
 

@@ -25,7 +25,7 @@ def read_token(path: Path) -> str:
         token = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path}: no token can be read ({error}); give the file that `fcslam certificates` wrote"
+            f"{path}: no token can be read ({error}); give the file that `fcslam setup certificates` wrote"
         ) from error
     if not token or not token.isprintable() or " " in token:
         raise InputError(f"{path}: holds no token; it should be one word")

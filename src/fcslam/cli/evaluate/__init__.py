@@ -9,7 +9,6 @@ from fcslam.cli.evaluate.homography import homography
 from fcslam.cli.evaluate.places import places
 from fcslam.cli.evaluate.quality import quality
 from fcslam.cli.evaluate.relations import relations
-from fcslam.cli.evaluate.vocabulary import vocabulary
 from fcslam.cli.examples import examples
 
 _FLEET = "fcslam evaluate fleet fleet/run --truth fleet"
@@ -41,5 +40,4 @@ app.command(
         "fcslam evaluate places corridor --features onnx --train-on photos --verify",
     )
 )(places)
-app.command(epilog=examples("fcslam evaluate vocabulary tower corridor --first photos"))(vocabulary)
 app.command(epilog=examples("fcslam evaluate federated robot1 robot2 robot3 -o study"))(federated)

@@ -9,7 +9,8 @@ RunFolder = Annotated[Path, typer.Argument(help="Run folder to measure.")]
 Reference = Annotated[
     Path, typer.Argument(metavar="RELATIONS", help="Relations file, plain or compressed by gzip or xz.")
 ]
-EvaluationSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all random draws, bootstrap included.")]
+SEED = 1
+"""Seed of all random draws, bootstrap included."""
 
 Sets = Annotated[
     list[Path],
@@ -22,7 +23,7 @@ Sets = Annotated[
 Features = Annotated[
     str,
     typer.Option(
-        help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that fcslam extract "
+        help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that fcslam learn extract "
         "wrote, with a subfolder for each set."
     ),
 ]

@@ -1,12 +1,10 @@
 """`fcslam evaluate closures`: precision and recall of the closures of a run."""
 
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from fcslam.cli.evaluate.arguments import Reference, RunFolder
 from fcslam.cli.evaluate.fleet import percent
-from fcslam.cli.options import Csv, Quiet, WrongDeg, WrongM
+from fcslam.cli.options import Csv, Quiet
 from fcslam.cli.output import answers, notices, print_line
 
 if TYPE_CHECKING:
@@ -20,18 +18,6 @@ def closures(
     run: RunFolder,
     reference: Reference,
     *,
-    wrong_m: WrongM = 0.5,
-    wrong_deg: WrongDeg = 10.0,
-    bridge_s: Annotated[
-        float,
-        typer.Option(min=0.0, help="Largest time between the stamps of a closure and of the relations, in seconds."),
-    ] = 1.0,
-    reach_m: Annotated[
-        float,
-        typer.Option(
-            min=0.0, help="Largest distance along the path, at both ends, from a revisit to its closure, in m."
-        ),
-    ] = 2.0,
     csv: Csv = None,
     quiet: Quiet = False,
 ) -> None:
@@ -41,7 +27,7 @@ def closures(
     from fcslam.lab.evaluation.fleet.relations import write_metrics
     from fcslam.metrics.closures import ClosureCriteria
 
-    criteria = ClosureCriteria(bridge_s, wrong_m, wrong_deg, reach_m)
+    criteria = ClosureCriteria()
     with ProgressDisplay(notices(quiet)) as display:
         display.start("evaluating")
         report = evaluate_closures(run, reference, criteria)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.evaluate.arguments import RunFolder
-from fcslam.cli.options import Csv, Quiet, WrongDeg, WrongM
+from fcslam.cli.options import Csv, Quiet
 from fcslam.cli.output import answers, notices, print_line
 
 if TYPE_CHECKING:
@@ -33,8 +33,6 @@ def fleet(
             show_default="recordings beside the run, else the parent of the run",
         ),
     ] = None,
-    wrong_m: WrongM = 0.5,
-    wrong_deg: WrongDeg = 10.0,
     csv: Csv = None,
     figure: Annotated[
         Path | None,
@@ -47,11 +45,10 @@ def fleet(
     from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
     from fcslam.lab.evaluation.fleet.report import evaluate_fleet
-    from fcslam.metrics.closures import ClosureCriteria
 
     with ProgressDisplay(notices(quiet)) as display:
         display.start("evaluating")
-        report = evaluate_fleet(run, truth, ClosureCriteria(wrong_m=wrong_m, wrong_deg=wrong_deg))
+        report = evaluate_fleet(run, truth)
     show_fleet(report, answers())
     if csv is not None:
         write_metrics(fleet_metrics(report), csv)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.evaluate.arguments import EvaluationSeed
+from fcslam.cli.evaluate.arguments import SEED
 from fcslam.cli.options import Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
@@ -41,7 +41,7 @@ def homography(
     features: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of extracted features, SCENE/1.npz ..., as fcslam extract writes them, to evaluate instead of "
+            help="Folder of extracted features, SCENE/1.npz ..., as fcslam learn extract writes them, to evaluate instead of "
             "detectors or, with --detector, beside them. Can be repeated."
         ),
     ] = None,
@@ -53,7 +53,6 @@ def homography(
     ] = HomographyGroundTruth.CORRECTED,
     csv: Annotated[Path | None, typer.Option(help="Write all measures of all pairs to this CSV file.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Draw matches and curves into this folder.")] = None,
-    seed: EvaluationSeed = 1,
     quiet: Quiet = False,
 ) -> None:
     """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
@@ -73,18 +72,18 @@ def homography(
             draw_figures(figures, report, found, detectors, ground_truth, display.start("drawing", len(found)))
     if csv is not None:
         write_pairs(report, csv)
-    _show(answers(), report, ground_truth, seed)
+    _show(answers(), report, ground_truth)
 
 
-def _show(console: "Console", report: "HomographyReport", truth: HomographyGroundTruth, seed: int) -> None:
+def _show(console: "Console", report: "HomographyReport", truth: HomographyGroundTruth) -> None:
     described = [name for name in report.detectors if report.of(name)[0].matching]
-    console.print(_repeatability_table(report, seed))
+    console.print(_repeatability_table(report))
     if described:
-        console.print(_homography_table(report, described, seed))
+        console.print(_homography_table(report, described))
         console.print(_matching_table(report, described))
     console.print(_scene_table(report))
     if len(report.detectors) > 1:
-        console.print(_difference_table(report, seed))
+        console.print(_difference_table(report))
     for line in (
         f"{len(report.of(report.detectors[0]))} pairs, {truth} ground truth. In brackets: 95 % intervals by bootstrap "
         "over pairs.",
@@ -100,7 +99,7 @@ def _show(console: "Console", report: "HomographyReport", truth: HomographyGroun
         print_line(console, line)
 
 
-def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
+def _repeatability_table(report: "HomographyReport") -> "Table":
     from rich.table import Table
 
     from fcslam.lab.evaluation.detectors.homography import LARGE, SMALL
@@ -117,14 +116,14 @@ def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
         table.add_row(
             name,
             *map(_share, kinds),
-            _interval(interval(pairs, "repeatability", seed)),
+            _interval(interval(pairs, "repeatability", SEED)),
             _number(mean(pairs, "localisation_error_px"), 2),
             *(_number(time, 1) for time in times),
         )
     return table
 
 
-def _homography_table(report: "HomographyReport", described: "Sequence[str]", seed: int) -> "Table":
+def _homography_table(report: "HomographyReport", described: "Sequence[str]") -> "Table":
     from rich.table import Table
 
     from fcslam.lab.evaluation.detectors.homography import MATCHING_NMS_PX
@@ -139,7 +138,7 @@ def _homography_table(report: "HomographyReport", described: "Sequence[str]", se
             pairs = report.of(name)
             measure = f"homography_3px_nms{nms_px}"
             kinds = (mean(pairs, measure, kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT))
-            shares = (interval(pairs, f"homography_{px}px_nms{nms_px}", seed) for px in CORRECT_CORNERS_PX)
+            shares = (interval(pairs, f"homography_{px}px_nms{nms_px}", SEED) for px in CORRECT_CORNERS_PX)
             table.add_row(name, str(nms_px), *map(_share, kinds), *map(_interval, shares))
         table.add_section()
     return table
@@ -188,7 +187,7 @@ def _scene_table(report: "HomographyReport") -> "Table":
     return table
 
 
-def _difference_table(report: "HomographyReport", seed: int) -> "Table":
+def _difference_table(report: "HomographyReport") -> "Table":
     from rich.table import Table
 
     from fcslam.lab.evaluation.detectors.measures import difference
@@ -201,7 +200,7 @@ def _difference_table(report: "HomographyReport", seed: int) -> "Table":
     }
     table = Table("", *titles.values(), title=f"{first} less the others, pair by pair", title_justify="left")
     for name in others:
-        gains = (difference(report.of(first), report.of(name), measure, seed) for measure in titles)
+        gains = (difference(report.of(first), report.of(name), measure, SEED) for measure in titles)
         table.add_row(name, *(_interval(gain, sign="+") for gain in gains))
     return table
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.evaluate.arguments import EvaluationSeed, Features, Label, Sets, TrainOn
+from fcslam.cli.evaluate.arguments import SEED, Features, Label, Sets, TrainOn
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import EVALUATIONS, answers, new_folder, notices, print_line
 
@@ -49,7 +49,6 @@ def places(
             "agreement of consecutive places.",
         ),
     ] = False,
-    seed: EvaluationSeed = 1,
     quiet: Quiet = False,
 ) -> None:
     """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
@@ -61,7 +60,7 @@ def places(
     output = output or new_folder(EVALUATIONS)
     with ProgressDisplay(notices(quiet)) as display:
         results = _evaluate(
-            sets, features, label or (), train_on or (), strategies, seed, display, verify=verify, sequence=sequence
+            sets, features, label or (), train_on or (), strategies, display, verify=verify, sequence=sequence
         )
     write_results(output, results)
     save(curves_figure(results), output / "precision_recall.png")
@@ -74,7 +73,6 @@ def _evaluate(
     labels: "Sequence[str]",
     train_on: "Sequence[Path]",
     strategies: "Sequence[Strategy]",
-    seed: int,
     display: "ProgressDisplay",
     *,
     verify: bool,
@@ -91,11 +89,11 @@ def _evaluate(
     described_one = display.start("describing")
     training = describe_training(train_on, chosen, described_one)
     described = describe_sets(sets, labels, chosen, described_one)
-    scorers = choose_scorers(strategies, VocabularyConfig(), training, seed)
+    scorers = choose_scorers(strategies, VocabularyConfig(), training, SEED)
     compared_one = display.start("comparing", len(scorers) * len(described))
     variants = in_sequence if sequence else plain
     return [
-        evaluate_set(each, scorers, PairVerifier(each) if verify else None, seed, compared_one, variants)
+        evaluate_set(each, scorers, PairVerifier(each) if verify else None, SEED, compared_one, variants)
         for each in described
     ]
 

@@ -1,4 +1,4 @@
-"""`fcslam federate join`: one robot of a fleet on several machines."""
+"""`fcslam learn federate join`: one robot of a fleet on several machines."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`fcslam federate local`: a whole fleet in one process."""
+"""`fcslam learn federate local`: a whole fleet in one process."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`fcslam federate serve`: the server of a fleet on several machines."""
+"""`fcslam learn federate serve`: the server of a fleet on several machines."""
 
 from pathlib import Path
 from typing import Annotated
@@ -47,7 +47,7 @@ def serve(
     device: Device = "auto",
     tokens: Annotated[
         Path | None,
-        typer.Option(help="File of the robots' tokens; `fcslam certificates` makes one.", rich_help_panel=_TLS),
+        typer.Option(help="File of the robots' tokens; `fcslam setup certificates` makes one.", rich_help_panel=_TLS),
     ] = None,
     tls_certificate: Annotated[
         Path | None, typer.Option(help="Certificate of this machine (PEM).", rich_help_panel=_TLS)
@@ -63,7 +63,7 @@ def serve(
 ) -> None:
     """Run the server of a fleet: wait for robots at HOST:PORT and train one detector with them.
 
-    Give --tokens, --tls-certificate and --tls-key, which `fcslam certificates` makes. Give --insecure only in a
+    Give --tokens, --tls-certificate and --tls-key, which `fcslam setup certificates` makes. Give --insecure only in a
     network that nobody else can reach.
     """
     from fcslam.cli.progress import ProgressDisplay

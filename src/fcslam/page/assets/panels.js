@@ -80,7 +80,7 @@ export function showMaps() {
     return tab;
   }));
   at("empty").hidden = !link.connected || fleet.robots.length > 0;
-  if (!at("empty").hidden) at("first-robot").textContent = `fcslam robot RECORDING --server ${location.origin} --state FOLDER`;
+  if (!at("empty").hidden) at("first-robot").textContent = `fcslam play RECORDING --server ${location.origin} --state FOLDER`;
 }
 export function showAge() {
   const { counts, readOnly } = fleet;

@@ -1,0 +1,272 @@
+"""`fcslam play`: a recording played to a cloud service, as if its robot drove now."""
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.cli.groups import with_groups
+from fcslam.cli.learning_options import LearningFlags
+from fcslam.cli.mission_options import ConfigFiles, mission_config
+from fcslam.cli.options import Quiet
+from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.recordings import BagFlags, open_recording, print_faults, print_notes
+from fcslam.cli.server_options import Floor, ServerFlags
+from fcslam.cli.warm_up import compiled
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.learning.federated.learning_beside import RobotLearningPlan
+    from fcslam.live.records import RobotStatus
+    from fcslam.live.robot import Robot
+    from fcslam.robot.frontend import RobotConfig
+    from fcslam.sources import Source, Survey
+
+
+@with_groups
+def play(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            metavar="LOG", help="The robot's recording, which names the robot; NAME=LOG gives another name."
+        ),
+    ],
+    *,
+    server: ServerFlags,
+    state: Annotated[
+        Path,
+        typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
+    ],
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
+    ] = False,
+    speed: Annotated[
+        str,
+        typer.Option(
+            metavar="FACTOR", help="Playback speed as a multiple of real time; max plays as fast as possible."
+        ),
+    ] = "max",
+    floor: Floor = "",
+    config: ConfigFiles = None,
+    bags: BagFlags,
+    learning: LearningFlags,
+    quiet: Quiet = False,
+) -> None:
+    """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
+    from fcslam.errors import InputError
+    from fcslam.live.robot import Playback, Robot
+    from fcslam.ros.addresses import is_address
+    from fcslam.sources.faults import Fault
+    from fcslam.storage.files import keep_private
+
+    keep_private()
+    if is_address(recording):
+        raise InputError(f"{recording}: is a live robot; `fcslam robot {recording}` maps it")
+    settings, cloud = mission_config(config), server.access()
+    if cloud is None:
+        raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
+    pace = _speed(speed)
+    opened = open_recording(recording, bags.options())
+    _check_name(opened.name)
+    survey = opened.survey()
+    console = notices(quiet)
+    print_notes(console, survey.notes)
+    plan = learning.plan(settings.robot, server, state)
+    fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kbps, floor)
+    live = Robot(
+        opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor,
+        keep_keyframes=learning.learn, playback=Playback(fingerprint, resume),
+    )  # fmt: skip
+    with closing(live):
+        _play(live, opened, survey.scan_count, pace, plan, state, console)
+        print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
+        _report(live, state, cloud.url)
+
+
+def _play(
+    live: "Robot", recording: "Source", scans: int, speed: float | None, plan: "RobotLearningPlan | None", state: Path,
+    console: "Console",
+) -> None:  # fmt: skip
+    """Play a recording of ``scans`` scans to its robot, which learns afterwards if there is a plan for it."""
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.live.playback import PlaybackPace, play
+
+    pace = PlaybackPace(speed, time.monotonic, time.sleep)
+    try:
+        with compiled(console), _interruptible(), ProgressDisplay(console) as display:
+            watch = _watch(display, console, scans)
+            stay = None if plan is None else partial(_learn, plan, console, display, watch)
+            play(live, recording.records(), pace, watch, stay)
+    except KeyboardInterrupt:
+        left = live.status().waiting
+        print_line(
+            console, f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume"
+        )
+        raise
+
+
+def _learn(
+    plan: "RobotLearningPlan", console: "Console", display: "ProgressDisplay",
+    watch: "Callable[[RobotStatus], None]", robot: "Robot",
+) -> None:  # fmt: skip
+    """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
+    from fcslam.learning.federated.learning_beside import LearningBeside
+
+    def tell(line: str) -> None:
+        print_line(console, line)
+
+    tell("the drive is over; the robot learns with its fleet until Ctrl-C")
+    learning = LearningBeside(plan, robot.name, tell)
+    began_s = time.monotonic()
+    try:
+        learning.set_idle(robot.first_epoch)
+        while (passed_s := time.monotonic() - began_s) < plan.settings.time_s and not learning.has_ended:
+            robot.stand_still()
+            watch(robot.status())
+            display.show("learning", round(passed_s), round(plan.settings.time_s))
+            time.sleep(0.5)
+    except KeyboardInterrupt:
+        tell("learning ends; the robot sends what is left")
+    finally:
+        learning.close()
+
+
+def _speed(text: str) -> float | None:
+    """Playback speed as a multiple of real time; None: as fast as possible."""
+    from fcslam.errors import InputError
+
+    if text == "max":
+        return None
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = 0.0
+    if not 0.0 < speed < float("inf"):
+        raise InputError(f"--speed {text!r} is not a speed; give a factor above 0, or max")
+    return speed
+
+
+def _check_name(name: str) -> None:
+    from fcslam.errors import PacketError, SourceError
+    from fcslam.wire.checks import check_name
+
+    try:
+        check_name(name, "robot")
+    except PacketError as error:
+        raise SourceError(f"{error}; give another one: NAME=LOG") from error
+    stem, plus, number = name.rpartition("+")
+    if plus and number.isdigit():
+        raise SourceError(f"robot: {name!r} is how a later start of {stem!r} is called; give another one: NAME=LOG")
+
+
+def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None, floor: str) -> str:
+    """A digest of the inputs that determine the packets; digests of the packets themselves reveal other changes."""
+    import hashlib
+
+    import fcslam
+    from fcslam.config import dump
+
+    length = survey.scan_count, survey.duration_s, survey.path_length_m
+    inputs = (fcslam.__version__, name, *length, survey.lasers, budget_kbps, floor)
+    return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Treat SIGTERM, which service managers send, like Ctrl-C."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
+    """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localisation."""
+    trouble: str | None = "connecting"
+    notices_before: tuple[str, ...] = ()
+    localization, times_lost = "mapping", 0
+    waits = sends = False
+
+    def watch(now: "RobotStatus") -> None:
+        nonlocal trouble, notices_before, localization, times_lost, waits, sends
+        lines = [now.trouble or "connected"] * (now.trouble != trouble)
+        if (now.localization, now.times_lost) != (localization, times_lost):
+            lines.append(_localisation(now, times_lost))
+        localization, times_lost = now.localization, now.times_lost
+        for line in [*lines, *(notice for notice in now.notices if notice not in notices_before)]:
+            print_line(console, line)
+        is_complete = now.scans == total
+        if is_complete and now.trouble and not waits:
+            waits = True
+            print_line(
+                console,
+                f"all scans are mapped; {now.waiting.packets} packets wait for the server. Ctrl-C ends the wait: they "
+                "stay on disk, and --resume sends them",
+            )
+        trouble, notices_before = now.trouble, now.notices
+        details = _details(now, is_complete)
+        display.show("mapping", now.scans, total, details)
+        sends = sends or (is_complete and now.waiting.packets > 0)
+        if sends:
+            display.show("sending", now.confirmed, now.confirmed + now.waiting.packets, details)
+
+    return watch
+
+
+def _localisation(now: "RobotStatus", times_lost_before: int) -> str:
+    """Return a line on the place of a robot that was lost; ``times_lost_before``: its count at the last such line."""
+    if now.quality > 0.0:
+        return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
+    if now.times_lost > times_lost_before:
+        return "lost: the scans contradict the map; a new session begins here"
+    return "not relocalised: no other closure supports the estimated place"
+
+
+def _details(now: "RobotStatus", is_complete: bool) -> str:
+    """The state of robot, connection, packets and map, the most important first: a narrow terminal cuts the end."""
+    stage = "catching up" if now.catching_up else "sending" if is_complete else str(now.localization)
+    details = [stage, "offline" if now.trouble else "online", f"{now.waiting.packets} waiting"]
+    details += [f"{now.refused} refused"] if now.refused else []
+    if now.map_index is None:
+        details.append("in no map")
+    else:
+        age_s = now.correction_age_s or 0.0
+        details.append(f"map {now.map_index}, quality {now.quality:.2f}, corrected {age_s:.0f} s ago")
+    details += [f"{now.confirmed} packets confirmed", f"{now.sent_bytes / 1e3:.0f} kB sent"]
+    details += [f"{now.left_out} places left out"] if now.left_out else []
+    return ", ".join([*details, f"{now.keyscans} keyscans"])
+
+
+def _report(robot: "Robot", state: Path, server: str) -> None:
+    from fcslam.runs import write_tum
+
+    now = robot.status()
+    console = answers()
+    print_line(
+        console,
+        f"{now.scans} scans, {now.keyscans} keyscans; {server} has confirmed all packets "
+        f"({now.sent_bytes / 1e3:.0f} kB sent)",
+    )
+    if now.left_out:
+        print_line(console, f"{now.left_out} places were left out: the outbox was full or the budget was spent")
+    if now.refused:
+        print_line(console, f"{now.refused} packets were refused: {state / 'refused'}")
+    if now.times_lost:
+        lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
+        print_line(console, f"{lost}; {_localisation(now, now.times_lost)}")
+    if now.map_index is not None:
+        trajectory = robot.trajectory()
+        write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)
+        print_line(console, f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
