@@ -80,7 +80,9 @@ def fleet(seed: int, building: Building, no_camera: bool) -> list[Outcome]:
 def outcome(seed: int, strategy: FusionStrategy, recordings: Path) -> Outcome:
     run = recordings.parent / strategy
     robots = sorted(recordings.glob("robot_*"))
-    cost = common.run_fcslam("map", *robots, "--output", run, "--fusion", strategy, "--seed", seed)
+    config = recordings.parent / f"{strategy}.yaml"
+    config.write_text(f"fleet: {{fusion: {strategy}}}")
+    cost = common.run_fcslam("map", *robots, "--output", run, "--config", config, "--seed", seed)
     used = common.metrics(run)["inter_robot_closures_accepted"]
     return Outcome(seed, strategy, evaluate_fleet(run, recordings), used, cost.wall_s)
 

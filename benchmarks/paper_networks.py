@@ -9,8 +9,8 @@ keypoints of the detector that comes with fcslam and Harris's corners. Each trai
 one thread; with the paper's losses, --collapsing-minutes may be fewer, as its codes collapse soon. The folder
 --training keeps what is done; the same command continues.
 
-Validation: pairs of held-out images, as at the end of `fcslam learn train`. `benchmarks/homography.py` evaluates the networks
-on other scenes.
+Validation: pairs of held-out images, as at the end of `fcslam learn train`. `benchmarks/homography.py` evaluates the
+networks on other scenes.
 """
 
 import csv

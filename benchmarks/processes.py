@@ -108,7 +108,7 @@ def robot(log: Path, port: int, place: Path, speed: object) -> Iterator[Process]
     """Plays a recording; goes on with it when it is started again."""
     state = place / "state" / log.stem
     url = f"http://127.0.0.1:{port}"
-    arguments = ("robot", log, "--server", url, "--state", state, "--speed", speed, "--resume")
+    arguments = ("play", log, "--server", url, "--state", state, "--speed", speed, "--resume")
     process = Process(arguments, place / f"{log.stem}.log")
     try:
         yield process

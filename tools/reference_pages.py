@@ -36,8 +36,7 @@ REST = """\
 A running service answers these HTTP requests for its state, maps and edits. `make docs` writes the page from the code.
 
 - A service on your machine: `fcslam serve --data cloud` listens at `http://127.0.0.1:8340`.
-- `/openapi.json` describes all requests, parameters and answers for programs. `fcslam serve --docs` shows them at
-  `/docs`.
+- `/openapi.json` describes all requests, parameters and answers for programs.
 - Roles: each token has the role robot, viewer or admin. An admin may do what a viewer may. A robot acts in its own name
   only. See [deployment](../howto/deploy.md).
 - An error is one line of JSON, `{"error": "..."}`.

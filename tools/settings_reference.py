@@ -68,7 +68,7 @@ fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 - An unknown key or a value out of range is an error. The message names the nearest known key.
 - Every run folder contains the complete configuration of the run, `config.yaml`.
 - `fcslam map --config paper` begins with [the paper's settings](../results/paper.md) in place of the defaults. The keys
-  of `--config` override them.
+  of a further `--config FILE` override them.
 - In Python, `fcslam.map_recordings(..., config={"map": {"resolution_m": 0.1}})` takes the same keys.
 
 A key path such as `map.resolution_m` stands for nested keys:

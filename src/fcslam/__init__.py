@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         open_run,
     )
     from fcslam.sources import BagOptions
+    from fcslam.wire.http_transport import Server
 
 __version__ = "0.1.0"
 
@@ -90,6 +91,7 @@ __all__ = [
     "RobotStatus",
     "RobotTrajectory",
     "Run",
+    "Server",
     "ServiceError",
     "SimulationError",
     "SourceError",
@@ -128,6 +130,7 @@ _LAZY: Final = {
     "RobotStatus": "fcslam.live.records",
     "RobotTrajectory": "fcslam.runs",
     "Run": "fcslam.runs",
+    "Server": "fcslam.wire.http_transport",
     "Transform": "fcslam.records",
     "Veto": "fcslam.records",
     "changes": "fcslam.api",

@@ -15,7 +15,7 @@ from fcslam.sources import open_source
 from tests.lab.simulation.gl import require_gl
 
 TINY = ["demo", "--robots", "2", "--path-length", "20"]
-TINIEST = ["--no-camera", "--building", "flat", "--robots", "1", "--path-length", "3"]
+TINIEST = ["--no-camera", "--robots", "1", "--path-length", "3"]
 
 
 def run_demo(output, *more):

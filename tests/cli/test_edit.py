@@ -37,8 +37,13 @@ def run(mapped, tmp_path):
     return shutil.copytree(mapped, tmp_path / "run")
 
 
+@pytest.fixture(autouse=True)
+def user(monkeypatch):
+    monkeypatch.setenv("LOGNAME", "anna")
+
+
 def edit(run, command, *arguments):
-    return main(["edit", command, str(run), *map(str, arguments), "--author", "anna"])
+    return main(["edit", command, str(run), *map(str, arguments)])
 
 
 def again(run, name):

@@ -104,27 +104,42 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["learn", "federate", "local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
-        (["learn", "federate", "local", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
-        (["learn", "federate", "local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
-        (["learn", "federate", "local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
-        (["learn", "federate", "local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
-        (["learn", "federate", "local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is not a checkpoint"),
-        (["learn", "federate", "serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is not a HOST:PORT"),
-        (["learn", "federate", "serve", "a:1", "-o", "{out}"], "give --tokens"),
-        (["learn", "federate", "serve", "a:1", "-o", "{out}", *SERVE_FILES], "give --tokens"),
-        (["learn", "federate", "serve", "a:1", "-o", "{out}", "--insecure", *TOKENS, *SERVE_FILES], "or --insecure"),
-        (["learn", "federate", "serve", "a:1", "-o", "{out}", *TOKENS, *SERVE_FILES], "no certificate with its key"),
-        (["learn", "federate", "join", "http://a:1", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
-        (["learn", "federate", "join", "a", "{fleet}/one", "-o", "{out}"], "is not the address of a cloud"),
-        (["learn", "federate", "join", "https://a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give a PEM"),
-        (["learn", "federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--name", ""], "give another --name"),
-        (["learn", "federate", "join", "http://a:1", "{fleet}/one", "-o", "{out}", "--token-file", "{fleet}/no"], "no token"),
+        (["local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
+        (["local", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
+        (["local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
+        (["local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
+        (
+            ["local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"],
+            "cannot be used as the output folder",
+        ),
+        (
+            ["local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"],
+            "is not a checkpoint",
+        ),
+        (["serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is not a HOST:PORT"),
+        (["serve", "a:1", "-o", "{out}"], "give --tokens"),
+        (["serve", "a:1", "-o", "{out}", *SERVE_FILES], "give --tokens"),
+        (["serve", "a:1", "-o", "{out}", "--insecure", *TOKENS, *SERVE_FILES], "or --insecure"),
+        (["serve", "a:1", "-o", "{out}", *TOKENS, *SERVE_FILES], "no certificate with its key"),
+        (["join", "http://a:1", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
+        (["join", "a", "{fleet}/one", "-o", "{out}"], "is not the address of a cloud"),
+        (
+            ["join", "https://a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"],
+            "give a PEM",
+        ),
+        (
+            ["join", "http://a:1", "{fleet}/one", "-o", "{out}", "--name", ""],
+            "give another --name",
+        ),
+        (
+            ["join", "http://a:1", "{fleet}/one", "-o", "{out}", "--token-file", "{fleet}/no"],
+            "no token",
+        ),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
     given = [word.format(fleet=fleet, out=tmp_path / "out") for word in arguments]
-    assert main(given) == BAD_INPUT
+    assert main(["learn", "federate", *given]) == BAD_INPUT
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
     assert words in said[0]

@@ -364,16 +364,6 @@ def test_a_start_that_cannot_be_is_refused(tmp_path, log, capsys, options, reaso
     assert reason in refused(capsys, tmp_path, log, *options, "--output", tmp_path / "run")
 
 
-def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, log, capsys):
-    run = tmp_path / "run"
-    assert "--no-fuse" in refused(capsys, tmp_path, log, "--no-fuse", "--fusion", "two_point", "--output", run)
-    assert run_map(log, "--fusion", "three_point", "--output", run) == 2
-    assert "two_point" in capsys.readouterr().err
-    assert not run.exists()
-    assert run_map(log, "--fusion", "two_point", "--output", run) == 0
-    assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["fusion"] == "two_point"
-
-
 def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log, capsys):
     run, file = tmp_path / "run", tmp_path / "own.yaml"
     file.write_text("fleet: {matcher: {delta: 1.5}}")
@@ -382,9 +372,10 @@ def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log
     assert (fleet["matcher"]["decision"], fleet["matcher"]["delta"]) == ("similarity", 1.5)
     assert (fleet["fusion"], fleet["matcher"]["vocabulary"]["strategy"]) == ("two_point", "rebuild")
     capsys.readouterr()
-    assert run_map(log, "--config", "paper", "--fusion", "joint", "--output", tmp_path / "other") == 2
+    file.write_text("fleet: {fusion: joint}")
+    assert run_map(log, "--config", "paper", "--config", file, "--output", tmp_path / "other") == 2
     assert capsys.readouterr().err.splitlines() == [
-        "fcslam: the command line: fleet: matcher.decision similarity measures no transform, which the joint "
+        f"fcslam: {file}: fleet: matcher.decision similarity measures no transform, which the joint "
         "graph needs; set fusion to two_point, first_two or n_point"
     ]
 

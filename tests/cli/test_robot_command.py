@@ -14,12 +14,13 @@ import pytest
 from rich.console import Console
 
 from fcslam.cli import live, main
+from fcslam.cli.play import _watch
 from fcslam.cli.progress import ProgressDisplay
-from fcslam.cli.robot import _watch
 from fcslam.errors import CloudError, StateError
 from fcslam.live.records import RobotStatus
 from fcslam.live.robot import Robot
 from fcslam.robot.outbox import WaitingPackets
+from fcslam.ros.addresses import RosAddress
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.topics import SensorTopics
 from fcslam.runs import read_tum
@@ -49,7 +50,7 @@ def cloud():
 @pytest.mark.slow
 def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     state = tmp_path / "state"
-    assert main(["robot", str(log), "--server", cloud.url, "--state", str(state)]) == 0
+    assert main(["play", str(log), "--server", cloud.url, "--state", str(state)]) == 0
     out, err = capsys.readouterr()
     stored = [decode(data) for data in cloud.cloud.stored.values()]
     assert {packet.robot for packet in stored} == {"alice"}
@@ -58,9 +59,9 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert keyscans == sum(type(packet.body).__name__ == "Keyscan" for packet in stored)
     assert "connected" in err
     assert (state / "outbox.sqlite").stat().st_mode & 0o077 == 0
-    assert main(["robot", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 0
+    assert main(["play", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 0
     assert len(cloud.cloud.stored) == len(stored), "nothing twice"
-    assert main(["robot", str(log), "--server", cloud.url, "--state", str(state), "--name", "bob"]) == 2
+    assert main(["play", f"bob={log}", "--server", cloud.url, "--state", str(state)]) == 2
     assert "belongs to robot 'alice'" in capsys.readouterr().err
 
 
@@ -68,7 +69,7 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
 def test_the_token_goes_with_every_request(log, cloud, tmp_path):
     (tmp_path / "token").write_text("s3cret\n")
     arguments = ["--server", cloud.url, "--state", str(tmp_path), "--token-file", str(tmp_path / "token")]
-    assert main(["robot", str(log), *arguments]) == 0
+    assert main(["play", str(log), *arguments]) == 0
     assert {headers["Authorization"] for _, _, headers, _ in cloud.requests} == {"Bearer s3cret"}
 
 
@@ -79,8 +80,6 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         (["--speed", "fast"], "--speed 'fast' is not a speed"),
         (["--speed", "-1"], "is not a speed"),
         (["--speed", "nan"], "is not a speed"),
-        (["--name", "r+2"], "how a later start of 'r' is called"),
-        (["--name", "r/2"], "is not a name"),
         (["--token-file", "nowhere"], "no token can be read"),
         (["--certificate", "nowhere"], "--certificate and --key belong together"),
         (
@@ -89,30 +88,36 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         ),
         (["--state", "/dev/null/state"], "cannot be made"),
         (["--ca", "nowhere"], "cannot read a certificate authority"),
-        (["--localize", "nowhere"], "`fcslam localize RECORDING --map MAP` localises a recording"),
     ],
 )
 def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reason):
     given = ["--server", cloud.url, "--state", str(tmp_path / "state")]
-    assert main(["robot", str(log), *given, *arguments]) == 2
+    assert main(["play", str(log), *given, *arguments]) == 2
     err = capsys.readouterr().err
     assert reason in err
     assert err.count("\n") == 1
     assert cloud.cloud.stored == {}
 
 
+@pytest.mark.parametrize(("name", "reason"), [("r+2", "how a later start of 'r' is called"), ("r/2", "is not a name")])
+def test_a_name_that_cannot_be_used_is_one_line(log, cloud, tmp_path, capsys, name, reason):
+    assert main(["play", f"{name}={log}", "--server", cloud.url, "--state", str(tmp_path / "state")]) == 2
+    assert reason in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--localize", "nowhere", "--state", "state"], "leave --state out"),
-        (["--localize", "nowhere", "--server", "http://127.0.0.1:9"], "nowhere holds no earlier copy of the map"),
-        (["--localize", "nowhere", "--server", "cloud"], "'cloud' is not the address of a cloud"),
-        (["--localize", "nowhere", "--initial-pose", "1,2"], "--initial-pose '1,2' is not a pose"),
-        (["--initial-pose", "1,2,3"], "an initial pose is one in a finished map; give --localize, too"),
+        (["robot", "log.clf"], "`fcslam play` plays a recording to a service"),
+        (["play", "ros2:/robot1", "--state", "state"], "`fcslam robot ros2:/robot1` maps it"),
+        (["localize", "ros2:/robot1", "--map", "no", "--server", "http://127.0.0.1:9"], "no holds no earlier copy"),
+        (["localize", "ros2:/robot1", "--map", "no", "--server", "cloud"], "'cloud' is not the address of a cloud"),
+        (["localize", "ros2:/robot1", "--map", "no", "--initial-pose", "1,2"], "--initial-pose '1,2' is not a pose"),
+        (["localize", "ros2:/robot1", "--map", "no", "--update"], "record the drive, and localise the recording"),
     ],
 )
-def test_what_a_localised_robot_cannot_use_is_one_line(capsys, arguments, reason):
-    assert main(["robot", "ros2:/robot1", *arguments]) == 2
+def test_what_a_robot_cannot_use_is_one_line(capsys, arguments, reason):
+    assert main(arguments) == 2
     err = capsys.readouterr().err
     assert reason in err
     assert err.count("\n") == 1
@@ -120,7 +125,7 @@ def test_what_a_localised_robot_cannot_use_is_one_line(capsys, arguments, reason
 
 def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, capsys):
     cloud.canned.append((401, {}, b'{"error": "no token"}'))
-    assert main(["robot", str(log), "--server", cloud.url, "--state", str(tmp_path)]) == 2
+    assert main(["play", str(log), "--server", cloud.url, "--state", str(tmp_path)]) == 2
     assert f"fcslam: {cloud.url}: no token (401)" in capsys.readouterr().err
 
 
@@ -130,7 +135,7 @@ def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_pat
     # A process in the background of a shell ignores SIGINT.
     heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     command = [sys.executable, "-c", f"{heeds}; import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"]
-    nowhere = ["robot", str(log), "--state", str(tmp_path), "--speed", "2", "--server"]
+    nowhere = ["play", str(log), "--state", str(tmp_path), "--speed", "2", "--server"]
     with subprocess.Popen([*command, *nowhere, "http://127.0.0.1:9"], stderr=subprocess.PIPE, text=True) as robot:
         assert "127.0.0.1:9" in robot.stderr.readline()
         robot.send_signal(number)
@@ -231,9 +236,9 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
     monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
     monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
     start = partial(Turned, executor=SameThread())
-    arguments = ("ros2:/anna", None, start, BagOptions(), None, NodeParameters(), tmp_path / "run")
+    arguments = ("anna", RosAddress("ros2", "/anna"), start, BagOptions(), NodeParameters(), tmp_path / "run")
     with pytest.raises(type(failure), match=re.escape(str(failure))):
-        live.map_live(*arguments, Console(file=io.StringIO()), None)
+        live.drive_live(*arguments, Console(file=io.StringIO()))
     assert read_tum(tmp_path / "run" / "trajectories" / "anna.tum")[0].size == len(scans)
     assert f"{len(scans)} scans, 1 sessions" in capsys.readouterr().out
 

@@ -1,4 +1,4 @@
-"""`fcslam serve --learn` and `fcslam robot --learn`: wrong options end in one line, before anything starts."""
+"""`fcslam serve --learn` and `fcslam play --learn`: wrong options end in one line, before anything starts."""
 
 import pytest
 
@@ -6,7 +6,8 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import main
-from fcslam.cli.learning_options import RobotLearning
+from fcslam.cli.learning_options import LearningFlags
+from fcslam.cli.server_options import ServerFlags
 from fcslam.errors import InputError
 from fcslam.records import Channel
 from fcslam.robot.frontend import RobotConfig
@@ -31,10 +32,10 @@ def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeyp
     assert not (tmp_path / "data").exists()
 
 
-def plan(tmp_path, config=None, **options):
-    given = {"learn": True, "config": None, "token_file": tmp_path / "token", "ca": None, "own": None} | options
-    learning = RobotLearning(**given).checked(False)
-    return learning.plan(config or RobotConfig(), "http://localhost:8340,http://192.0.2.1:8340", tmp_path)
+def plan(tmp_path, config=None, learn=True):
+    (tmp_path / "token").write_text("secret\n")
+    server = ServerFlags("http://localhost:8340,http://192.0.2.1:8340", tmp_path / "token")
+    return LearningFlags(learn).plan(config or RobotConfig(), server, tmp_path)
 
 
 def test_a_robot_learns_at_the_service_that_maps_it(tmp_path):
@@ -44,24 +45,12 @@ def test_a_robot_learns_at_the_service_that_maps_it(tmp_path):
     assert plan(tmp_path, learn=False) is None
 
 
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ({"config": RobotConfig(channels=(Channel.LIDAR,))}, "trains the camera's network"),
-    ],
-)
-def test_a_robot_that_cannot_learn_says_why(options, reason, tmp_path):
-    with pytest.raises(InputError, match=reason):
-        plan(tmp_path, **options)
+def test_a_robot_without_a_camera_cannot_learn(tmp_path):
+    with pytest.raises(InputError, match="trains the camera's network"):
+        plan(tmp_path, RobotConfig(channels=(Channel.LIDAR,)))
 
 
-def test_a_robot_that_localises_does_not_learn():
-    with pytest.raises(InputError, match="for a robot that maps; leave out --localize or --learn"):
-        RobotLearning(True, None, None, None, None).checked(True)
-
-
-@pytest.mark.parametrize("missing", ["service", "state"])
-def test_a_live_robot_learns_with_a_service_and_a_state_folder(missing, tmp_path):
-    given = {"service": "http://localhost:8340", "state": tmp_path} | {missing: None}
+@pytest.mark.parametrize(("server", "has_state"), [(None, True), ("http://localhost:8340", False)])
+def test_a_live_robot_learns_with_a_service_and_a_state_folder(server, has_state, tmp_path):
     with pytest.raises(InputError, match="give --server and --state"):
-        RobotLearning(True, None, None, None, None).plan(RobotConfig(), **given)
+        LearningFlags(True).plan(RobotConfig(), ServerFlags(server), tmp_path if has_state else None)

@@ -45,18 +45,9 @@ def test_bags_hold_the_same_scans(simulated):
 
 
 def test_the_robot_of_a_yard_is_as_asked(tmp_path):
-    asked = [
-        "--beams",
-        "91",
-        "--field-of-view",
-        "180",
-        "--lidar-range",
-        "81.9",
-        "--lidar-rate",
-        "2",
-        "--odometry",
-        "good",
-    ]
+    file = tmp_path / "sick.yaml"
+    file.write_text(f"lidar: {{beams: 91, field_of_view_rad: {np.pi}, max_range_m: 81.9, rate_hz: 2}}")
+    asked = ["--config", str(file), "--odometry", "good"]
     tiny = ["simulate", "--building", "yard", "--no-camera", "--robots", "1", "--path-length", "5"]
     assert main([*tiny, *asked, "--output", str(tmp_path / "yard")]) == 0
     scans = [record for record in open_source(tmp_path / "yard" / "robot_1").records() if isinstance(record, LaserScan)]
@@ -71,9 +62,11 @@ def test_the_robot_of_a_yard_is_as_asked(tmp_path):
     assert "max_range_m: 12.0" in (tmp_path / "ld19" / "simulation.yaml").read_text(encoding="utf-8")
 
 
-def test_a_scanner_is_as_asked_and_options_override_it(tmp_path):
+def test_a_scanner_is_as_asked_and_a_file_overrides_it(tmp_path):
+    file = tmp_path / "other.yaml"
+    file.write_text("{lidar: {beams: 100, rate_hz: 5, max_range_m: 8}, turn_rate_rad_s: 1}")
     tiny = [*TINY, "--path-length", "2", "--robots", "1", "--no-camera", "--scanner", "ld19"]
-    changes = ["--beams", "100", "--lidar-rate", "5", "--lidar-range", "8", "--turn-rate", "2", "--odometry", "none"]
+    changes = ["--config", str(file), "--turn-rate", "2", "--odometry", "none"]
     for name, options, expected in (("ld19", [], (450, 12.0, 0.1)), ("other", changes, (100, 8.0, 0.2))):
         assert main([*tiny, *options, "--output", str(tmp_path / name)]) == 0
         records = list(open_source(tmp_path / name / "robot_1").records())

@@ -1,4 +1,4 @@
-"""`fcslam learn vocabulary`, and robots that send its words: a whole mission without a range or a descriptor on the wire."""
+"""`fcslam learn vocabulary`, and robots that send its words: a mission without a range or a descriptor on the wire."""
 
 import json
 import shutil
@@ -134,7 +134,7 @@ def test_regions_count_in_a_map_of_words_and_a_removed_stretch_stays_in_it(with_
     robot = np.loadtxt(sorted((run / "trajectories").glob("*.tum"))[0])
     name = sorted((run / "trajectories").glob("*.tum"))[0].stem
     x, y = robot[0, 1:3]
-    assert main(["edit", "erase", str(run), f"{x - 0.5},{y - 0.5} {x + 0.5},{y + 0.5}", "--author", "eve"]) == 0
+    assert main(["edit", "erase", str(run), f"{x - 0.5},{y - 0.5} {x + 0.5},{y + 0.5}"]) == 0
     assert main(["edit", "remove", str(run), name, "--from", str(robot[-9, 0]), "--to", str(robot[-1, 0])]) == 0
     assert main(["map", "--onto", str(run), "--quiet", "--output", str(edited)]) == 0
     before, after = (read_map(folder / "map.yaml") for folder in (run, edited))
@@ -151,4 +151,6 @@ def test_a_file_of_another_kind_is_not_replaced(with_descriptors, tmp_path, caps
     assert recording.read_bytes() == b"a recording"
     assert "is not a vocabulary, so it stays" in capsys.readouterr().err
     words = tmp_path / "building.words"
-    assert [main(["learn", "vocabulary", str(with_descriptors), "-o", str(words), "--words", "16"]) for _ in range(2)] == [0, 0]
+    assert [
+        main(["learn", "vocabulary", str(with_descriptors), "-o", str(words), "--words", "16"]) for _ in range(2)
+    ] == [0, 0]

@@ -75,16 +75,6 @@ def test_the_file_is_as_documented(images, tmp_path):
         assert archive["image_size"].tolist() == [320, 240]
 
 
-def test_nms_keeps_boxes_apart(images, tmp_path):
-    main(["learn", "extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb", "--nms", "8"])
-    points = read_features(tmp_path / "grey.npz")[0].keypoints_px
-    gaps = np.abs(points[:, None] - points)
-    common = np.prod(np.clip(8 - gaps, 0, None), axis=2)
-    np.fill_diagonal(common, 0)
-    assert np.all(common <= 0.1 * (128 - common) + 1e-3)
-    assert 20 < len(points) < 800
-
-
 def test_larger_images_are_shrunk_and_keypoints_are_in_their_own_pixels(image):
     large = cv2.resize(image, (1280, 960), interpolation=cv2.INTER_NEAREST)
     small = Orb(OrbConfig()).detect(image)
@@ -97,7 +87,9 @@ def test_larger_images_are_shrunk_and_keypoints_are_in_their_own_pixels(image):
 def test_networks_extract_as_well(images, tmp_path, capsys):
     pytest.importorskip("onnxruntime")
     tiny_network(tmp_path / "n.onnx")
-    assert main(["learn", "extract", str(images), "-o", str(tmp_path / "out"), "--weights", str(tmp_path / "n.onnx")]) == 0
+    assert (
+        main(["learn", "extract", str(images), "-o", str(tmp_path / "out"), "--weights", str(tmp_path / "n.onnx")]) == 0
+    )
     assert "tiny-1: features of 8 images, 3 files skipped" in capsys.readouterr().out
 
 
@@ -195,7 +187,16 @@ def test_taking_some_takes_all_that_is_known_of_them(image):
 
 def test_scales_of_the_command_line(images, tmp_path, capsys):
     tiny_network(tmp_path / "n.onnx")
-    given = ["learn", "extract", str(images / "grey.png"), "--weights", str(tmp_path / "n.onnx"), "--keypoints", "50", "-o"]
+    given = [
+        "learn",
+        "extract",
+        str(images / "grey.png"),
+        "--weights",
+        str(tmp_path / "n.onnx"),
+        "--keypoints",
+        "50",
+        "-o",
+    ]
     for scales in ("1", "0.5", "1,0.5"):
         assert main([*given, str(tmp_path / scales), "--scales", scales]) == 0
     one, half, both = (read_features(tmp_path / scales / "grey.npz")[0] for scales in ("1", "0.5", "1,0.5"))

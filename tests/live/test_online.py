@@ -52,10 +52,10 @@ class Clock:
         return self.now
 
 
-def drive(tmp_path, network, records, resume=False, watch=lambda _: None, limit=10**9, recording="r"):
+def drive(tmp_path, network, records, resume=False, watch=lambda _: None, recording="r"):
     pause = threading.Event()
     robot = Robot(
-        "alice", server=network, state=tmp_path, outbox_mb=1e-6 * limit, own_map=False,
+        "alice", server=network, state=tmp_path, own_map=False,
         playback=Playback(recording, resume), executor=SameThread(), clock=Clock(),
         sleep=lambda _: pause.wait(0.001),
     )  # fmt: skip
@@ -144,10 +144,11 @@ def test_another_recording_cannot_be_resumed(scans, tmp_path):
 
 
 @pytest.mark.slow
-def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone, tmp_path):
+def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone, tmp_path, monkeypatch):
     """The cloud is away until the outbox is full."""
     cloud = FakeCloud()
     limit = sum(map(len, contents(alone))) // 3
+    monkeypatch.setattr("fcslam.live.robot.LARGEST_OUTBOX_BYTES", limit)
     waits = []
 
     class Away(Network):
@@ -158,7 +159,7 @@ def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone
         if now.waiting.bytes >= limit:
             waits.append(now.scans)
 
-    robot = drive(tmp_path, Away(cloud), scans, watch=watch, limit=limit)
+    robot = drive(tmp_path, Away(cloud), scans, watch=watch)
     assert len(set(waits)) < len(waits), "the front end waited"
     places = [packet for packet in alone if isinstance(packet.body, Place)]
     sent = [decode(data).body for data in cloud.stored.values()]

@@ -18,6 +18,7 @@ from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
+from fcslam.wire.http_transport import Server
 from fcslam.wire.map_client import MapClient
 
 NOBODY = "http://127.0.0.1:9"
@@ -64,7 +65,7 @@ def floors(tmp_path):
 
 @pytest.mark.parametrize(("floor", "side"), [("1", 160), ("2", 90)])
 def test_the_copy_has_the_maps_of_the_cloud_with_their_floors(floors, tmp_path, floor, side):
-    assert fetch_maps(tmp_path / "copy", floors) is None
+    assert fetch_maps(tmp_path / "copy", Server(floors)) is None
     copied = read_map(tmp_path / "copy", floor)
     assert np.array_equal(copied.cells, building(side).cells)
     assert (copied.resolution_m, copied.origin_xy, copied.floor) == (0.05, (-3.0, -2.0), floor)
@@ -74,12 +75,12 @@ def test_the_copy_has_the_maps_of_the_cloud_with_their_floors(floors, tmp_path, 
 
 def test_an_earlier_copy_serves_while_the_cloud_cannot_be_reached(floors, tmp_path):
     with pytest.raises(CloudError, match="copy holds no earlier copy of the map"):
-        fetch_maps(tmp_path / "copy", NOBODY)
+        fetch_maps(tmp_path / "copy", Server(NOBODY))
     assert not (tmp_path / "copy").exists()
-    fetch_maps(tmp_path / "copy", floors)
+    fetch_maps(tmp_path / "copy", Server(floors))
     before = {path: path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()}
-    assert "127.0.0.1:9" in fetch_maps(tmp_path / "copy", NOBODY)
-    assert fetch_maps(tmp_path / "copy", f"{NOBODY},{floors}") is None
+    assert "127.0.0.1:9" in fetch_maps(tmp_path / "copy", Server(NOBODY))
+    assert fetch_maps(tmp_path / "copy", Server(f"{NOBODY},{floors}")) is None
     assert {path: path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()} == before
 
 
@@ -87,7 +88,7 @@ def test_a_new_copy_replaces_the_earlier_one(tmp_path):
     for side in (40, 60):
         run_of([(building(side), "")]).save(tmp_path / "run", force=True)
         with served(tmp_path / "run") as url:
-            fetch_maps(tmp_path / "copy", url)
+            fetch_maps(tmp_path / "copy", Server(url))
         assert read_map(tmp_path / "copy").cells.shape == (side, side)
 
 
@@ -95,7 +96,7 @@ def test_a_folder_with_something_else_stays_as_it_is(floors, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match="exists and is not a run folder"):
-        fetch_maps(tmp_path / "mine", floors)
+        fetch_maps(tmp_path / "mine", Server(floors))
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
 
 
@@ -112,13 +113,13 @@ def test_a_map_that_the_cloud_draws_anew_meanwhile_is_read_again(floors, tmp_pat
         return one._replace(extent_m=(one.extent_m[0] - 0.05, *one.extent_m[1:]))
 
     monkeypatch.setattr(MapClient, "maps", maps)
-    assert fetch_maps(tmp_path / "copy", floors) is None
+    assert fetch_maps(tmp_path / "copy", Server(floors)) is None
     assert len(answers) == 2
-    assert "its maps change all the time" in fetch_maps(tmp_path / "copy", floors)
+    assert "its maps change all the time" in fetch_maps(tmp_path / "copy", Server(floors))
 
 
 def test_a_cloud_without_a_map_is_told_in_one_line(tmp_path, capsys):
     replace(run_of([]), metrics={}).save(tmp_path / "run")
     with served(tmp_path / "run") as url:
-        assert main(["robot", "ros2:/robot1", "--server", url, "--localize", str(tmp_path / "copy")]) == 2
+        assert main(["localize", "ros2:/robot1", "--server", url, "--map", str(tmp_path / "copy")]) == 2
     assert capsys.readouterr().err == f"fcslam: {url}: has no map yet; let a robot send its scans first\n"

@@ -162,7 +162,11 @@ app.command(
     ),
 )(simulate.simulate)
 app.add_typer(evaluate.app, name="evaluate", rich_help_panel=STUDY)
-learn = typer.Typer(no_args_is_help=True, help="Train the detector of the cameras, alone or together, and use it.")
+learn = typer.Typer(
+    no_args_is_help=True,
+    help="Train the detector of the cameras, alone or together, and use it.",
+    epilog=examples("fcslam learn train photos -o detector"),
+)
 learn.command(
     "train",
     epilog=examples(
@@ -184,7 +188,11 @@ learn.command(
     ),
 )(vocabulary.vocabulary)
 app.add_typer(learn, name="learn", rich_help_panel=MORE)
-setup = typer.Typer(no_args_is_help=True, help="Configuration, credentials, and compiling ahead of the first run.")
+setup = typer.Typer(
+    no_args_is_help=True,
+    help="Configuration, credentials, and compiling ahead of the first run.",
+    epilog=examples("fcslam setup config > mission.yaml"),
+)
 setup.command(
     "config",
     epilog=examples(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingSeed, NoCamera, Quiet
+from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.show import Live, live_page
 from fcslam.lab.simulation.options import Scanner
@@ -31,6 +31,7 @@ def demo(
     ] = Path("demo"),
     robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 3,
     seed: BuildingSeed = 1,
+    path_length: PathLength = None,
     no_camera: NoCamera = False,
     learn: Annotated[
         bool,
@@ -57,6 +58,7 @@ def demo(
     camera = None if no_camera else CameraSettings()
     settings = SimulationSettings(
         robots=robots,
+        path_length_m=60.0 if path_length is None else path_length,
         lidar=SCANNERS[Scanner.LD19],
         camera=camera,
     )

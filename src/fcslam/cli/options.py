@@ -13,6 +13,10 @@ Csv = Annotated[
     Path | None, typer.Option(help="Also write the numbers to this file: as JSON if it ends in .json, else as CSV.")
 ]
 BuildingSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the building, the routes and the noise.")]
+PathLength = Annotated[
+    float | None,
+    typer.Option(min=1.0, max=10_000.0, help="Distance that each robot drives, in metres.", show_default="60"),
+]
 NoCamera = Annotated[bool, typer.Option("--no-camera", help="Simulate LiDARs only. This needs no GL library.")]
 
 _WORKERS = "Workers"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingSeed, NoCamera, Quiet, output_option
+from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
@@ -33,10 +33,7 @@ def simulate(
     robots: Annotated[int | None, typer.Option(min=1, max=100, help="Number of robots.", show_default="3")] = None,
     seed: BuildingSeed = 1,
     building: Annotated[Building | None, typer.Option(help="Kind of building.", show_default="default")] = None,
-    path_length: Annotated[
-        float | None,
-        typer.Option(min=1.0, max=10_000.0, help="Distance that each robot drives, in metres.", show_default="60"),
-    ] = None,
+    path_length: PathLength = None,
     lighting: Annotated[
         list[Lighting] | None,
         typer.Option(
@@ -72,7 +69,7 @@ def simulate(
         typer.Option(
             "--config", "-c",
             help="Settings of the simulation (YAML), such as range, rate and beams of the scanner, or the slope of a "
-            "yard; each simulation writes its own to simulation.yaml. Options override them.",
+            "yard, over those of --scanner; each simulation writes its own to simulation.yaml.",
         ),
     ] = None,
     bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
@@ -91,7 +88,8 @@ def simulate(
 
     if resume and output is None:
         raise OutputError("--resume continues a simulation in its folder; give --output")
-    settings = SimulationSettings() if config is None else load(SimulationSettings, config)
+    settings = SimulationSettings(lidar=SCANNERS[scanner or Scanner.INSTANT])
+    settings = settings if config is None else load(SimulationSettings, config, over=settings)
     given = {
         "robots": robots,
         "building": building,
@@ -99,12 +97,12 @@ def simulate(
         "lighting": tuple(lighting) if lighting else None,
         "moved_furniture": moved_furniture,
         "turn_rate_rad_s": turn_rate,
-        "lidar": None if scanner is None else SCANNERS[scanner],
     }
     settings = settings.model_copy(update={key: value for key, value in given.items() if value is not None})
     if odometry is not None:
         settings = settings.model_copy(update={"drift": KINDS[odometry]})  # none is a kind, too
-    if settings.building.is_outdoors and settings.lidar == SCANNERS[Scanner.INSTANT]:
+    usual_m = SCANNERS[Scanner.INSTANT].max_range_m
+    if settings.building.is_outdoors and scanner is None and settings.lidar.max_range_m == usual_m:
         settings = settings.model_copy(update={"lidar": settings.lidar.model_copy(update={"max_range_m": OUTDOORS_M})})
     if no_camera:
         settings = settings.model_copy(update={"camera": None})

@@ -1,4 +1,4 @@
-"""`fcslam learn vocabulary`: the words that robots and cloud share, so that robots send words in place of descriptors."""
+"""`fcslam learn vocabulary`: the words that robots and cloud share, and robots send in place of descriptors."""
 
 from pathlib import Path
 from typing import Annotated

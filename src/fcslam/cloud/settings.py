@@ -56,8 +56,8 @@ class FleetConfig(Settings):
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     vocabularies: tuple[Path, ...] = Field(
         default=(),
-        description="files of the vocabularies that robots may send words of, as `fcslam learn vocabulary` writes them; "
-        "others are refused",
+        description="files of the vocabularies that robots may send words of, as `fcslam learn vocabulary` writes "
+        "them; others are refused",
     )
     consistency: ConsistencySettings = Field(
         default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"

@@ -242,13 +242,6 @@ def test_metrics_have_unique_names_and_json_no_nan(folder, capsys):
     assert values.keys() == {metric.name for metric in metrics}
 
 
-def test_the_thresholds_can_be_chosen(folder, capsys):
-    report_of(RUN, folder, *CLOSURES)
-    table = folder.parent / "table.csv"
-    assert main(["evaluate", "fleet", str(folder), "--wrong-m", "0.7", "--csv", str(table)]) == 0
-    assert "inter_robot_verified_both_wrong,0,1" in table.read_text().splitlines()
-
-
 def spoil_nothing(recordings):
     (recordings / "r1" / "ground_truth.tum").unlink()
 

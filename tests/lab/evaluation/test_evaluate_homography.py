@@ -130,7 +130,19 @@ def test_extracted_features_score_as_the_detector_that_runs_here(scenes, tmp_pat
     H = framed_homography(TURN, pictures[0].framing, pictures[1].framing, HomographyGroundTruth.CORRECTED)
     np.savetxt(scene / "H_1_2", H / H[2, 2])
     assert (
-        main(["learn", "extract", str(scene.parent), "-o", str(tmp_path / "mine"), "--detector", "orb", "--keypoints", "1500"])
+        main(
+            [
+                "learn",
+                "extract",
+                str(scene.parent),
+                "-o",
+                str(tmp_path / "mine"),
+                "--detector",
+                "orb",
+                "--keypoints",
+                "1500",
+            ]
+        )
         == 0
     )
     for number in (1, 2):

@@ -1,11 +1,8 @@
 """The paper's figure 4 on drawn places, its measures against plain loops."""
 
-import csv
-
 import numpy as np
 import pytest
 
-from fcslam.cli import main
 from fcslam.lab.evaluation.places.features import choose_features, describe_sets
 from fcslam.lab.evaluation.places.vocabulary_growth import (
     BATCH,
@@ -96,21 +93,3 @@ def test_what_is_fixed_stays(world):
         assert np.isnan(growth.seconds).all()
         difference = ahead_of(growth, growth, "significance", SEED)
         assert tuple(difference) == (0.0, 0.0, 0.0)
-
-
-@pytest.mark.slow
-def test_the_command_draws_and_writes(tour, tmp_path, capsys):
-    assert main(["evaluate", "vocabulary", str(tour), "--groups", "5", "-o", str(tmp_path)]) == 0
-    assert "5 groups" in " ".join(capsys.readouterr().out.split())
-    assert (tmp_path / "figure4.png").read_bytes().startswith(b"\x89PNG")
-    with (tmp_path / "figure4.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert {row["strategy"] for row in rows} == {"brute force", *(strategy.value for strategy in Strategy)}
-    assert {row["measure"] for row in rows} == {*MEASURES, "words", "seconds"}
-    assert {row["places"] for row in rows} == {"40", "80"}
-
-
-def test_too_few_places_are_told(tmp_path, capsys):
-    folder = place_folders.generic(tmp_path / "generic")
-    assert main(["evaluate", "vocabulary", str(folder), "-o", str(tmp_path / "out")]) == 2
-    assert "give sets with 40 places" in capsys.readouterr().err

@@ -23,8 +23,8 @@ Sets = Annotated[
 Features = Annotated[
     str,
     typer.Option(
-        help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that fcslam learn extract "
-        "wrote, with a subfolder for each set."
+        help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that `fcslam learn "
+        "extract` wrote, with a subfolder for each set."
     ),
 ]
 TrainOn = Annotated[

@@ -41,8 +41,8 @@ def homography(
     features: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of extracted features, SCENE/1.npz ..., as fcslam learn extract writes them, to evaluate instead of "
-            "detectors or, with --detector, beside them. Can be repeated."
+            help="Folder of extracted features, SCENE/1.npz ..., as `fcslam learn extract` writes them, to evaluate "
+            "instead of detectors or, with --detector, beside them. Can be repeated."
         ),
     ] = None,
     ground_truth: Annotated[

@@ -8,7 +8,7 @@ from fcslam.cli.federate.local import local
 from fcslam.cli.federate.serve import serve
 
 _LOCAL = "fcslam learn federate local robot1 robot2 robot3 --public photos -o fleet"
-_SERVE = "fcslam learn federate serve server.lab:8000 --insecure --public photos -o fleet"
+_SERVE = "fcslam learn federate serve lab:8000 --insecure --public photos -o fleet"
 _JOIN = "fcslam learn federate join http://server.lab:8000 images --name robot1 -o home"
 
 app = typer.Typer(no_args_is_help=True)

@@ -1,15 +1,12 @@
 """The figure and the table of a growing vocabulary."""
 
-import csv
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fcslam.errors import OutputError
-from fcslam.lab.evaluation.places.figures import COLOURS, panel_figure, save
-from fcslam.lab.evaluation.places.vocabulary_growth import BATCH, MEASURES, Growth, growth_rows
+from fcslam.lab.evaluation.places.figures import COLOURS, panel_figure
+from fcslam.lab.evaluation.places.vocabulary_growth import BATCH, MEASURES, Growth
 from fcslam.records import FloatArray
 
 _TITLES = {
@@ -38,23 +35,6 @@ def draw_growth(growths: Mapping[str, Growth], caption: str, seed: int) -> Any:
     figure.legend(*axes[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(0.94, 0.2))
     figure.supxlabel(caption, fontsize=9)
     return figure
-
-
-def write_growth(folder: Path, growths: Mapping[str, Growth], caption: str, seed: int) -> None:
-    """Write ``figure4.png`` and ``figure4.csv``.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
-    save(draw_growth(growths, caption, seed), folder / "figure4.png")
-    try:
-        with (folder / "figure4.csv").open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["strategy", "places", "measure", "value", "low", "high"])
-            for *what, value, low, high in growth_rows(growths, seed):
-                writer.writerow([*what, *("" if np.isnan(x) else f"{x:.6g}" for x in (value, low, high))])
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot write the table ({error})") from error
 
 
 def _series(growth: Growth, measure: str, seed: int) -> FloatArray:
