@@ -1,5 +1,7 @@
 """Networks as detectors: the contract, images of any size, and what breaks the contract."""
 
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -8,7 +10,7 @@ import pytest
 
 from fcslam.errors import FeatureError
 from fcslam.features.classical import Orb, OrbConfig
-from fcslam.features.detector import OnnxConfig, OnnxDetector
+from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.factory import make_detector
 from tests.features.networks import tiny_network
@@ -64,7 +66,7 @@ def test_logits_that_are_all_zero_stay_so(weights, monkeypatch):
     detector = OnnxDetector(OnnxConfig(weights=weights))
     scores = np.zeros((16, 16), np.float32)
     scores[5, 6] = 0.5
-    monkeypatch.setattr(detector, "_run", lambda _: (scores, np.zeros((256, 2, 2), np.float32)))
+    monkeypatch.setattr("fcslam.features.detector._run", lambda *_: (scores, np.zeros((256, 2, 2), np.float32)))
     found = detector.detect_floats(np.zeros((16, 16), np.uint8))
     assert found.keypoints_px.tolist() == [[6, 5]]
     assert not found.descriptors.any()
@@ -150,9 +152,19 @@ def test_without_weights_one_is_told_so(tmp_path, monkeypatch):
         OnnxDetector(OnnxConfig())
 
 
-def test_weights_that_come_with_the_package_are_the_default(weights, monkeypatch):
-    monkeypatch.setattr("fcslam.features.detector.BUNDLED_NETWORK", weights)
-    assert OnnxDetector(OnnxConfig()).version == "tiny-1"
+def test_the_bundled_network_is_the_default_and_has_the_version_that_is_named(tmp_path):
+    shutil.copy(BUNDLED_NETWORK, tmp_path / "copy.onnx")
+    named = OnnxDetector(OnnxConfig())
+    assert named.version == OnnxDetector(OnnxConfig(weights=tmp_path / "copy.onnx")).version
+    assert len(named.detect(np.kron(np.eye(8, dtype=np.uint8), np.full((16, 16), 255, np.uint8))).scores)
+
+
+def test_the_bundled_network_is_loaded_for_the_first_image():
+    program = (
+        "import sys; from fcslam.features.detector import OnnxConfig, OnnxDetector; "
+        "assert OnnxDetector(OnnxConfig()).version; assert 'onnxruntime' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_a_bare_name_is_a_bundled_network_and_finds_corners():

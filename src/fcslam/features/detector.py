@@ -9,6 +9,7 @@ A network is an ONNX file, run by ONNX Runtime on the CPU. Its format, ``fcslam_
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, Protocol, Self
 
@@ -29,6 +30,8 @@ NETWORK_FORMAT: Final = "1"
 """Format of networks that this version of fcslam reads."""
 BUNDLED_NETWORK: Final = Path(__file__).parent / "networks" / "detector.onnx"
 """The bundled network; a package may be built without it."""
+BUNDLED_VERSION: Final = "light-723cb7f52404"
+"""Its version. A robot without a camera names it and never loads ONNX Runtime."""
 
 MATCHING_SCALES: Final = (1.0, 0.71, 0.5)
 """Scales at which two views match best. Robots recognise places as well with one scale, in half the time."""
@@ -126,7 +129,7 @@ class OnnxDetector:
     """Keypoints and codes by a network."""
 
     def __init__(self, config: OnnxConfig) -> None:
-        """Load and try the network.
+        """Load and try the network; the bundled one is loaded for the first image.
 
         Raises:
             FeatureError: the file is missing, or is not a network of this format.
@@ -134,17 +137,23 @@ class OnnxDetector:
         self._config = config
         if config.weights is None and not BUNDLED_NETWORK.is_file():
             raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or choose orb")
-        path = network_file(config.weights)
-        self._session, metadata = _load(path, config.threads)
+        self._path = network_file(config.weights)
+        self._version = BUNDLED_VERSION if self._path == BUNDLED_NETWORK else self._loaded[1]
+
+    @cached_property
+    def _loaded(self) -> tuple[Any, str]:
+        """Session and version of the network, whose output is checked."""
+        path, (session, metadata) = self._path, _load(self._path, self._config.threads)
         if metadata.get("fcslam_format") != NETWORK_FORMAT:
             found = metadata.get("fcslam_format", "none")
             raise FeatureError(
                 f"{path}: its format is {found}, not {NETWORK_FORMAT}; give weights made for this fcslam"
             )
-        self._version = metadata.get("fcslam_version", "")
-        if not NAME.fullmatch(self._version):
-            raise FeatureError(f"{path}: '{self._version}' is not a detector version; export the network with one")
-        self._check(path)
+        version = metadata.get("fcslam_version", "")
+        if not NAME.fullmatch(version):
+            raise FeatureError(f"{path}: '{version}' is not a detector version; export the network with one")
+        _check(session, path)
+        return session, version
 
     @property
     def version(self) -> str:
@@ -174,7 +183,7 @@ class OnnxDetector:
         height, width = image.shape
         if not image.size:
             return np.empty(image.shape, np.float32), np.zeros((CODE_BITS, 1, 1), np.float32)
-        scores, logits = self._run(padded(image))
+        scores, logits = _run(self._loaded[0], padded(image))
         return scores[:height, :width], logits
 
     def _find(self, image: GreyImage) -> tuple[Keypoints, NDArray[np.float32]]:
@@ -194,27 +203,6 @@ class OnnxDetector:
         scores, cells = self.infer(level)
         positions, strengths = find_peaks(scores, config.least_score, config.nms_px, config.most_features)
         return in_original(positions, level, image), np.float32(scale) * strengths, sample_logits(cells, positions)
-
-    def _run(self, image: GreyImage) -> tuple[Probabilities, Logits]:
-        grey = (image.astype(np.float32) / np.float32(255.0))[None, None]
-        scores, logits = self._session.run(["scores", "logits"], {"image": grey})
-        return scores[0], logits[0]
-
-    def _check(self, path: Path) -> None:
-        """Run the network on a small image and check its output, because its metadata may be wrong."""
-        rows, columns = 3, 5
-        try:
-            scores, logits = self._run(np.full((rows * CELL_PX, columns * CELL_PX), 128, np.uint8))
-        except Exception as error:  # ONNX Runtime has no common exception
-            raise FeatureError(
-                f"{path}: the network does not run ({error}); give weights of an fcslam detector"
-            ) from error
-        expected = ((rows * CELL_PX, columns * CELL_PX), (CODE_BITS, rows, columns))
-        if (scores.shape, logits.shape) != expected or not (np.isfinite(scores).all() and np.isfinite(logits).all()):
-            raise FeatureError(
-                f"{path}: for {columns * CELL_PX} x {rows * CELL_PX} pixels it gives {scores.shape} scores and "
-                f"{logits.shape} logits, not finite ones of {expected[0]} and {expected[1]}; give other weights"
-            )
 
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
@@ -247,6 +235,27 @@ def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     except Exception as error:  # ONNX Runtime has no common exception
         raise FeatureError(f"{path}: no ONNX network ({error}); give weights of an fcslam detector") from error
     return session, dict(session.get_modelmeta().custom_metadata_map)
+
+
+def _run(session: Any, image: GreyImage) -> tuple[Probabilities, Logits]:
+    grey = (image.astype(np.float32) / np.float32(255.0))[None, None]
+    scores, logits = session.run(["scores", "logits"], {"image": grey})
+    return scores[0], logits[0]
+
+
+def _check(session: Any, path: Path) -> None:
+    """Run the network on a small image and check its output, because its metadata may be wrong."""
+    rows, columns = 3, 5
+    try:
+        scores, logits = _run(session, np.full((rows * CELL_PX, columns * CELL_PX), 128, np.uint8))
+    except Exception as error:  # ONNX Runtime has no common exception
+        raise FeatureError(f"{path}: the network does not run ({error}); give weights of an fcslam detector") from error
+    expected = ((rows * CELL_PX, columns * CELL_PX), (CODE_BITS, rows, columns))
+    if (scores.shape, logits.shape) != expected or not (np.isfinite(scores).all() and np.isfinite(logits).all()):
+        raise FeatureError(
+            f"{path}: for {columns * CELL_PX} x {rows * CELL_PX} pixels it gives {scores.shape} scores and "
+            f"{logits.shape} logits, not finite ones of {expected[0]} and {expected[1]}; give other weights"
+        )
 
 
 def shrink(image: GreyImage, scale: float) -> GreyImage:
