@@ -12,9 +12,6 @@ if TYPE_CHECKING:
 
 TRAINING_OUTPUT = "Folder for everything that training writes. If it holds an unfinished run, training continues it."
 
-TrainingSeed = Annotated[
-    int | None, typer.Option("--seed", min=0, help="Seed of the training.", show_default="that of the settings")
-]
 Start = Annotated[
     Path | None,
     typer.Option(

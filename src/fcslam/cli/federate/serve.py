@@ -5,46 +5,25 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.federate.options import (
-    LocalSteps,
-    Public,
-    Rounds,
-    SettingsFile,
-    Strategy,
-    federated_settings,
-    parse_address,
-)
+from fcslam.cli.federate.options import RoundFlags, parse_address
 from fcslam.cli.federate.rounds import show_rounds
+from fcslam.cli.groups import with_groups
 from fcslam.cli.listening import check_tls, listen
 from fcslam.cli.options import Quiet, output_option
-from fcslam.cli.output import TRAINING, new_folder, notices, print_line
-from fcslam.cli.training_options import (
-    TRAINING_OUTPUT,
-    Device,
-    Quick,
-    Start,
-    TrainingSeed,
-    compute_budget,
-    require_training_libraries,
-)
+from fcslam.cli.output import TRAINING, notices, print_line
+from fcslam.cli.training_options import TRAINING_OUTPUT, require_training_libraries
 
 _TLS = "TLS"
 MAX_LINES = 1000
 """Different notices that are printed, so that nobody on the network can fill a log."""
 
 
+@with_groups
 def serve(
     address: Annotated[str, typer.Argument(metavar="HOST:PORT", help="Address to listen on.")],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
-    config: SettingsFile = None,
-    start: Start = None,
-    public: Public = None,
-    strategy: Strategy = None,
-    rounds: Rounds = None,
-    local_steps: LocalSteps = None,
-    seed: TrainingSeed = None,
-    device: Device = "auto",
+    rounds: RoundFlags,
     tokens: Annotated[
         Path | None,
         typer.Option(help="File of the robots' tokens; `fcslam setup certificates` makes one.", rich_help_panel=_TLS),
@@ -58,7 +37,6 @@ def serve(
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Use neither encryption nor authentication.", rich_help_panel=_TLS)
     ] = False,
-    quick: Quick = False,
     quiet: Quiet = False,
 ) -> None:
     """Run the server of a fleet: wait for robots at HOST:PORT and train one detector with them.
@@ -69,10 +47,9 @@ def serve(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import ServiceError
 
-    settings = federated_settings(config, quick, strategy, rounds, local_steps, seed)
+    settings = rounds.settings()
     require_training_libraries("flwr", extra="federated")
     from fcslam.learning.federated import launch
-    from fcslam.learning.federated.job import FederatedJob
     from fcslam.service.http.authentication import Authenticator, read_tokens
 
     tls = None if tls_certificate is None or tls_key is None else (tls_certificate, tls_key)
@@ -80,7 +57,7 @@ def serve(
         raise ServiceError("give --tokens, --tls-certificate and --tls-key, or --insecure in a network of your own")
     check_tls(tls_certificate, tls_key)
     host, port = parse_address(address)
-    options = compute_budget(device, quick)
+    options = rounds.compute_budget()
     console, printed = notices(quiet), set[str]()
 
     def print_once(line: str) -> None:
@@ -89,7 +66,7 @@ def serve(
             print_line(console, line)
 
     authenticator = Authenticator(None if insecure or tokens is None else read_tokens(tokens))
-    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
+    job = rounds.job(output, settings)
     with listen(host, port) as listener, ProgressDisplay(console, f"output: {job.output}") as display:
         progress = show_rounds(display, console, settings)
         launch.serve(job, options, listener, None if insecure else tls, authenticator, progress, print_once)
