@@ -17,7 +17,7 @@ from fcslam.cli import live, main
 from fcslam.cli.play import _watch
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.errors import CloudError, StateError
-from fcslam.live.records import RobotStatus
+from fcslam.live.records import RobotStatus, Wiring
 from fcslam.live.robot import Robot
 from fcslam.robot.outbox import WaitingPackets
 from fcslam.ros.addresses import RosAddress
@@ -235,7 +235,7 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
     monkeypatch.setattr("fcslam.ros.addresses.open_network", lambda *_: MemoryNetwork())
     monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
     monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
-    start = partial(Turned, executor=SameThread())
+    start = partial(Turned, wiring=Wiring(SameThread()))
     arguments = ("anna", RosAddress("ros2", "/anna"), start, BagOptions(), NodeParameters(), tmp_path / "run")
     with pytest.raises(type(failure), match=re.escape(str(failure))):
         live.drive_live(*arguments, Console(file=io.StringIO()))

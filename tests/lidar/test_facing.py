@@ -10,6 +10,7 @@ import fcslam
 from fcslam.geometry import se2
 from fcslam.lidar.facing import Facing, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig
+from fcslam.live.records import Wiring
 from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.sources import BagOptions, open_source, write_bag
@@ -135,7 +136,7 @@ def test_a_laser_may_be_given_upside_down(tmp_path):
 def test_a_live_robot_says_once_that_its_laser_faces_another_way(turned_deg, said):
     told = []
     scans = stated(drive(NARROW), turned_deg)
-    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=told.append) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread()), on_event=told.append) as robot:
         for scan in scans:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
     lines = [event.text for event in told if "the laser is turned by about 180 deg" in event.text]

@@ -8,6 +8,7 @@ import pytest
 import fcslam
 from fcslam.errors import InputError
 from fcslam.geometry import se2
+from fcslam.live.records import Wiring
 from fcslam.mission.localization import read_map
 from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.sources import write_carmen
@@ -34,7 +35,7 @@ def scans(fleet):
 
 
 def robot_in(building, scans, executor=None, **options):
-    return fcslam.LocalizedRobot("anna", building, scans[0].laser, executor=executor or SameThread(), **options)
+    return fcslam.LocalizedRobot("anna", building, scans[0].laser, wiring=Wiring(executor or SameThread()), **options)
 
 
 def drive(robot, scans):

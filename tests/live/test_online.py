@@ -11,8 +11,8 @@ from fcslam.errors import CloudError, StateError
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
 from fcslam.live.playback import PlaybackPace, play
-from fcslam.live.records import EventKind, LocalizationState
-from fcslam.live.robot import Playback, Robot
+from fcslam.live.records import EventKind, LocalizationState, Playback, Wiring
+from fcslam.live.robot import Robot
 from fcslam.records import Channel, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
@@ -56,8 +56,7 @@ def drive(tmp_path, network, records, resume=False, watch=lambda _: None, record
     pause = threading.Event()
     robot = Robot(
         "alice", server=network, state=tmp_path, own_map=False,
-        playback=Playback(recording, resume), executor=SameThread(), clock=Clock(),
-        sleep=lambda _: pause.wait(0.001),
+        wiring=Wiring(SameThread(), Clock(), lambda _: pause.wait(0.001), Playback(recording, resume)),
     )  # fmt: skip
     with closing(robot):
         play(robot, records, AS_FAST_AS_POSSIBLE, watch)
@@ -219,7 +218,7 @@ def test_a_robot_on_another_floor_was_not_lost(scans, tmp_path):
     half = len(scans) // 2
     robot = Robot(
         "alice", server=Network(cloud), state=tmp_path, own_map=False, floor="1", on_event=events.append,
-        executor=SameThread(), clock=Clock(), sleep=lambda _: pause.wait(0.001),
+        wiring=Wiring(SameThread(), Clock(), lambda _: pause.wait(0.001)),
     )  # fmt: skip
     with closing(robot):
         for scan in scans[:half]:
@@ -285,7 +284,7 @@ def test_a_full_disk_does_not_fill_the_memory(scans, tmp_path, monkeypatch):
         raise StateError("disk full")
 
     monkeypatch.setattr(Outbox, "put", put)
-    with Robot("alice", scans[0].laser, state=tmp_path, executor=SameThread()) as robot:
+    with Robot("alice", scans[0].laser, state=tmp_path, wiring=Wiring(SameThread())) as robot:
         for scan in scans:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
         with pytest.raises(StateError, match="disk full"):
@@ -313,7 +312,7 @@ def test_a_recording_is_played_by_its_own_clock():
 
 def test_the_own_map_lies_where_the_server_puts_it(scans):
     cloud = FakeCloud(correction=CORRECTION.version)
-    with Robot("alice", scans[0].laser, server=Network(cloud), executor=SameThread()) as robot:
+    with Robot("alice", scans[0].laser, server=Network(cloud), wiring=Wiring(SameThread())) as robot:
         for scan in scans:
             pose = robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
         before = robot.map()
@@ -332,7 +331,7 @@ def test_the_own_map_lies_where_the_server_puts_it(scans):
 @pytest.mark.parametrize("is_away", [True, False])
 def test_own_closures_move_the_pose_while_the_server_is_away(scans, monkeypatch, is_away):
     """And never the map. While the server is there, its next correction has the closure."""
-    with Robot("alice", scans[0].laser, executor=SameThread()) as robot:
+    with Robot("alice", scans[0].laser, wiring=Wiring(SameThread())) as robot:
         for scan in scans[:-2]:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
         monkeypatch.setattr(robot, "_is_server_away", lambda: is_away)
@@ -358,8 +357,9 @@ def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_pa
             return "none" if back.is_set() else "request lost"
 
     network, pause = Away(FakeCloud()), threading.Event()
-    with Robot("alice", scans[0].laser, server=network, state=tmp_path, own_map=False, executor=SameThread(),
-               clock=Clock(), on_event=events.append) as robot:  # fmt: skip
+    wiring = Wiring(SameThread(), Clock())
+    with Robot("alice", scans[0].laser, server=network, state=tmp_path, own_map=False, wiring=wiring,
+               on_event=events.append) as robot:  # fmt: skip
         for scan in scans[:20]:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
             while not network.requests:
@@ -367,7 +367,7 @@ def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_pa
         assert not robot.finish(timeout_s=5.0)
     assert [event.kind for event in events] == [EventKind.OFFLINE]
     back.set()
-    with Robot("alice", state=tmp_path, server=network, own_map=False, executor=SameThread()) as robot:
+    with Robot("alice", state=tmp_path, server=network, own_map=False, wiring=Wiring(SameThread())) as robot:
         robot.finish()
     assert {epoch for epoch, _ in network.cloud.stored} == {0}
 
@@ -378,7 +378,7 @@ def test_a_server_that_turns_the_robot_away_stops_no_scan(scans, tmp_path):
             raise CloudError("no token")
 
     events, pause = [], threading.Event()
-    with Robot("alice", scans[0].laser, server=Closed(FakeCloud()), state=tmp_path, executor=SameThread(),
+    with Robot("alice", scans[0].laser, server=Closed(FakeCloud()), state=tmp_path, wiring=Wiring(SameThread(), Clock()),
                on_event=events.append) as robot:  # fmt: skip
         while not robot._uplink.failure:
             pause.wait(0.001)

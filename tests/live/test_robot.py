@@ -11,6 +11,7 @@ import pytest
 import fcslam
 from fcslam.errors import FcslamError, InputError
 from fcslam.geometry import se2
+from fcslam.live.records import Wiring
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import open_source, write_carmen
 from tests import small_fleet
@@ -28,7 +29,7 @@ def scans():
 
 @pytest.fixture
 def robot(scans):
-    with fcslam.Robot("anna", scans[0].laser, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread())) as robot:
         yield robot
 
 
@@ -57,7 +58,7 @@ def test_a_dense_scanner_that_gives_its_maximum_where_nothing_is_maps_as_any_oth
     odometry = worlds.drifting(truth, rng)
     measured = worlds.ranges(truth, worlds.room(), dense, 0.01, rng)
     assert (measured == np.float32(5.6)).any()
-    with fcslam.Robot("anna", dense, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", dense, wiring=Wiring(SameThread())) as robot:
         poses = [robot.add_scan(measured[k], 0.1 * k, odometry[k]).T_map_base for k in range(len(truth))]
     assert worlds.pose_errors(np.array(poses), truth)[0].max() < 0.03
 
@@ -81,7 +82,7 @@ def test_the_covariance_is_one_in_the_axes_of_the_map(robot, scans):
 def test_the_finished_run_is_that_of_the_recording(scans, tmp_path):
     write_carmen(tmp_path / "anna.clf", scans)
     mapped = fcslam.map_recordings(tmp_path / "anna.clf")
-    with fcslam.Robot("anna", executor=SameThread()) as robot:
+    with fcslam.Robot("anna", wiring=Wiring(SameThread())) as robot:
         for record in open_source(tmp_path / "anna.clf").records():
             robot.add(record)
         robot.finish()
@@ -124,7 +125,7 @@ def test_a_robot_that_drives_on_while_its_path_is_asked_for(robot, scans, monkey
 
 def test_poses_do_not_wait_for_the_worker(scans):
     executor = SameThread()
-    with fcslam.Robot("anna", scans[0].laser, executor=executor) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(executor)) as robot:
         executor.holds = True
         poses = drive(robot, scans)
         assert [pose.map_index for pose in poses] == [None] * len(scans)
@@ -157,7 +158,7 @@ def test_a_lost_robot_says_so_and_finds_its_place_again():
     def settled(pose):
         return not moment < pose.stamp < lost.stamp
 
-    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=events.append) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread()), on_event=events.append) as robot:
         poses = drive(robot, scans)
     lost, found = (event for event in events if event.kind is not fcslam.EventKind.CORRECTED)
     assert (lost.kind, found.kind) == (fcslam.EventKind.LOST, fcslam.EventKind.RELOCALISED)
@@ -168,10 +169,12 @@ def test_a_lost_robot_says_so_and_finds_its_place_again():
 @pytest.mark.slow
 def test_a_robot_that_starts_again_finds_its_earlier_map(tmp_path):
     first, again = drives()
-    with fcslam.Robot("anna", first[0].laser, state=tmp_path, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", first[0].laser, state=tmp_path, wiring=Wiring(SameThread())) as robot:
         drive(robot, first[:80])
     events = []
-    with fcslam.Robot("anna", first[0].laser, state=tmp_path, executor=SameThread(), on_event=events.append) as robot:
+    with fcslam.Robot(
+        "anna", first[0].laser, state=tmp_path, wiring=Wiring(SameThread()), on_event=events.append
+    ) as robot:
         poses = drive(robot, again)
         robot.finish()
         run = robot.save(tmp_path / "run")
@@ -186,7 +189,7 @@ def test_a_robot_that_starts_again_finds_its_earlier_map(tmp_path):
 
 def test_a_worker_that_ends_is_told_once_and_the_robot_goes_on(scans, caplog):
     executor, events = SameThread(), []
-    with fcslam.Robot("anna", scans[0].laser, executor=executor, on_event=events.append) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(executor), on_event=events.append) as robot:
         drive(robot, scans[:10])
         executor.is_broken = True
         with caplog.at_level(logging.WARNING):
@@ -211,7 +214,7 @@ def test_invalid_ranges_are_no_points(robot, scans):
 
 def test_without_odometry_scan_matching_alone_gives_the_motion(scans):
     events = []
-    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=events.append) as blind:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread()), on_event=events.append) as blind:
         poses = [blind.add_scan(scan.ranges_m, scan.stamp) for scan in scans]
         with pytest.raises(InputError, match="some scans have odometry and some have not"):
             blind.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
@@ -230,7 +233,7 @@ def test_without_odometry_scan_matching_alone_gives_the_motion(scans):
 )
 def test_odometry_that_says_nothing_is_told_and_not_used(scans, told, words):
     events = []
-    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=events.append) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread()), on_event=events.append) as robot:
         for scan in scans:
             pose = robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base * told)
     assert [words in event.text for event in events if event.kind is fcslam.EventKind.FAILED] == [True]
@@ -247,7 +250,7 @@ def test_a_bare_corridor_is_told_once_to_a_robot_without_odometry():
     laser = fcslam.LaserModel(360, -math.pi, math.radians(1.0), 12.0)
     distances = 1.0 / np.maximum(np.abs(np.sin(laser.angles_rad())), 1e-9)
     rng, events = np.random.default_rng(1), []
-    with fcslam.Robot("anna", laser, executor=SameThread(), on_event=events.append) as robot:
+    with fcslam.Robot("anna", laser, wiring=Wiring(SameThread()), on_event=events.append) as robot:
         poses = [robot.add_scan(distances + rng.normal(0.0, 0.01, 360), stamp) for stamp in np.arange(0.0, 3.0, 0.1)]
     assert [event.kind for event in events] == [fcslam.EventKind.UNDETERMINED]
     assert not any(pose.is_determined for pose in poses)
@@ -259,7 +262,7 @@ def test_the_number_of_beams_may_vary_from_scan_to_scan():
     laser = fcslam.LaserModel(360, -math.pi, math.tau / 360, 12.0)
     truth = worlds.drive([(-2.0, -1.0), (1.5, -1.5), (1.5, 2.0)])
     rng, found = np.random.default_rng(0), []
-    with fcslam.Robot("anna", laser, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", laser, wiring=Wiring(SameThread())) as robot:
         for k, pose in enumerate(truth):
             beams = fcslam.LaserModel(count := 345 + k % 30, -math.pi, math.tau / count, 12.0)
             (ranges,) = worlds.ranges(pose[None], worlds.room(), beams, 0.01, rng)
@@ -305,7 +308,7 @@ def test_a_scan_that_cannot_be_is_refused_and_the_next_one_is_not(robot, scans, 
 )
 def test_a_robot_that_cannot_be_is_one_line(arguments, reason):
     with pytest.raises(InputError, match=reason) as raised:
-        fcslam.Robot(**{"name": "anna", **arguments}, executor=SameThread())
+        fcslam.Robot(**{"name": "anna", **arguments}, wiring=Wiring(SameThread()))
     assert "\n" not in str(raised.value)
 
 
@@ -354,7 +357,7 @@ def test_closures_join_places_that_are_near_each_other(robot, scans):
 
 
 def test_images_are_grey_or_rgb_and_of_the_camera(scans):
-    with fcslam.Robot("anna", scans[0].laser, camera=CAMERA, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", scans[0].laser, camera=CAMERA, wiring=Wiring(SameThread())) as robot:
         drive(robot, scans[:2])
         robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
         robot.add_image(np.zeros((48, 64, 3), np.uint8), scans[1].stamp, scans[1].T_odom_base)
@@ -379,12 +382,12 @@ def test_an_image_without_a_camera_is_one_line(robot, scans):
 )
 def test_a_camera_that_cannot_be_is_one_line(change, reason):
     with pytest.raises(InputError, match=reason):
-        fcslam.Robot("anna", camera=replace(CAMERA, **change), executor=SameThread())
+        fcslam.Robot("anna", camera=replace(CAMERA, **change), wiring=Wiring(SameThread()))
 
 
 def test_two_lasers_are_told_apart_by_name(scans):
     rear = replace(scans[0].laser, T_base_laser=(-0.2, 0.0, math.pi))
-    with fcslam.Robot("anna", {"front": scans[0].laser, "rear": rear}, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", {"front": scans[0].laser, "rear": rear}, wiring=Wiring(SameThread())) as robot:
         for scan in scans[:10]:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base, laser="front")
             robot.add_scan(np.full(180, np.inf), scan.stamp, scan.T_odom_base, laser="rear")
@@ -396,7 +399,7 @@ def test_two_lasers_are_told_apart_by_name(scans):
 def test_a_lift_begins_a_session_on_another_floor(scans, tmp_path):
     events = []
     half = len(scans) // 2
-    with fcslam.Robot("anna", scans[0].laser, floor="1", executor=SameThread(), on_event=events.append) as robot:
+    with fcslam.Robot("anna", scans[0].laser, floor="1", wiring=Wiring(SameThread()), on_event=events.append) as robot:
         drive(robot, scans[:half])
         robot.change_floor("1")
         robot.change_floor("2")
@@ -414,7 +417,7 @@ def test_a_lift_begins_a_session_on_another_floor(scans, tmp_path):
 
 
 def test_a_robot_that_has_not_moved_changes_its_floor_at_once(scans, tmp_path):
-    with fcslam.Robot("anna", scans[0].laser, executor=SameThread()) as robot:
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread())) as robot:
         robot.change_floor("2")
         drive(robot, scans)
         robot.finish()

@@ -12,6 +12,7 @@ import fcslam
 from fcslam.errors import NetworkError
 from fcslam.geometry import se2
 from fcslam.live.fleet_view import Teammate
+from fcslam.live.records import Wiring
 from fcslam.ros import node as node_module
 from fcslam.ros.network import Endpoint, Quality
 from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
@@ -43,7 +44,7 @@ def network():
 
 @pytest.fixture
 def robot():
-    with fcslam.Robot("robot1", executor=SameThread()) as robot:
+    with fcslam.Robot("robot1", wiring=Wiring(SameThread())) as robot:
         yield robot
 
 
@@ -266,7 +267,7 @@ def given_pose(x, y, theta, frame="map"):
 
 @pytest.fixture(scope="module")
 def own_map(scans):
-    with fcslam.Robot("robot1", executor=SameThread()) as robot:
+    with fcslam.Robot("robot1", wiring=Wiring(SameThread())) as robot:
         for scan in scans:
             robot.add(scan)
         robot.finish()
@@ -275,7 +276,7 @@ def own_map(scans):
 
 def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(network, scans, own_map):
     said = []
-    with fcslam.LocalizedRobot("robot1", own_map, executor=SameThread()) as robot:
+    with fcslam.LocalizedRobot("robot1", own_map, wiring=Wiring(SameThread())) as robot:
         node = start(network, robot, said.append, suggest_pose=robot.suggest_pose)
         node.publish_map()
         (grid,) = network.sent["/robot1/map"]
@@ -309,7 +310,7 @@ def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(netwo
 )
 def test_an_initial_pose_that_cannot_be_used_is_refused(network, own_map, message, reason):
     said = []
-    with fcslam.LocalizedRobot("robot1", own_map, executor=SameThread()) as robot:
+    with fcslam.LocalizedRobot("robot1", own_map, wiring=Wiring(SameThread())) as robot:
         start(network, robot, said.append, suggest_pose=robot.suggest_pose)
         network.say(f"/robot1/{INITIAL_POSE}", POSE, message)
         network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))

@@ -61,7 +61,8 @@ def play(
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
     from fcslam.errors import InputError
-    from fcslam.live.robot import Playback, Robot
+    from fcslam.live.records import Playback, Wiring
+    from fcslam.live.robot import Robot
     from fcslam.ros.addresses import is_address
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
@@ -82,7 +83,7 @@ def play(
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kbps, floor)
     live = Robot(
         opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor,
-        keep_keyframes=learning.learn, playback=Playback(fingerprint, resume),
+        wiring=Wiring(playback=Playback(fingerprint, resume), keeps_keyframes=learning.learn),
     )  # fmt: skip
     with closing(live):
         _play(live, opened, survey.scan_count, pace, plan, state, console)

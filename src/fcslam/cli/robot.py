@@ -74,6 +74,7 @@ def robot(
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
     from fcslam.cli.live import drive_live, named_address
+    from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.sources import BagOptions
     from fcslam.storage.files import keep_private
@@ -82,7 +83,12 @@ def robot(
     name, place = named_address(address, otherwise="`fcslam play` plays a recording to a service")
     settings = mission_config(config)
     start = partial(
-        Robot, server=server.access(), state=state, config=settings, floor=floor, keep_keyframes=learning.learn
+        Robot,
+        server=server.access(),
+        state=state,
+        config=settings,
+        floor=floor,
+        wiring=Wiring(keeps_keyframes=learning.learn),
     )
     plan = learning.plan(settings.robot, server, state)
     drive_live(name, place, start, bags.options() or BagOptions(), ros.parameters(), output, notices(quiet), plan)

@@ -139,7 +139,7 @@ def turn_remedy(turn: float, beams: Beams) -> str:
     return f"{wheels}, or the angles of the beams, which then span {span_deg / turn:.0f} deg and not {span_deg:.0f}"
 
 
-class Pair(NamedTuple):
+class ScanPair(NamedTuple):
     """Two scans of one laser with a motion between them."""
 
     before: LaserScan
@@ -228,7 +228,7 @@ class FacingWatch:
 class _Trial:
     """Pairs of scans on which mountings are compared; those with a turn count as much as those with a move."""
 
-    def __init__(self, moves: list[Pair], turns: list[Pair]) -> None:
+    def __init__(self, moves: list[ScanPair], turns: list[ScanPair]) -> None:
         self._moves, self._turns = moves, turns
         kinds = [moves, turns] if min(len(moves), len(turns)) >= FEWEST_PAIRS // 2 else [[*moves, *turns]]
         self.pairs = [pair for kind in kinds for pair in kind]
@@ -260,10 +260,10 @@ class _Trial:
         return gain > max(least, SIGMAS * sigma)
 
 
-def _pairs(scans: Iterable[LaserScan]) -> tuple[list[Pair], list[Pair]]:
+def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
     """Pairs of scans one after the other with a move between them, and those with a turn."""
-    moves: list[Pair] = []
-    turns: list[Pair] = []
+    moves: list[ScanPair] = []
+    turns: list[ScanPair] = []
     first: LaserScan | None = None
     for scan in scans:
         if first is None or not 0.0 <= scan.stamp - first.stamp <= LONGEST_S:
@@ -273,7 +273,7 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[Pair], list[Pair]]:
         if has_moved or has_turned:
             pairs = turns if has_turned else moves
             if len(pairs) < MOST_PAIRS:
-                pairs.append(Pair.of(first, scan))
+                pairs.append(ScanPair.of(first, scan))
             first = scan
         if len(moves) == len(turns) == MOST_PAIRS:
             break
@@ -286,7 +286,7 @@ def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
     return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
 
 
-def _agreement(pair: Pair, facing: Facing) -> float:
+def _agreement(pair: ScanPair, facing: Facing) -> float:
     """Mean agreement, 0 to 1, of the points of the later scan with the earlier one; NaN if too few are in its view."""
     before, after, in_laser = pair
     T_base_laser = se2.compose(before.laser.T_base_laser, (0.0, 0.0, math.radians(facing.turned_deg)))

@@ -5,7 +5,7 @@ which is another process, so no pose waits for them.
 """
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import BrokenExecutor, Executor
+from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,11 @@ from fcslam.api import StrPath, settings_of
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.live.inputs import Lasers, checked_pose
-from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
+from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
 from fcslam.mission.localization import LocalizedDrive, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, frozen
-from fcslam.robot.beside import worker_process
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.localizer_beside import LocalizerBeside
 from fcslam.robot.map_localizer import MapEstimate
@@ -62,7 +61,7 @@ class LocalizedRobot(LiveTracker):
         floor: str = "",
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         on_event: Callable[[RobotEvent], None] | None = None,
-        executor: Executor | None = None,
+        wiring: Wiring = WIRED,
     ) -> None:
         """Start the robot; takes some seconds, after which the first scan is as quick as every other.
 
@@ -76,7 +75,7 @@ class LocalizedRobot(LiveTracker):
                 floors.
             config: as in ``map_recordings``; ``robot`` counts.
             on_event: called by ``add_scan`` and ``add``, in their thread, before they return.
-            executor: searches the map, in its only worker. None: a process of its own, which ends with the robot.
+            wiring: for fcslam's own commands and tests.
 
         Raises:
             InputError: the name, a laser, the configuration, the map or the pose cannot be used, or the worker does not
@@ -89,9 +88,7 @@ class LocalizedRobot(LiveTracker):
         self._was_localized = False
         robot = self._config.robot
         with ExitStack() as stack:
-            if executor is None:
-                executor = worker_process()
-                stack.callback(executor.shutdown, cancel_futures=True)
+            executor = wiring.started(stack)
             try:
                 self._localizer = LocalizerBeside(self.name, self._map, initial, executor)
             except BrokenExecutor as error:

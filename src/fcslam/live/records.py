@@ -1,7 +1,12 @@
 """Records of a live robot: poses, counts and events."""
 
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -10,6 +15,7 @@ from fcslam.lidar.frontend import motion_information
 from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
+from fcslam.robot.beside import worker_process
 from fcslam.robot.outbox import WaitingPackets
 
 
@@ -182,3 +188,39 @@ class RobotEvent:
     """Stamp of the newest scan, seconds."""
     text: str
     """One line for people."""
+
+
+class Playback(NamedTuple):
+    """A recording that is played to a robot."""
+
+    fingerprint: str
+    """Fingerprint of the recording and the settings."""
+    resume: bool
+    """Whether the robot read it before and was interrupted; its packets come again."""
+
+
+class Wiring(NamedTuple):
+    """What a live robot takes from the computer, and what fcslam's own commands ask of it."""
+
+    executor: Executor | None = None
+    """Runs the back end and the map, in its only worker. None: a process of its own, which ends with the robot."""
+    clock: Callable[[], float] = time.monotonic
+    """Seconds of any origin, for the age of corrections and for retries."""
+    sleep: Callable[[float], None] = time.sleep
+    """Sleeps for a number of seconds while ``finish`` waits for the server."""
+    playback: Playback = Playback("live", resume=False)
+    """The recording that is played."""
+    keeps_keyframes: bool = False
+    """Whether the keyframes of the camera stay in the state folder, for a process that learns from them; the next start
+    removes them."""
+
+    def started(self, stack: ExitStack) -> Executor:
+        """The executor; a process of the robot's own ends with ``stack``."""
+        if self.executor is not None:
+            return self.executor
+        executor = worker_process()
+        stack.callback(executor.shutdown, cancel_futures=True)
+        return executor
+
+
+WIRED: Final = Wiring()

@@ -7,7 +7,6 @@ beside it, which is another process, so no pose waits for it.
 import math
 import shutil
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
@@ -35,7 +34,7 @@ from fcslam.live.inputs import (
     checked_stamp,
 )
 from fcslam.live.own_map import OwnMap
-from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
+from fcslam.live.records import WIRED, EventKind, Playback, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
 from fcslam.maps.joint_tiles import padded
 from fcslam.mission.driving import track_of
@@ -51,7 +50,7 @@ from fcslam.records import (
     Sweep,
     frozen,
 )
-from fcslam.robot.beside import Beside, worker_process
+from fcslam.robot.beside import Beside
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
@@ -106,18 +105,6 @@ class _Ahead:
         """Changes of the fleet that were told."""
 
 
-class Playback(NamedTuple):
-    """A recording that is played to a robot."""
-
-    fingerprint: str
-    """Fingerprint of the recording and the settings."""
-    resume: bool
-    """Whether the robot read it before and was interrupted; its packets come again."""
-
-
-LIVE = Playback("live", resume=False)
-
-
 class Robot(LiveTracker):
     """One robot that maps while it drives.
 
@@ -146,12 +133,8 @@ class Robot(LiveTracker):
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         own_map: bool = True,
         floor: str = "",
-        keep_keyframes: bool = False,
-        playback: Playback | None = None,
         on_event: Callable[[RobotEvent], None] | None = None,
-        executor: Executor | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        wiring: Wiring = WIRED,
     ) -> None:
         """Start the robot; takes some seconds, after which the first scan is as quick as every other.
 
@@ -167,14 +150,8 @@ class Robot(LiveTracker):
             own_map: whether the robot has a map of its own; a robot with a server may do without.
             floor: floor of the building, 1 to 16 letters, digits and ``. _ + -``. Places of different floors are never
                 compared. Empty: none is named.
-            keep_keyframes: keep the keyframes of the camera in the state folder, for a process that learns from them;
-                they stay there, and the next start removes them.
-            playback: the recording that is played. None: live.
             on_event: called by ``add_scan``, ``add_image`` and ``add``, in their thread, before they return.
-            executor: runs the back end and the map, in its only worker. None: a process of its own, which ends with the
-                robot.
-            clock: seconds of any origin, for the age of corrections and for retries.
-            sleep: sleeps for a number of seconds while ``finish`` waits for the server.
+            wiring: for fcslam's own commands and tests.
 
         Raises:
             InputError: the name, a laser, the configuration, the floor, the address, a file or the state folder cannot
@@ -184,7 +161,7 @@ class Robot(LiveTracker):
         """Floor by the first part that is on it."""
         super().__init__(name, laser, settings_of(config), on_event)
         self._camera = checked_camera(camera)
-        self._clock = clock
+        self._clock = wiring.clock
         self._newest_part = 0
         """The part that the newest pose is of."""
         self._applied: Correction | None = None
@@ -200,14 +177,12 @@ class Robot(LiveTracker):
         """Whether the poses of all keyframes are written."""
         self._is_online: bool | None = None
         """Whether the server can be reached; None before the first reply."""
-        self._sleep = sleep
+        self._sleep = wiring.sleep
         self.fleet: FleetView | None = None
         """What the robot knows of its fleet; None without a server or without a map of its own."""
         self._ahead = _Ahead()
         with ExitStack() as stack:
-            if executor is None:
-                executor = worker_process()
-                stack.callback(executor.shutdown, cancel_futures=True)
+            executor = wiring.started(stack)
             folder = _state_folder(state, server is not None, stack)
             access = Server(server) if isinstance(server, str) else server
             outbox, transport = None, None if isinstance(access, Server) else access
@@ -222,15 +197,16 @@ class Robot(LiveTracker):
                 if own_map:
                     followed = [FleetClient(url, *shown) for url in urls]
                     self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
-            known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
-            keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None
+            known = 0 if outbox is None else outbox.begin(*wiring.playback)
+            keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)
             self._outbox = outbox
             self._uplink: Uplink | None = None
             if outbox is not None and folder is not None:
                 # Not the seed of the configuration: robots must not retry at the same moments.
                 self._uplink = Uplink(
-                    self._frontend, outbox, transport, folder, np.random.default_rng(), clock, self._correct_by_server,
+                    self._frontend, outbox, transport, folder, np.random.default_rng(), self._clock,
+                    self._correct_by_server,
                     known, None if budget_kbps is None else Budget(1e3 * budget_kbps),
                 )  # fmt: skip
                 stack.callback(self._uplink.close)
@@ -685,7 +661,7 @@ def _in_epoch(packet: Packet, epoch: int) -> Packet:
     return replace(packet, epoch=epoch, body=body)
 
 
-def _keyframe_folder(state: Path | None, playback: Playback | None) -> Path:
+def _keyframe_folder(state: Path | None, playback: Playback) -> Path:
     """The folder of the keyframes of this start.
 
     Raises:
@@ -694,7 +670,7 @@ def _keyframe_folder(state: Path | None, playback: Playback | None) -> Path:
     if state is None:
         raise InputError("a robot that learns keeps keyframes; give --state, in Python state=")
     folder = state / KEYFRAMES
-    if playback is None or not playback.resume:
+    if not playback.resume:
         shutil.rmtree(folder, ignore_errors=True)
     return folder
 
