@@ -378,7 +378,8 @@ def test_a_server_that_turns_the_robot_away_stops_no_scan(scans, tmp_path):
             raise CloudError("no token")
 
     events, pause = [], threading.Event()
-    with Robot("alice", scans[0].laser, server=Closed(FakeCloud()), state=tmp_path, wiring=Wiring(SameThread(), Clock()),
+    wiring = Wiring(SameThread(), Clock())
+    with Robot("alice", scans[0].laser, server=Closed(FakeCloud()), state=tmp_path, wiring=wiring,
                on_event=events.append) as robot:  # fmt: skip
         while not robot._uplink.failure:
             pause.wait(0.001)
