@@ -15,7 +15,7 @@ _LEARNING = "Learning"
 
 LearnConfig = Annotated[
     Path | None,
-    typer.Option(help="YAML file of settings of learning; see docs/howto/federated.md.", rich_help_panel=_LEARNING),
+    typer.Option(help="YAML file of settings of learning.", rich_help_panel=_LEARNING),
 ]
 
 

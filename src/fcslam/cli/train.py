@@ -37,9 +37,7 @@ def train(
     images: Annotated[list[Path], typer.Argument(help="Folders of images, searched with all their subfolders.")],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML file of training settings (docs/howto/training.md).")
-    ] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
     encoder: Annotated[
         str | None,
         typer.Option(
@@ -55,7 +53,7 @@ def train(
         ),
     ] = None,
     teacher: Annotated[
-        Path | None, typer.Option(help="Folder with the keypoints of a teacher network; see docs/howto/training.md.")
+        Path | None, typer.Option(help="Folder with the keypoints of a teacher network, of tools/teacher_points.py.")
     ] = None,
     start: Start = None,
     device: Device = "auto",

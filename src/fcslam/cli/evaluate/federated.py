@@ -21,9 +21,7 @@ def federated(
     ],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, EVALUATIONS)] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML file of the study's settings; see docs/howto/federated.md.")
-    ] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file of the study's settings.")] = None,
     device: Device = "auto",
     quiet: Quiet = False,
 ) -> None:

@@ -24,9 +24,7 @@ _FROM_SETTINGS = "that of the settings"
 class RoundFlags:
     """What the rounds of a run train, from what, and how."""
 
-    config: Annotated[
-        Path | None, typer.Option(help="YAML file of federated settings; see docs/howto/federated.md.")
-    ] = None
+    config: Annotated[Path | None, typer.Option(help="YAML file of federated settings.")] = None
     start: Start = None
     public: Annotated[
         list[Path] | None,
