@@ -34,6 +34,8 @@ BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmar
 
 .PHONY: help install gl learning demo test test-fast test-system test-learning test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
+# Where this is set, each process of a test compiles the package and the tests anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 help:
 	@echo "make demo         simulate a fleet, map it, evaluate it against ground truth, draw the result"

@@ -49,15 +49,11 @@ def fed(packets):
     return cloud
 
 
-def fleet(seed):
-    """Packets of three robots on ways through one building."""
-    robots = small_fleet.draw(3, 30.0, seed=seed).robots
-    return in_order(decode(encode(packet)) for robot in robots for packet in small_fleet.sent_by(robot))
-
-
 @pytest.fixture(scope="module")
 def honest():
-    return fleet(2)
+    """Packets of three robots in a building in which a copy bends their paths and no closure shows it."""
+    robots = small_fleet.draw(3, 30.0, seed=5).robots
+    return in_order(decode(encode(packet)) for robot in robots for packet in small_fleet.sent_by(robot))
 
 
 @pytest.fixture(scope="module")
@@ -97,26 +93,15 @@ def test_a_scaled_copy_gets_a_map_of_its_own(alone, attacked):
     assert reasons <= {ReasonCode.PATHS_CONTRADICT, ReasonCode.SEPARATED}
 
 
-@pytest.fixture(scope="module")
-def stretched():
-    """Three honest robots in a building in which a copy bends their paths and no closure shows it, and their result."""
-    packets = fleet(5)
-    return packets, fed(packets).finalize()
-
-
-@pytest.mark.parametrize(("scale", "evil"), [(0.97, 1), (1.01, 0), (1.02, 1)])
-def test_a_copy_at_a_false_scale_moves_others_by_centimetres_at_most(stretched, scale, evil):
+def test_a_copy_at_a_false_scale_moves_others_by_centimetres_at_most(honest, alone):
     """At 1 % it contradicts the others by no more than honest robots contradict each other, and it stays."""
-    honest, alone = stretched
     copied = [packet for packet in honest if packet.robot == "robot_2"]
-    found = fed(in_order([*honest, *scaled(copied, "evil", scale)])).finalize()
-    assert map_of(found) == map_of(alone) | {"evil": evil}
+    found = fed(in_order([*honest, *scaled(copied, "evil", 1.01)])).finalize()
+    assert map_of(found) == map_of(alone) | {"evil": 0}
     now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
     xy, wanted = (np.concatenate([those[name][:, :2] for name in then]) for those in (now, then))
     moved_m = np.hypot(*(se2.transform(n_point_alignment(wanted, xy), xy) - wanted).T).max()
-    assert (0.0 if evil else 0.01) <= moved_m < 0.05
-    if evil:
-        assert np.abs(xy - wanted).max() < 0.05, "without alignment, too"
+    assert 0.01 <= moved_m < 0.05
 
 
 def test_a_restored_fleet_keeps_robots_apart(packets, attacked):
