@@ -77,7 +77,7 @@ def postgres(postgres_server):
 
 @pytest.fixture(scope="session")
 def drawn() -> SimulatedFleet:
-    """Three robots, 30 m each, that meet."""
+    """Three robots, 15 m each, that meet."""
     return small_fleet.draw(3)
 
 

@@ -13,7 +13,7 @@ from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
 
-def draw(robots: int, path_length_m: float = 30.0, seed: int = 1) -> SimulatedFleet:
+def draw(robots: int, path_length_m: float = 15.0, seed: int = 1) -> SimulatedFleet:
     lidar = LidarSettings(beams=180, rate_hz=3.0)
     settings = SimulationSettings(robots=robots, path_length_m=path_length_m, lidar=lidar, camera=None)
     return simulate_fleet(settings, seed)

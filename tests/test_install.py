@@ -73,10 +73,9 @@ def test_an_unprivileged_user_maps_with_a_read_only_installation(installed, tmp_
     said = run(*UNPRIVILEGED, sys.executable, "-c", asked, cwd=tmp_path, **user)
     assert said.split() == [str(installed / "fcslam" / "__init__.py"), "False"]
     fcslam_command = [*UNPRIVILEGED, sys.executable, "-m", "fcslam.cli"]
-    logs = [LOGS / "anna.clf.xz", LOGS / "ben.clf.xz"]
-    run(*fcslam_command, "map", *logs, "-o", "run", cwd=tmp_path, **user)
-    trajectories = fcslam.open_run(tmp_path / "run").trajectories
-    assert {name: trajectory.map_index for name, trajectory in trajectories.items()} == {"anna": 0, "ben": 0}
+    run(*fcslam_command, "map", LOGS / "anna.clf.xz", "-o", "run", cwd=tmp_path, **user)
+    assert set(fcslam.open_run(tmp_path / "run").trajectories) == {"anna"}
+    assert any((tmp_path / "cache").rglob("*.nbi"))
 
 
 def test_every_extra_is_named_where_it_is_needed():

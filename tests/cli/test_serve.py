@@ -195,8 +195,7 @@ def mapped(folder):
 
 @pytest.mark.attack
 @pytest.mark.system
-@pytest.mark.parametrize("session", [{}, {"epoch": 0}], ids=["robot", "session"])
-def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets, session):
+def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets):
     """The worker is killed in between; the robot goes on sending."""
     honest = [packet for packet in packets if packet.robot != "robot_2"]
     service = Service(tmp_path / "data")
@@ -229,9 +228,7 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets,
         play(packets[:cut])
         finalized()
         until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
-        removed = client.post(
-            f"{API}/edits", json={"kind": "removal", "content": {"robot": "robot_2", **session}}
-        ).json()
+        removed = client.post(f"{API}/edits", json={"kind": "removal", "content": {"robot": "robot_2"}}).json()
         until(lambda: robots() == {"robot_1", "robot_3"})
         os.kill(children(service.process.pid)[0], signal.SIGKILL)
         play(packets[cut:])

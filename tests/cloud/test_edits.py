@@ -167,7 +167,7 @@ def test_a_veto_that_is_undone_leaves_no_trace_in_the_result(scripted):
 @pytest.fixture(scope="module")
 def two():
     """Packets of two robots on short ways."""
-    robots = small_fleet.draw(2, path_length_m=15.0).robots
+    robots = small_fleet.draw(2, path_length_m=10.0).robots
     return in_order(packet for robot in robots for packet in small_fleet.sent_by(robot))
 
 

@@ -3,7 +3,6 @@ contradicts.
 """
 
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -295,7 +294,7 @@ def test_a_robots_own_closure_may_be_revoked_too(scripted):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("names", list(permutations("abcd")), ids="".join)
+@pytest.mark.parametrize("names", ["abcd", "acbd", "bdac", "dbca"])
 def test_maps_of_several_robots_join_whoever_came_first(scripted, names):
     """Two pairs of robots join first, then the pairs: each map moves as a whole, into the older one's frame."""
     w, x, y, z = names
@@ -339,13 +338,12 @@ def test_nothing_received_is_nothing_mapped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [(1, 2), (3, 4)])
-def test_robots_in_two_buildings_stay_in_two_maps(seeds):
+def test_robots_in_two_buildings_stay_in_two_maps():
     """Real scans, real matching: two offices with corridors of one width are full of places that look the same."""
     packets = [
         packet
-        for number, seed in enumerate(seeds)
-        for packet in small_fleet.sent_by(small_fleet.draw(1, seed=seed).robots[0], f"robot_{number}")
+        for number, seed in enumerate((1, 2))
+        for packet in small_fleet.sent_by(small_fleet.draw(1, 30.0, seed).robots[0], f"robot_{number}")
     ]
     result = feed(Cloud(FleetConfig(), seed=0), in_order(packets)).finalize()
     assert sorted(map_of(result).values()) == [0, 1]
@@ -374,9 +372,8 @@ def reference(packets):
     return fingerprint(feed(Cloud(FleetConfig(), seed=0), packets).finalize())
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_the_result_is_a_function_of_the_set_of_packets(reference, packets, seed):
-    rng = np.random.default_rng(seed)
+def test_the_result_is_a_function_of_the_set_of_packets(reference, packets):
+    rng = np.random.default_rng(0)
     twice = [*packets, *(packets[k] for k in rng.integers(0, len(packets), 200))]
     shuffled = [twice[k] for k in rng.permutation(len(twice))]
     assert fingerprint(feed(Cloud(FleetConfig(), seed=0), shuffled).finalize()) == reference

@@ -46,7 +46,9 @@ def test_every_target_reads_some_inputs_and_refuses_others(target, tmp_path):
         pytest.importorskip("torch", reason="needs fcslam[federated]")
         pytest.importorskip("flwr", reason="needs fcslam[federated]")
     with TARGETS[target](tmp_path) as one:
-        assert {one(random.Random(f"{target} {number}")) for number in range(150)} == {True, False}
+        outcomes = (one(random.Random(f"{target} {number}")) for number in range(150))
+        first = next(outcomes)
+        assert any(outcome is not first for outcome in outcomes)
 
 
 def test_an_exception_is_a_finding_with_the_command_that_repeats_it(fuzz, tmp_path, monkeypatch):

@@ -81,7 +81,7 @@ def test_training_brings_the_codes_of_a_point_together(light):
         first, second = (codes(state, image, points) for image, points in zip(OWN.images, PAIR.points, strict=True))
         return float(np.mean(first != second))
 
-    plan = LocalTrainingPlan(0, 40)
+    plan = LocalTrainingPlan(0, 20)
     done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
     assert {"contrastive", "balance", "keypoints"} == done.losses.keys()
     assert distance(done.network.state_dict()) < 0.8 * distance(light)
@@ -97,8 +97,8 @@ def test_training_brings_codes_towards_the_taught_ones(light):
 
 def test_earlier_codes_and_keypoints_hold_as_hard_as_asked(light):
     loose = SMALL.model_copy(update={"loss": SMALL.loss.model_copy(update={"keypoints": 0.0})})
-    free = train_codes(light, OWN, CodeInputs(), loose, LocalTrainingPlan(0, 40), CPU)
-    held = train_codes(light, OWN, CodeInputs(), SMALL, LocalTrainingPlan(0, 40, compatible=100.0), CPU)
+    free = train_codes(light, OWN, CodeInputs(), loose, LocalTrainingPlan(0, 20), CPU)
+    held = train_codes(light, OWN, CodeInputs(), SMALL, LocalTrainingPlan(0, 20, compatible=100.0), CPU)
     assert held.losses["keypoints"] < 0.5 * free.losses["keypoints"]
     same = [
         np.mean(codes(each.network.state_dict(), OWN.images[0], POINTS) == codes(light, OWN.images[0], POINTS))
@@ -111,7 +111,7 @@ def test_rehearsal_keeps_the_codes_of_pictures_that_the_robot_does_not_see(light
     elsewhere = textured(9)[:SIZE, :SIZE]
 
     def kept(compatible):
-        plan = LocalTrainingPlan(0, 40, compatible=compatible)
+        plan = LocalTrainingPlan(0, 20, compatible=compatible)
         done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
         assert ("compatible" in done.losses) is (compatible > 0.0)
         return np.mean(codes(done.network.state_dict(), elsewhere, POINTS) == codes(light, elsewhere, POINTS))

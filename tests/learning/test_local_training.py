@@ -142,9 +142,9 @@ def test_codes_are_kept_to_those_of_a_former_network(examples, start):
         assert ("former" in losses) is (state is not None and leg.compatible > 0.0)
         return float((bits(network) == wanted).float().mean())
 
-    free = agreement(LocalTrainingPlan(0, 30), None)
-    assert agreement(LocalTrainingPlan(0, 30), former) == free
-    assert agreement(LocalTrainingPlan(0, 30, compatible=100.0), former) > free + 0.1
+    free = agreement(LocalTrainingPlan(0, 15), None)
+    assert agreement(LocalTrainingPlan(0, 15), former) == free
+    assert agreement(LocalTrainingPlan(0, 15, compatible=100.0), former) > free + 0.1
 
 
 def test_a_former_network_of_another_kind_is_refused(examples, start):

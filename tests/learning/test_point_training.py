@@ -46,7 +46,7 @@ def strengths(state, points):
 
 def test_keypoints_found_again_gain_and_others_lose(light, voted):
     assert len(voted.points) > 10
-    done = train_points(light, RevisitExamples([IMAGE], voted=[voted]), SMALL, LocalTrainingPlan(0, 40), CPU)
+    done = train_points(light, RevisitExamples([IMAGE], voted=[voted]), SMALL, LocalTrainingPlan(0, 20), CPU)
     before, after = strengths(light, voted.points), strengths(done.network.state_dict(), voted.points)
     gains = np.log(after / before)
     assert np.median(gains[voted.is_found]) > np.median(gains[~voted.is_found]) + 0.5
@@ -83,7 +83,7 @@ def test_targets_move_the_voted_keypoints_alone():
     assert np.count_nonzero(shifted != np.float32(0.01)) == 9 + 9
 
 
-@pytest.mark.parametrize("step", range(5))
+@pytest.mark.parametrize("step", range(3))
 def test_without_a_vote_the_initial_network_stays(light, step):
     """Steps shift the grid of cells, each in another way."""
     nobody = VotedImage(0, np.empty((0, 2), np.float32), np.empty(0, bool))

@@ -33,6 +33,7 @@ from fcslam.storage.files import replacing  # noqa: E402
 
 CPU_FLAGS = Path("/proc/cpuinfo")
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
+pytestmark = pytest.mark.usefixtures("brief_validation")
 PACE = ExecutionOptions(validate_every=100, checkpoint_every_s=0.0, log_every=1)
 
 

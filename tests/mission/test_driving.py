@@ -41,9 +41,16 @@ def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_processes_change_no_byte_of_a_run(logs, tmp_path):
-    alone = run_mission([open_source(log) for log in logs], MissionConfig())
-    together = run_mission([open_source(log) for log in logs], MissionConfig(), drive=side_by_side(2))
+def test_processes_change_no_byte_of_a_run_and_faults_arrive(logs, tmp_path):
+    damaged = tmp_path / "damaged.clf"
+    damaged.write_bytes(logs[0].read_bytes() + b"FLASER 3 1 2\n")
+    recordings, seen = [damaged, *logs[1:]], []
+    alone = run_mission([open_source(log) for log in recordings], MissionConfig())
+    together = run_mission(
+        [open_source(log) for log in recordings], MissionConfig(), seen.append, drive=side_by_side(2)
+    )
+    assert seen[-1].faults["damaged"][Fault.BROKEN_LINE].count == 1
+    assert not seen[-1].faults["robot_2"]
     for name, run in (("alone", alone), ("together", together)):
         run.save(tmp_path / name)
     files = {path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*") if path.is_file()}
@@ -61,15 +68,6 @@ def test_legs_are_the_same_and_their_arrays_read_only(logs):
     assert all(same(one, other) for one, other in zip(sent, wanted, strict=True))
     assert not any(packet.body.ranges_m.flags.writeable for packet in sent if isinstance(packet.body, Keyscan))
     assert legs[-1].faults == expected[-1].faults
-
-
-def test_faults_of_a_recording_arrive(logs, tmp_path):
-    damaged = tmp_path / "damaged.clf"
-    damaged.write_bytes(logs[0].read_bytes() + b"FLASER 3 1 2\n")
-    seen = []
-    run_mission([open_source(damaged), open_source(logs[1])], MissionConfig(), seen.append, drive=side_by_side(2))
-    assert seen[-1].faults["damaged"][Fault.BROKEN_LINE].count == 1
-    assert not seen[-1].faults["robot_2"]
 
 
 def test_one_robot_needs_no_process(monkeypatch):

@@ -174,14 +174,13 @@ def counted(cloud, monkeypatch):
     return applied
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud, monkeypatch, tmp_path, seed):
+def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud, monkeypatch, tmp_path):
     packets = two_robots()
     whole = Cloud(tmp_path / "whole")
     whole.put(packets)
     expected = whole.finalize()
     whole.store.close()
-    cut = int(np.random.default_rng(seed).integers(AT_ONCE, len(packets)))
+    cut = (AT_ONCE + len(packets)) // 2
     cloud.put(packets[:cut])
     cloud.work()
     cloud.now += SNAPSHOT_EVERY_S
@@ -460,26 +459,21 @@ def test_a_worker_waits_until_the_one_before_is_gone(cloud):
     with cloud.folder.worker_lock.open("w") as before:
         fcntl.flock(before, fcntl.LOCK_EX)
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-            time.sleep(3.0)
+            time.sleep(1.0)
             assert cloud.store.applied() == 0
             fcntl.flock(before, fcntl.LOCK_UN)
             told(process, "ready")
             told(process, "live")
+            process.terminate()  # once it works, only the end of its input stops it
             process.stdin.close()
             assert process.wait(60) == 0
 
 
-@pytest.mark.slow
-def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cloud):
+def test_a_worker_that_is_told_to_stop_while_it_compiles_does_so_at_once(cloud):
     command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.terminate()
         assert process.wait(60) == -signal.SIGTERM
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        told(process, "ready")
-        process.terminate()
-        process.stdin.close()
-        assert process.wait(60) == 0
 
 
 @pytest.mark.slow
@@ -518,8 +512,11 @@ def content(run):
     return poses, local, run.map_files, run.pose_graph_g2o, [str(closure) for closure in run.closures]
 
 
-@pytest.mark.parametrize("restarts", [False, True])
-@pytest.mark.parametrize("change", [Removal("b"), Removal("b", 0), Veto("a", "b"), FloorLabel("b", "2")], ids=str)
+@pytest.mark.parametrize(
+    ("change", "restarts"),
+    [(Removal("b"), True), (Removal("b", 0), False), (Veto("a", "b"), False), (FloorLabel("b", "2"), True)],
+    ids=str,
+)
 def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, tmp_path, change, restarts):
     packets, others = two_robots(), [packet for packet in two_robots() if packet.robot == "a"]
     if not isinstance(change, Removal):
@@ -652,7 +649,7 @@ def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step_m", [1e6, 1e5, 25.0])
+@pytest.mark.parametrize("step_m", [1e6, 25.0])
 def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same(cloud, step_m):
     far = np.cumsum(np.full((13, 3), (step_m, 0.0, 0.0)), axis=0)
     cloud.put(stream("c", far, start_s=0.0))

@@ -82,7 +82,7 @@ def test_a_yard_has_no_images():
         simulate_fleet(TINY.model_copy(update={"camera": CameraSettings()}), 1)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_everything_stands_in_the_yard_and_clear_of_its_ways(seed):
     plan = draw_yard(np.random.default_rng(seed))
     assert all(60.0 < size < 160.0 for size in plan.size_m)
@@ -95,7 +95,7 @@ def test_everything_stands_in_the_yard_and_clear_of_its_ways(seed):
         assert distances(way, plan.segments).min() > 1.2
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_walk_touches_nothing_has_its_length_and_comes_home(seed):
     rng = np.random.default_rng(seed)
     plan = draw_yard(rng)
