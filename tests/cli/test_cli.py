@@ -1,7 +1,6 @@
 """The command line: help with examples, numbers, and one clear line with exit code 2 for bad input."""
 
 import os
-import signal
 import subprocess
 import sys
 import types

@@ -37,7 +37,7 @@ from tests.ros.memory_network import MemoryNetwork
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "alice.clf"
-    write_carmen(path, small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+    write_carmen(path, small_fleet.draw(1, path_length_m=6.0).robots[0].scans())
     return path
 
 

@@ -1,5 +1,7 @@
 """`fcslam learn train`: one small run from images to files, and what it says of bad input."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -11,9 +13,9 @@ OPTIONS = ["--device", "cpu"]
 pytestmark = pytest.mark.usefixtures("brief_validation")
 
 
-@pytest.fixture
-def photos(tmp_path):
-    folder = tmp_path / "photos"
+@pytest.fixture(scope="module")
+def some_photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
     (folder / "inner").mkdir(parents=True)
     for seed in range(3):
         cv2.imwrite(str(folder / f"{seed}.png"), textured(seed))
@@ -22,6 +24,26 @@ def photos(tmp_path):
     (folder / "broken.jpg").write_bytes(b"no image")
     cv2.imwrite(str(folder / "tiny.png"), textured(1)[:20, :20])
     return folder
+
+
+@pytest.fixture
+def photos(some_photos, tmp_path):
+    return shutil.copytree(some_photos, tmp_path / "photos")
+
+
+@pytest.fixture(scope="module")
+def first(some_photos, tmp_path_factory, brief_validation):
+    """The command of a small run, without its output folder, and the output of one."""
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    from fcslam.learning.training_step import LAST_RATE
+
+    folder = tmp_path_factory.mktemp("first")
+    (folder / "settings.yaml").write_text(
+        f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1, learning_rate: {LAST_RATE}}}"
+    )
+    command = ["learn", "train", str(some_photos), "--config", str(folder / "settings.yaml"), *OPTIONS, "--output"]
+    assert main([*command, str(folder / "first")]) == 0
+    return command, folder / "first"
 
 
 def complaint(capsys, *arguments):
@@ -64,20 +86,14 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["joint/checkpoint.npz", "detector.onnx"])
-def test_training_starts_from_given_weights(file, photos, tmp_path, capsys):
-    pytest.importorskip("torch", reason="needs fcslam[train]")
+def test_training_starts_from_given_weights(file, first, photos, tmp_path, capsys):
     from fcslam.learning.federated.initial_weights import read_detector_weights
     from fcslam.learning.training_step import LAST_RATE
     from fcslam.untrusted import read_arrays
 
-    settings = tmp_path / "settings.yaml"
-    settings.write_text(
-        f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1, learning_rate: {LAST_RATE}}}"
-    )
-    first, second, third = (tmp_path / name for name in ("first", "second", "third"))
-    arguments = ["learn", "train", str(photos), "--config", str(settings), *OPTIONS, "--output"]
-    assert main([*arguments, str(first)]) == 0
-    assert main([*arguments, str(second), "--start", str(first / file)]) == 0
+    command, first = first
+    second, third = (tmp_path / name for name in ("second", "third"))
+    assert main([*command, str(second), "--start", str(first / file)]) == 0
     assert not (second / "shapes").exists()
     kept = next(second.glob("start-*.npz"), None)  # of an ONNX file, with statistics of the batches
     before = read_detector_weights(first / file, "light") if kept is None else read_arrays(kept)
@@ -87,9 +103,7 @@ def test_training_starts_from_given_weights(file, photos, tmp_path, capsys):
     moved = max(np.abs(after[name] - before[name]).max() for name in kernels)
     assert 0.0 < moved <= 2.1 * LAST_RATE
     capsys.readouterr()
-    assert "from another start" in complaint(
-        capsys, photos, "-o", second, "--config", settings, "--start", second / file
-    )
+    assert "from another start" in complaint(capsys, *command[2:5], "-o", second, "--start", second / file)
     assert "is not a checkpoint" in complaint(capsys, photos, "-o", third, "--start", photos / "0.png")
     assert "holds no body" in complaint(capsys, photos, "-o", third, "--start", "vgg")
 

@@ -29,7 +29,7 @@ SHIPPED = describe_detector_file(BUNDLED_NETWORK)
 
 @pytest.fixture(scope="module")
 def seen():
-    return records_of([(1.5, 1.5), (14.5, 1.5), (14.5, 6.0)], 10)[0]
+    return records_of([(1.5, 1.5), (14.5, 1.5), (14.5, 4.0)], 10)[0]
 
 
 def driven(robot, records, switch_after=None):

@@ -13,9 +13,9 @@ from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import BusyError, LeaseError
 from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
 from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import LOOK_S, REST_LOOK_S, REST_S, Instance, fair_part
+from fcslam.service.shared.instance import GRACE_S, REST_LOOK_S, REST_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
-from fcslam.service.shared.registry import LEASE_S, Registry
+from fcslam.service.shared.registry import Registry
 from tests.mission.test_mission_store import packet
 
 
@@ -51,6 +51,21 @@ def instance(postgres, name, room=10, clock=time.monotonic):
     return Instance(registry, name, room, launch, lambda *_: None, lambda: None, lambda: None, clock), workers
 
 
+EXPIRY = "fcslam.service.shared.registry._EXPIRY"
+
+
+@pytest.fixture(autouse=True)
+def lasting(monkeypatch):
+    """Leases last until a test ends them, however slow the machine is."""
+    monkeypatch.setattr(EXPIRY, "clock_timestamp() + interval '1 hour'")
+
+
+def end_leases(postgres, name):
+    """What the server's clock does to an instance that renews nothing."""
+    for table, column in (("missions", "holder"), ("instances", "name")):
+        postgres.rows(f"UPDATE {table} SET expires = '-infinity' WHERE {column} = ? RETURNING 1", (name,))
+
+
 def until(condition, timeout_s=120.0):
     end = time.monotonic() + timeout_s
     while not condition():
@@ -76,19 +91,16 @@ def test_of_two_that_claim_at_once_each_mission_gets_one_worker(registry, postgr
     assert len(claimed) == 20 == len({lease.mission for lease in claimed})
 
 
-def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(registry, postgres):
+def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(registry, postgres, monkeypatch):
     for name in ("kept", "lost"):
         wanted(registry, postgres, name)
-    kept, lost = sorted(registry.claim(2))
+    with monkeypatch.context() as patched:
+        patched.setattr(EXPIRY, "clock_timestamp() + interval '0.3 seconds'")
+        kept, lost = sorted(registry.claim(2))
+    assert registry.renew([(kept, True)]) == {kept}
     other = Registry(postgres, "other", "process of other")
     taken = []
-
-    def ends():
-        assert registry.renew([(kept, True)]) == {kept}
-        taken.extend(other.claim(9))
-        return taken
-
-    until(ends)
+    until(lambda: taken.extend(other.claim(9)) or taken)
     assert taken == [Lease(lost.mission, lost.fence + 1)]
     assert registry.renew([(kept, True), (lost, True)]) == {kept}
 
@@ -107,27 +119,33 @@ def test_the_clock_of_an_instance_may_be_wrong_by_minutes(registry, postgres, mo
 def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(registry, postgres, monkeypatch):
     wanted(registry, postgres, "m")
     (lease,) = registry.claim(1)
-    other, workers = instance(postgres, "other")
+    now, seen = [0.0], []
+    other, workers = instance(postgres, "other", clock=lambda: now[0])
     is_gone, register = threading.Event(), Registry.register
 
     def failing(self, room):
-        if self._instance == "other" and is_gone.is_set():
+        seen.append(is_gone.is_set())
+        if is_gone.is_set():
             raise StoreError("gone")
         return register(self, room)
 
     monkeypatch.setattr(Registry, "register", failing)
     is_gone.set()
     other.start()
-    time.sleep(LEASE_S + 2 * LOOK_S)  # the lease has ended, and nobody could renew it
+    until(lambda: seen)
+    end_leases(postgres, "one")
     is_gone.clear()
-    time.sleep(2 * LOOK_S)
-    assert registry.renew([(lease, True)]) == {lease}
+    until(lambda: seen.count(False) > 1)
     assert not workers
-    until(lambda: workers)  # it is not renewed any more
+    assert registry.renew([(lease, True)]) == {lease}
+    end_leases(postgres, "one")
+    now[0] += GRACE_S
+    until(lambda: workers)
     other.close()
 
 
-def test_two_instances_of_one_name_are_refused(registry, postgres):
+def test_two_instances_of_one_name_are_refused(registry, postgres, monkeypatch):
+    monkeypatch.setattr("fcslam.service.shared.instance.NAME_S", 0.5)
     one, _ = instance(postgres, "same")
     one.start()
     again = Registry(postgres, "same", "another process")
@@ -137,8 +155,10 @@ def test_two_instances_of_one_name_are_refused(registry, postgres):
     Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
 
 
-def test_the_name_of_a_killed_instance_is_free_again(registry, postgres):
-    assert Registry(postgres, "killed", "before").register(1)
+def test_the_name_of_a_killed_instance_is_free_again(registry, postgres, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(EXPIRY, "clock_timestamp() + interval '0.3 seconds'")
+        assert Registry(postgres, "killed", "before").register(1)
     after = Registry(postgres, "killed", "after")
     Instance(after, "killed", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
 
@@ -158,12 +178,13 @@ def test_missions_are_spread_and_those_of_an_instance_that_ends_or_dies_are_take
     assert all(worker.is_stopped for worker in of_two)
     until(lambda: list(held(registry).values()) == ["one"] * 6)
     one._closing.set()  # it dies: nobody renews its leases
+    one._thread.join()
+    end_leases(postgres, "one")
     three, of_three = instance(postgres, "three")
     three.start()
     until(lambda: list(held(registry).values()) == ["three"] * 6)
     assert {worker.lease.fence for worker in of_three} >= {2}
     three.close()
-    one._thread.join()
 
 
 def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postgres):
