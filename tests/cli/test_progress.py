@@ -20,7 +20,7 @@ def shown(console):
 
 
 def wait_for_lines(console, count):
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 120.0
     while shown(console).count("\n") < count and time.monotonic() < end:
         time.sleep(0.01)
     return shown(console).splitlines()

@@ -133,7 +133,7 @@ def test_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(run, end):
         with httpx.stream("GET", f"{command.url}{API}/events", timeout=30.0) as events:
             assert events.status_code == 200
             command.process.send_signal(end)
-            assert command.process.wait(30.0) == 0
+            assert command.process.wait(120.0) == 0
 
 
 @pytest.mark.slow

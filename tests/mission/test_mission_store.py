@@ -234,7 +234,7 @@ def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypa
     def meanwhile(*paths):
         storing = threading.Thread(target=store.put, args=([packet(sequence=1)], 0.0), daemon=True)
         storing.start()
-        storing.join(20.0)
+        storing.join(120.0)
         assert not storing.is_alive()
         link(*paths)
 

@@ -41,7 +41,7 @@ def test_a_recording_is_a_bag(tmp_path):
         network.say("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0)))
         network.say("/scan", SCAN, scan(stamp, RANGES))
     stop.set()
-    thread.join(10.0)
+    thread.join(120.0)
     assert said == [{"/tf_static": 1, "/odom": 8, "/scan": 8}]
     survey = open_source(output).survey()
     assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
@@ -66,7 +66,7 @@ def recorded(network, output, messages):
     for topic, kind, message in messages:
         network.say(topic, kind, message)
     stop.set()
-    thread.join(20.0)
+    thread.join(120.0)
     return said
 
 

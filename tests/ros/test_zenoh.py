@@ -47,7 +47,7 @@ def peer(port):
 
 
 def wait_for(condition):
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 120.0
     while not condition() and time.monotonic() < end:
         time.sleep(0.01)
     assert condition()

@@ -15,9 +15,9 @@ STAYS = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
 """As a worker that is ready."""
 WAITS = (
     "import time, pathlib; go = pathlib.Path(sys.argv[1], 'go');"
-    "[time.sleep(0.02 * (not go.exists())) for _ in range(1000)];"
+    "[time.sleep(0.02 * (not go.exists())) for _ in range(6000)];"
 )
-"""For the file ``go``, at most 20 s."""
+"""For the file ``go``, at most 120 s."""
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def supervised(tmp_path, monkeypatch):
 
 
 def wait(condition):
-    until = time.monotonic() + 30.0
+    until = time.monotonic() + 120.0
     while not condition():
         assert time.monotonic() < until
         time.sleep(0.005)

@@ -32,7 +32,7 @@ def written_while_another_writes(database, numbers):
         with database.transaction() as connection:
             insert(0)(connection)
             futures = [pool.submit(database.share, insert(number)) for number in numbers]
-            until = time.monotonic() + 30.0
+            until = time.monotonic() + 120.0
             while len(database._group._waiting) < len(numbers):
                 assert time.monotonic() < until
                 time.sleep(0.001)

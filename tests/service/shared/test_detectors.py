@@ -22,6 +22,6 @@ def test_an_instance_follows_the_store_at_each_step(registry, tmp_path):
     instance = Instance(registry, "one", 0, nothing, nothing, nothing, followed.release)
     instance.start()
     try:
-        assert all(followed.acquire(timeout=30.0) for _ in range(2))
+        assert all(followed.acquire(timeout=120.0) for _ in range(2))
     finally:
         instance.close()
