@@ -45,7 +45,7 @@ class Server:
 
     def start(self) -> None:
         """Start the server and wait until it answers."""
-        options = f"-p {self.port} -k {self._folder} -h 127.0.0.1"
+        options = f"-F -p {self.port} -k {self._folder} -h 127.0.0.1"
         self._run("pg_ctl", "-D", f"{self._folder}/data", "-o", options, "-l", f"{self._folder}/log", "-w", "start")
 
     def stop(self, how: str = "immediate") -> None:

@@ -38,7 +38,7 @@ def route_of(seed, building=Building.DEFAULT, length_m=60.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "building"), enumerate(INDOORS))
+@pytest.mark.parametrize(("seed", "building"), list(enumerate(INDOORS)))
 def test_robots_touch_nothing_wherever_furniture_stands(building, seed):
     rng = np.random.default_rng(seed)
     plan = draw_floor_plan(rng, building)
@@ -117,7 +117,7 @@ def test_a_further_robot_changes_no_goals():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "building"), enumerate(INDOORS))
+@pytest.mark.parametrize(("seed", "building"), list(enumerate(INDOORS)))
 def test_neighbours_share_ground_and_return_to_their_own(building, seed):
     rng = np.random.default_rng(seed)
     plan = draw_floor_plan(rng, building)
