@@ -17,7 +17,7 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.trainer import ExecutionOptions
 
 SETTINGS = FederatedSettings.model_validate(
-    {"rounds": 2, "local_steps": 2, "training": {"shape_steps": 20, "pairs": 1, "side_px": 64, "label_copies": 2}}
+    {"rounds": 2, "local_steps": 2, "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "label_copies": 1}}
 )
 
 

@@ -25,8 +25,8 @@ settings.register_profile("fcslam", deadline=None, max_examples=40)
 settings.load_profile("fcslam")
 
 
-SIMULATED = frozenset({"drawn", "packets", "logs"})
-"""Fixtures that simulate and map a fleet: what uses one of them is slow."""
+SLOW = frozenset({"drawn", "packets", "logs", "desk", "postgres_server"})
+"""Fixtures that simulate and map a fleet, or start a server: what uses one of them is slow."""
 
 
 SECURITY = Path(__file__).parents[1] / "docs" / "develop" / "security.md"
@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.originalname in THREATS:
             item.add_marker(pytest.mark.attack)
-        if SIMULATED & set(getattr(item, "fixturenames", ())):
+        if SLOW & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
 
 

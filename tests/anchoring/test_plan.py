@@ -19,6 +19,8 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
 from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 
+pytestmark = pytest.mark.slow
+
 
 def placed(result, plan=None, to_walls=False, by_hand=(), fixes=None):
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}

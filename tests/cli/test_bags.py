@@ -15,6 +15,8 @@ from tests.sources.bag_messages import drive, mounted, odom, save, scan, text
 from tests.sources.camera_records import CAMERA, LASER
 from tests.sources.camera_records import drive as camera_drive
 
+pytestmark = pytest.mark.slow
+
 
 def run(*arguments):
     return main([*map(str, arguments)])

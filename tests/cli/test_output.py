@@ -3,9 +3,13 @@
 from datetime import datetime
 from pathlib import Path
 
+import pytest
+
 from fcslam.cli import main
 from fcslam.cli.output import new_folder
 from tests.sources.carmen_text import drive, flaser, pose_at, save
+
+pytestmark = pytest.mark.slow
 
 NOW = datetime(2026, 2, 3, 14, 5, 6)
 

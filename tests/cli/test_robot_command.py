@@ -33,6 +33,8 @@ from tests.robot.fake_cloud import FakeCloud
 from tests.robot.http_cloud import serving
 from tests.ros.memory_network import MemoryNetwork
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):

@@ -10,6 +10,8 @@ from fcslam.runs import open_run, read_tum
 from fcslam.sources import open_source
 from tests.lab.simulation.gl import require_gl
 
+pytestmark = pytest.mark.slow
+
 TINY = ["simulate", "--building", "flat", "--path-length", "6", "--seed", "3"]
 
 

@@ -14,6 +14,8 @@ from fcslam.wire.packets import encode
 from tests import small_fleet
 from tests.robot.kidnapping import kidnapping
 
+pytestmark = pytest.mark.slow
+
 CONFIG = RobotConfig(channels=(Channel.LIDAR,))
 
 

@@ -13,6 +13,8 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
 from tests.robot import spinning
 
+pytestmark = pytest.mark.slow
+
 
 def integrated(scale=1.0, turn=1.0, slip=None):
     """Odometry that measures the true motion wrongly."""

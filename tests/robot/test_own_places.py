@@ -17,6 +17,8 @@ from fcslam.lidar.tracker import TrackedScan
 from fcslam.robot.own_places import OwnPlaces
 from tests.lidar.worlds import box, path, recording, scan_at, shifted
 
+pytestmark = pytest.mark.slow
+
 STEP_M = 1.0
 FINE_M = 0.5
 RADIUS_M = 32.0

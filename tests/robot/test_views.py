@@ -23,6 +23,8 @@ from tests.features.networks import tiny_network
 from tests.features.pictures import image_at
 from tests.lidar.worlds import drifting, drive, path, recording, ring
 
+pytestmark = pytest.mark.slow
+
 EVERY = 3
 """Scans between two images."""
 

@@ -28,6 +28,8 @@ from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
 from tests.ros.ros_messages import CODEC, odometry, scan, transform
 
+pytestmark = pytest.mark.slow
+
 TOPICS = (("/robot1/scan", SCAN, False), ("/robot1/odom", ODOMETRY), ("/tf_static", TRANSFORMS, True, True))
 LOST_AT_A_RESTART = STEPS_BACK_FOR_RESTART - 1
 

@@ -30,6 +30,8 @@ from tests.scripted import closures, rectangle, stream
 from tests.service.inline import InlineTask
 from tests.small_fleet import in_order
 
+pytestmark = pytest.mark.slow
+
 POSES = rectangle(29)
 SCRIPT = closures(("a", POSES), ("b", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)])
 

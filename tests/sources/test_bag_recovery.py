@@ -18,6 +18,8 @@ from fcslam.untrusted import unpack
 from tests.sources.bag_messages import drive, save
 from tests.sources.carmen_text import scans_of
 
+pytestmark = pytest.mark.slow
+
 SCANS = 400
 
 

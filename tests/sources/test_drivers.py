@@ -18,6 +18,8 @@ from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan,
 from tests.sources.clouds import Measured, cloud, header, plan_ranges, rotation, said, xyz
 from tests.sources.clouds import spinning as spinning_cloud
 
+pytestmark = pytest.mark.slow
+
 START, SCANS = 1_700_000_000.0, 90
 TICKS = np.arange(0.0, 20.0, 0.01)
 POSES = spinning.pose_at(TICKS) - (0.0, 0.5, 0.0)
