@@ -50,7 +50,7 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def fleet():
-    return small_fleet.draw(3)
+    return small_fleet.draw(3, 30.0)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_robot_is_found_without_an_initial_pose(fleet, building):
 
 
 def test_no_pose_in_the_map_of_another_building(fleet):
-    elsewhere = map_of(small_fleet.draw(1, seed=7).robots)
+    elsewhere = map_of(small_fleet.draw(1, 30.0, seed=7).robots)
     run = localized(fleet.robots[2].scans(), elsewhere)
     assert run.metrics["fixes"].value == 0
     assert not run.localized["robot"].is_localized.any()
