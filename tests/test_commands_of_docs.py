@@ -39,7 +39,7 @@ OTHER_PROGRAMS: dict[str, str] = LISTED["other programs"]
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGES_WITH_COMMANDS = [page for page in PAGES if page.name not in {"CHANGELOG.md", "CONTRIBUTING.md", "commands.md"}]
 
-SCANS = 100
+SCANS = 120
 """Of a sample log that the commands get."""
 ANNA, BEN, CLEO = "anna.clf", "ben.clf", "cleo.clf"
 LOGS = {
@@ -92,13 +92,13 @@ def test_the_tests_that_reasons_name_are_there():
 
 
 def relations(run_folder: Path) -> str:
-    """Relations between scans of a run 15 s apart, as the reference files of the SLAM benchmark hold them."""
+    """Relations between scans of a run 21 s apart, as the reference files of the SLAM benchmark hold them."""
     (trajectory,) = open_run(run_folder).trajectories.values()
     poses, stamps = trajectory.T_map_base, trajectory.stamps
     lines = []
-    for i in range(0, len(stamps) - 60, 10):
-        x, y, theta = se2.between(poses[i], poses[i + 60])
-        lines.append(f"{stamps[i]:.6f} {stamps[i + 60]:.6f} {x:.6f} {y:.6f} 0 0 0 {theta:.6f}")
+    for i in range(0, len(stamps) - 84, 4):
+        x, y, theta = se2.between(poses[i], poses[i + 84])
+        lines.append(f"{stamps[i]:.6f} {stamps[i + 84]:.6f} {x:.6f} {y:.6f} 0 0 0 {theta:.6f}")
     return "\n".join(lines) + "\n"
 
 
