@@ -101,8 +101,9 @@ class Command:
     """A real one that shows a page."""
 
     def __init__(self, *words):
-        command = [sys.executable, "-m", "fcslam.cli", *map(str, words), "--no-open"]
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        command = [sys.executable, "-m", "fcslam.cli", *map(str, words)]
+        environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+        environment["PYTHONUNBUFFERED"] = "1"
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
