@@ -89,10 +89,29 @@ def test_a_bare_corridor_does_not_tell():
         assert contradicted_facing(stated(scans, turned_deg, upside_down)) is None
 
 
-def test_odometry_that_fits_in_no_way_corrects_nothing():
+@pytest.mark.parametrize("turned_deg", [180, 90])
+def test_a_drive_of_three_metres_is_enough(turned_deg):
+    scans = drive(WIDE)[:36]
+    assert contradicted_facing(scans) is None
+    assert contradicted_facing(stated(scans, turned_deg)).facing.turned_deg == pytest.approx(turned_deg, abs=3.0)
+
+
+def test_scans_that_fit_in_no_way_are_said():
     scans, rng = drive(WIDE), np.random.default_rng(1)
-    wild = [replace(scan, T_odom_base=frozen(rng.normal(0.0, 0.5, 3))) for scan in scans]
-    assert contradicted_facing(wild) is None
+    order = rng.permutation(WIDE.beam_count)
+    changes = {
+        "odometry of another robot": lambda scan: replace(scan, T_odom_base=frozen(rng.normal(0.0, 0.5, 3))),
+        "intensities": lambda scan: replace(scan, ranges_m=frozen(2.0 + 1.5 * np.sin(7.0 * scan.ranges_m), np.float32)),
+        "beams in another order": lambda scan: replace(scan, ranges_m=frozen(scan.ranges_m[order], np.float32)),
+    }
+    for change in changes.values():
+        found = contradicted_facing(map(change, scans))
+        assert found.facing == Facing()
+        assert "however the laser is mounted" in str(found)
+
+
+def test_without_odometry_nothing_is_compared():
+    scans = drive(WIDE)
     assert contradicted_facing(replace(scan, T_odom_base=frozen((math.nan,) * 3)) for scan in scans) is None
 
 

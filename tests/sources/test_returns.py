@@ -73,6 +73,13 @@ def test_other_units_in_a_log_are_refused(tmp_path, factor, unit):
     assert "only 0.0% of the beams measure a range (0 m to 50 m)" in refusal(save_log(tmp_path / "no.log", nothing))
 
 
+@pytest.mark.parametrize("strength", [9.0, 60.0, 900.0])
+def test_intensities_in_place_of_ranges_are_refused(tmp_path, strength):
+    """A return is weaker from afar, and its intensity is a whole number."""
+    message = refusal(bag(tmp_path / "run.bag", lambda _, values: np.ceil(strength / np.maximum(values, 0.5))))
+    assert "intensities" in message
+
+
 def missing(step, values, value, share=0.4):
     """``value`` in a part of the beams that differs from scan to scan."""
     return np.where(np.random.default_rng(step).random(len(values)) < share, value, values)

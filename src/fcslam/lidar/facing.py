@@ -28,7 +28,7 @@ MOST_PAIRS: Final = 40
 """Pairs with a move that are compared, and as many with a turn."""
 SCANS_WATCHED: Final = 60
 """Scans of a live laser that are compared."""
-FEWEST_PAIRS: Final = 10
+FEWEST_PAIRS: Final = 5
 """Fewer pairs say nothing."""
 FEW_PAIRS: Final = 20
 """About so many pairs decide whether another mounting is worth the search with all pairs."""
@@ -57,6 +57,12 @@ LEAST_LEAD: Final = 0.05
 """Least gain in agreement over any other mounting."""
 SIGMAS: Final = 5.0
 """Least ratio of the gain to its standard deviation."""
+CLEAR_LEAD, CLEAR_AGREEMENT = 0.25, 0.75
+"""A mounting with this agreement and gain is certain, too: a short drive has too few pairs for the deviation."""
+NO_AGREEMENT: Final = 0.3
+"""Scans agree less with the stated mounting only if something is wrong."""
+ENOUGH_PAIRS: Final = 10
+"""Pairs with which that is certain, although no mounting fits."""
 
 WHEELS: Final = 1.5
 """Distances that differ by a larger factor may be due to the unit of the ranges."""
@@ -86,6 +92,7 @@ class Contradiction(NamedTuple):
     """A mounting that the scans contradict."""
 
     facing: Facing
+    """How the laser faces; the default: no mounting fits."""
     agreement: float
     """Mean agreement of the points with the odometry, 0 to 1, as the laser faces."""
     stated_agreement: float
@@ -96,6 +103,12 @@ class Contradiction(NamedTuple):
     def __str__(self) -> str:
         """Why the mounting or the odometry cannot be right, and what to do."""
         (turned_deg, upside_down, distance, turn), claims = self.facing, []
+        if self.facing == Facing():
+            return (
+                f"the scans contradict the odometry, however the laser is mounted: only "
+                f"{100 * self.stated_agreement:.0f} % of the points agree; check that the ranges are distances, in the "
+                "order of their beams, and that both are of one robot"
+            )
         remedy = (
             "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the "
             "odometry"
@@ -157,6 +170,8 @@ class ScanPair(NamedTuple):
 def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     """How the laser faces if it is certainly not as stated; None if the scans fit the odometry or say nothing.
 
+    It faces as stated if no mounting fits.
+
     Args:
         scans: of one laser, with odometry; as many are read as are needed.
     """
@@ -166,7 +181,7 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
         return None
     few = trial.thinned()
     if few.mean(few.agreements(_best(few)[0])) - few.mean(few.agreements(Facing())) < 0.5 * LEAST_GAIN:
-        return None
+        return trial.without_mounting(as_stated)
     best, scores = _best(trial)
     square_deg = 90 * round(best.turned_deg / 90)
     if abs(best.turned_deg - square_deg) <= SQUARE_DEG:
@@ -184,10 +199,12 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
         trial.leads(found, scores[each], LEAST_LEAD) for each in far
     )
     least = LEAST_AGREEMENT if best.turn == 1.0 else LEAST_TURNED  # where angles are wrong, moves never agree
-    if not is_certain or trial.mean(found) < least:
+    if trial.mean(found) < least:
+        return trial.without_mounting(as_stated)
+    if not is_certain:
         return None
     turned_deg = math.remainder(best.turned_deg, 360)
-    beams = trial.pairs[0][0].laser.beams
+    beams = trial.pairs[0].before.laser.beams
     return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated), beams)
 
 
@@ -230,7 +247,7 @@ class _Trial:
 
     def __init__(self, moves: list[ScanPair], turns: list[ScanPair]) -> None:
         self._moves, self._turns = moves, turns
-        kinds = [moves, turns] if min(len(moves), len(turns)) >= FEWEST_PAIRS // 2 else [[*moves, *turns]]
+        kinds = [moves, turns] if min(len(moves), len(turns)) >= ENOUGH_PAIRS // 2 else [[*moves, *turns]]
         self.pairs = [pair for kind in kinds for pair in kind]
         self._weights = np.array([1.0 / len(kind) for kind in kinds for _ in kind])
 
@@ -257,7 +274,15 @@ class _Trial:
             return False
         weights, gain = self._weights[known] / self._weights[known].sum(), self.mean(gains)
         sigma = math.sqrt(float((weights**2 * (gains[known] - gain) ** 2).sum()))
-        return gain > max(least, SIGMAS * sigma)
+        is_clear = gain > CLEAR_LEAD and self.mean(scores) > CLEAR_AGREEMENT
+        return is_clear or gain > max(least, SIGMAS * sigma)
+
+    def without_mounting(self, as_stated: FloatArray) -> Contradiction | None:
+        """That no mounting fits; None if the stated one may."""
+        if np.count_nonzero(np.isfinite(as_stated)) < ENOUGH_PAIRS or self.mean(as_stated) > NO_AGREEMENT:
+            return None
+        agreement = self.mean(as_stated)
+        return Contradiction(Facing(), agreement, agreement, self.pairs[0].before.laser.beams)
 
 
 def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:

@@ -10,7 +10,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
-from fcslam.lidar.facing import WHEELS, Contradiction, contradicted_facing, distance_remedy, turn_remedy
+from fcslam.lidar.facing import WHEELS, Contradiction, Facing, contradicted_facing, distance_remedy, turn_remedy
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
@@ -75,7 +75,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     if found is None:
         return _calibrate_finely(bag, config)
     turned_deg, upside_down, distance, turn = found.facing
-    if (distance, turn) != (1.0, 1.0):
+    if (distance, turn) != (1.0, 1.0) or found.facing == Facing():
         fine = _calibrate_finely(bag, config)
         scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
         lines_before = () if _is_wrong(scale) else (f"{found}; not corrected",)

@@ -3,6 +3,7 @@
 - Nothing: nearly no beam has a return.
 - Another unit: the values are too large for a 2D LiDAR, and as varied as ranges. A driver that sends a large number for
   no return sends few different ones.
+- Whole numbers: no laser rounds ranges to metres. Intensities are whole numbers.
 - A placeholder: one value repeats exactly in many beams at most places of a drive, and values near it are rare. Along a
   wall they are not, as the beams beside the nearest one are a little longer, however coarse the ranges are.
 """
@@ -28,6 +29,8 @@ _VARIED, _MOST_COMMON = 0.5, 8
 """Share that the most common values have at most where values are varied, and their number."""
 _TOO_FAR = 0.6
 """Share of varied values beyond the maximum that no laser has."""
+_WHOLE, _FEWEST_VALUES = 0.95, 3
+"""Share of the different values that are whole where all are, and their least number."""
 _MILLIMETRES = 900.0
 """Values of which half are larger are millimetres and not centimetres."""
 _REPEATED, _PLACES = 0.1, 0.5
@@ -107,6 +110,8 @@ class RangeSample:
         limits = f"({nearest:g} m to {farthest:g} m)"
         large = beyond if len(beyond) > _TOO_FAR * beams and _is_varied(beyond) else returns
         middle = float(np.median(large)) if len(large) else 0.0
+        different = np.unique(np.concatenate((returns, beyond)))
+        is_whole = len(different) >= _FEWEST_VALUES and bool(np.mean(different == np.rint(different)) > _WHOLE)
         if large is beyond or (middle > LONGEST_USUAL_M and _is_varied(returns)):
             unit = (
                 "millimetres: divide them by 1000"
@@ -115,7 +120,12 @@ class RangeSample:
             )
             raise SourceError(
                 f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
-                f"be {unit} and give the recording again"
+                f"be {unit}{', or intensities,' * is_whole} and give the recording again"
+            )
+        if is_whole:
+            raise SourceError(
+                f"{path}: the ranges{which} are whole numbers, such as {different[len(different) // 2]:g}, and no "
+                "distances in metres; check that the driver does not publish intensities in their place"
             )
         share = len(returns) / max(beams, 1)
         if share < FEWEST_RETURNS:
