@@ -107,7 +107,7 @@ def test_scans_that_fit_in_no_way_are_said():
     for change in changes.values():
         found = contradicted_facing(map(change, scans))
         assert found.facing == Facing()
-        assert "however the laser is mounted" in str(found)
+        assert "no other mounting is certain" in str(found)
 
 
 def test_without_odometry_nothing_is_compared():

@@ -252,6 +252,22 @@ def test_odometry_of_a_robot_without_scans_is_not_used(tmp_path):
     assert same(found, open_source(save(tmp_path / "alone.mcap", own)))
 
 
+def test_the_lasers_of_two_robots_may_have_one_name(tmp_path):
+    said = [robot(k, **FLEETS["prefixes in one tf"][k]) for k in (0, 1)]
+    for each in (message.fields for messages in said for message in messages):
+        each.update({key: "laser" for key in ("frame", "child") if str(each.get(key)).endswith("/laser")})
+    robots = open_fleet([(save(tmp_path / "run.mcap", [message for each in said for message in each]), None)])
+    assert [each.survey().lasers[0].T_base_laser for each in robots] == [pytest.approx(each) for each in MOUNTINGS[:2]]
+
+
+def test_a_robot_without_odometry_does_not_spoil_the_other(tmp_path):
+    own = robot(0, space="/robot1", with_tf=True)
+    other = [each for each in robot(1, space="/robot2") if each.topic != "/robot2/odom"]
+    (found,) = open_fleet([(save(tmp_path / "run.mcap", [*own, *other]), None)])
+    assert same(found, open_source(save(tmp_path / "alone.mcap", own)))
+    assert any("on /robot2/scan are of no robot with odometry, unused" in note for note in found.survey().notes)
+
+
 def test_robots_without_namespaces_and_prefixes_are_named_by_their_frames(tmp_path):
     said = [robot(k, prefix=f"r{k}_", with_odom=False, with_tf=True) for k in (0, 1)]
     robots = open_fleet([(save(tmp_path / "run.mcap", [message for each in said for message in each]), None)])

@@ -106,12 +106,18 @@ def test_a_moving_joint_between_them_is_named():
         tree.fixed("base", "laser")
 
 
-def test_a_frame_that_changes_its_parent_moves():
+def test_a_frame_that_two_robots_have_is_that_of_the_own_base():
     tree = TransformTree()
-    tree.add("base", "laser", placed(0.1))
-    tree.add("arm", "laser", placed(0.1))
-    with pytest.raises(NoTransformError, match="moves"):
-        tree.fixed("base", "laser")
+    for k in range(3):
+        tree.add("a/base", "laser", placed(0.1))
+        tree.add("b/base", "b/mast", placed(0.2))
+        tree.add("b/mast", "laser", placed(0.3))
+        tree.add("c/base", "laser", placed(0.1 * k))
+    assert tree.fixed("a/base", "laser").translation_m[0] == 0.1
+    assert tree.fixed("b/base", "laser").translation_m[0] == 0.5
+    for base in ("c/base", "odom"):
+        with pytest.raises(NoTransformError, match="'laser' is in 'a/base' and in 'b/mast'"):
+            tree.fixed(base, "laser")
 
 
 def test_a_ring_of_frames_ends():

@@ -62,7 +62,7 @@ CLEAR_LEAD, CLEAR_AGREEMENT = 0.25, 0.75
 NO_AGREEMENT: Final = 0.3
 """Scans agree less with the stated mounting only if something is wrong."""
 ENOUGH_PAIRS: Final = 10
-"""Pairs with which that is certain, although no mounting fits."""
+"""Pairs with which that is certain, although no other mounting is."""
 
 WHEELS: Final = 1.5
 """Distances that differ by a larger factor may be due to the unit of the ranges."""
@@ -92,7 +92,7 @@ class Contradiction(NamedTuple):
     """A mounting that the scans contradict."""
 
     facing: Facing
-    """How the laser faces; the default: no mounting fits."""
+    """How the laser faces; the default: not known."""
     agreement: float
     """Mean agreement of the points with the odometry, 0 to 1, as the laser faces."""
     stated_agreement: float
@@ -105,9 +105,9 @@ class Contradiction(NamedTuple):
         (turned_deg, upside_down, distance, turn), claims = self.facing, []
         if self.facing == Facing():
             return (
-                f"the scans contradict the odometry, however the laser is mounted: only "
-                f"{100 * self.stated_agreement:.0f} % of the points agree; check that the ranges are distances, in the "
-                "order of their beams, and that both are of one robot"
+                f"the scans contradict the odometry: only {100 * self.stated_agreement:.0f} % of the points agree, and "
+                "no other mounting is certain; check the mounting, that the ranges are distances in the order of their "
+                "beams, and that both are of one robot"
             )
         remedy = (
             "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the "
@@ -170,7 +170,7 @@ class ScanPair(NamedTuple):
 def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     """How the laser faces if it is certainly not as stated; None if the scans fit the odometry or say nothing.
 
-    It faces as stated if no mounting fits.
+    If it faces as stated in the result, the scans fit the odometry in no certain way.
 
     Args:
         scans: of one laser, with odometry; as many are read as are needed.
@@ -199,10 +199,8 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
         trial.leads(found, scores[each], LEAST_LEAD) for each in far
     )
     least = LEAST_AGREEMENT if best.turn == 1.0 else LEAST_TURNED  # where angles are wrong, moves never agree
-    if trial.mean(found) < least:
+    if not is_certain or trial.mean(found) < least:
         return trial.without_mounting(as_stated)
-    if not is_certain:
-        return None
     turned_deg = math.remainder(best.turned_deg, 360)
     beams = trial.pairs[0].before.laser.beams
     return Contradiction(best._replace(turned_deg=turned_deg), trial.mean(found), trial.mean(as_stated), beams)
@@ -278,7 +276,7 @@ class _Trial:
         return is_clear or gain > max(least, SIGMAS * sigma)
 
     def without_mounting(self, as_stated: FloatArray) -> Contradiction | None:
-        """That no mounting fits; None if the stated one may."""
+        """That the stated mounting is wrong and no other certain; None if it may be right."""
         if np.count_nonzero(np.isfinite(as_stated)) < ENOUGH_PAIRS or self.mean(as_stated) > NO_AGREEMENT:
             return None
         agreement = self.mean(as_stated)

@@ -82,7 +82,7 @@ def robots_of(bag: CountedBag, options: BagOptions) -> tuple[BagRobot, ...]:
     members, spaces = _members(heard, bag.census)
     labels = {(_prefix(member.frame), member.space) for member in members}
     robots = [member for member in members if member.moves] or (members if len(labels) == len(members) else [])
-    if len(robots) < 2:
+    if len(robots) < 2 and not (robots and any(_is_apart(member, robots[0]) for member in members)):
         return (_only_robot(bag, robots or members, options),)
     notes = _lost_scans(bag, robots, members)
     found = [
@@ -106,6 +106,11 @@ def robots_of(bag: CountedBag, options: BagOptions) -> tuple[BagRobot, ...]:
     if options.scan_topics and not having:  # what is wrong with the topics is said where they are read
         return (_only_robot(bag, members, options),)
     return tuple(sorted(having or found, key=lambda robot: robot.name))
+
+
+def _is_apart(member: _Member, robot: _Member) -> bool:
+    """Whether a namespace with a tf of its own is beside that of a robot."""
+    return bool(robot.space and member.space) and not set(member.transforms) & set(robot.transforms)
 
 
 def robot_of(bag: CountedBag, options: BagOptions) -> BagRobot:

@@ -19,7 +19,7 @@ from fcslam.sources.bags.camera import (
 )
 from fcslam.sources.bags.census import CountedBag
 from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
-from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, ODOMETRY
+from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, ODOMETRY, SCANS
 from fcslam.sources.bags.container import RawMessage, Topic
 from fcslam.sources.bags.merging import merge_scans
 from fcslam.sources.bags.messages import (
@@ -75,6 +75,11 @@ class RecordedLaser(NamedTuple):
             yield (
                 f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
                 "above the floor (--cloud-band chooses)"
+            )
+        if self.topic.type in SCANS and self.topic.type not in LASER_SCANS and self.first.sweep is None:
+            yield (
+                f"{path}: the points of {self.name} have no times, so the motion of the robot during a cloud is not "
+                "corrected; let the driver publish them if the sensor turns"
             )
 
 

@@ -80,7 +80,10 @@ def choose_topics(
     heard, scans = _heard(robot), _scans(robot)
     if not scans:
         packed = [topic.name for topic in heard if topic.type == COMPRESSED_IMAGE and is_depth(topic.name)]
+        bare = [topic.name for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
         remedy = "record them"
+        if bare:
+            remedy = f"the depth images of {bare[0]} need their {_info_name(bare[0])}"
         if packed:
             remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
         raise SourceError(
@@ -249,9 +252,14 @@ def _calibration_of(camera: Topic, robot: BagRobot) -> Topic | None:
 
 def calibration_beside(camera: Topic, robot: BagRobot) -> Topic | None:
     """The calibration topic beside the images."""
-    name = camera.name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    name = slashed(_info_name(camera.name))
     infos = (topic for topic in _heard(robot) if topic.type == CAMERA_INFO)
-    return next((info for info in infos if slashed(info.name) == slashed(name)), None)
+    return next((info for info in infos if slashed(info.name) == name), None)
+
+
+def _info_name(images: str) -> str:
+    """The name of the calibration topic beside the images of a topic."""
+    return images.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
 
 
 def is_depth(name: str) -> bool:

@@ -79,11 +79,14 @@ class TransformTree:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Transform]] = {}
         self._moving: set[str] = set()
-        self._links: dict[tuple[str, str], None] = {}
+        self._links: dict[Link, Transform | None] = {}
+        """The first transform of each link; None if it moves."""
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Add a transform. The first one counts; a frame whose transform changes later is moving."""
-        self._links[parent, child] = None
+        of_link = self._links.setdefault((parent, child), T_parent_child)
+        if of_link is not None and differ(of_link, T_parent_child):
+            self._links[parent, child] = None
         first_parent, first = self._parents.setdefault(child, (parent, T_parent_child))
         if first is not T_parent_child and (parent != first_parent or differ(first, T_parent_child)):
             self._moving.add(child)
@@ -92,11 +95,21 @@ class TransformTree:
         return frame in self._parents or any(parent == frame for parent, _ in self._parents.values())
 
     def fixed(self, base: str, frame: str) -> Transform:
-        """``T_base_frame``.
+        """``T_base_frame``; of a frame that two robots have, that of the robot with ``base``.
 
         Raises:
             NoTransformError: the frames are not connected, or one moves against the other.
         """
+        parents = [parent for parent, child in self._links if child == frame]
+        if frame != base and len(parents) > 1:
+            own = [parent for parent in parents if base in self._above(parent)]
+            T_parent_frame = self._links[own[0], frame] if len(own) == 1 else None
+            if T_parent_frame is None:
+                raise NoTransformError(
+                    f"no fixed transform from '{base}' to '{frame}' ('{frame}' is in '{parents[0]}' and in "
+                    f"'{parents[1]}', as if two robots had it)"
+                )
+            return _compose(self.fixed(base, own[0]), T_parent_frame)
         above_base, above_frame = list(self._above(base)), list(self._above(frame))
         meeting = next((ancestor for ancestor in above_frame if ancestor in above_base), None)
         if meeting is None:
