@@ -97,7 +97,7 @@ def test_a_drive_of_three_metres_is_enough(turned_deg):
 
 
 def test_scans_that_fit_in_no_way_are_said():
-    scans, rng = drive(WIDE), np.random.default_rng(1)
+    scans, rng = drive(WIDE)[:150], np.random.default_rng(1)
     order = rng.permutation(WIDE.beam_count)
     changes = {
         "odometry of another robot": lambda scan: replace(scan, T_odom_base=frozen(rng.normal(0.0, 0.5, 3))),

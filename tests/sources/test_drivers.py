@@ -115,11 +115,12 @@ def outcome(path, options=None):
     except SourceError as error:
         return str(error), None
     frontend.finish()
-    (track,) = frontend.tracks
-    stamps = np.array(track.stamps) - START
-    true, estimated = pose_at(stamps), track.T_odom_base()
-    off = se2.compose(align(true, estimated), estimated) - true
-    return notes, float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
+    off = []
+    for track in frontend.tracks:
+        true, estimated = pose_at(np.array(track.stamps) - START), track.T_odom_base()
+        off.append(se2.compose(align(true, estimated), estimated)[:, :2] - true[:, :2])
+    lost = " the robot was lost" * (len(off) > 1)
+    return notes + lost, float(np.sqrt(np.mean(np.sum(np.vstack(off) ** 2, axis=1))))
 
 
 MILLIMETRES, INCHES = "they seem to be millimetres", "inches: by 39.37"
@@ -309,6 +310,52 @@ def scaled():
     return [mounting, *readings(9.0, scale=1 / 1.2), *scans_of(LASER)]
 
 
+def with_ranges(change):
+    """``change`` is given the time of each scan and its ranges."""
+    for each in recording(LASER):
+        if each.topic == "/scan":
+            ranges = change(each.fields["stamp"] - START, np.array(each.fields["ranges"]))
+            each.fields["ranges"] = ranges
+        yield each
+
+
+def posts(_, ranges):
+    """Four posts of the robot hide a part of the view."""
+    at = (np.arange(4)[:, None] * 90 + 40 + np.arange(5)).ravel()
+    ranges[at] = 0.25
+    return ranges
+
+
+def operator(time, ranges):
+    """Somebody walks 1 m behind the robot."""
+    legs = np.arange(-8, 9) + round(4 * math.sin(3.0 * time))
+    ranges[legs[np.abs(legs) > 2]] = 1.0
+    return ranges
+
+
+def with_odometry(change):
+    """``change`` is given the number of each reading and its pose; it returns the pose, or None."""
+    mounting, *_ = recording(LASER)
+    stamps = [START + 0.04 * k for k in range(238)]
+    poses = [change(k, *pose_at(stamp - START)) for k, stamp in enumerate(stamps)]
+    said = [odom(stamp, pose, bag_time=stamp) for stamp, pose in zip(stamps, poses, strict=True) if pose is not None]
+    return [mounting, *said, *scans_of(LASER)]
+
+
+def begun_again(pose):
+    return tuple(se2.between(pose_at(4.0), np.array(pose)))
+
+
+def bursts():
+    """Readings that are recorded five at a time."""
+    return [
+        each._replace(bag_time=START + 0.5 * math.ceil(2.0 * (each.fields["stamp"] - START)))
+        if each.topic == "/odom"
+        else each
+        for each in recording(LASER)
+    ]
+
+
 def packed_depth():
     message = ROS2.types["sensor_msgs/msg/CompressedImage"](
         header=header(ROS2, START, "camera"), format="16UC1; compressedDepth png", data=np.zeros(20, np.uint8)
@@ -324,6 +371,21 @@ ROBOTS = {
     "namespace": (namespaced, ""),
     "frames with a slash": (slashed, ""),
     "wheels of another radius": (scaled, "the robot's distance is 1.2"),
+    "odometry that begins again": (lambda: with_odometry(lambda k, *its: its if k < 100 else begun_again(its)), ""),
+    "two publishers that agree": (lambda: with_odometry(lambda k, x, y, a: (x + 0.01 * (k % 2), y, a)), ""),
+    "two publishers that differ": (
+        lambda: with_odometry(lambda k, x, y, a: (x + 5.0 * (k % 2), y, a)),
+        "as that of two publishers",
+    ),
+    "odometry in millimetres": (
+        lambda: with_odometry(lambda _, x, y, a: (1000.0 * x, 1000.0 * y, a)),
+        "or in another unit",
+    ),
+    "NaN in the odometry": (lambda: with_odometry(lambda k, x, y, a: (NAN if k % 7 == 0 else x, y, a)), ""),
+    "gaps in the odometry": (lambda: with_odometry(lambda k, *its: None if 75 < k < 90 else its), ""),
+    "bursts of odometry": (bursts, ""),
+    "posts of the robot": (lambda: with_ranges(posts), ""),
+    "legs of the operator": (lambda: with_ranges(operator), ""),
     "compressed depth images": (packed_depth, "record /depth/image_raw;"),
 }
 

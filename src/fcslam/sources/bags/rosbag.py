@@ -37,7 +37,7 @@ from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformErr
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.path_summary import FEWEST_POSES, PathSummary
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
 from fcslam.sources.pose import pose_array
 from fcslam.sources.returns import RangeSample, placeholder_note, without
@@ -45,6 +45,8 @@ from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _EACH_LASER = "give one for each laser, in the same order"
 
+_MOST_JUMPS = 0.2
+"""Share of the readings of odometry at which it may jump."""
 _OF_SCANS = "its range_min and range_max"
 _OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --cloud-band"
 
@@ -223,6 +225,12 @@ class RosBag:
                 f"{path}: {alone} of {alone + scans.count} scans in {laser.topic.name} have no odometry within 1 s: "
                 f"the first scan has the stamp {laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from "
                 f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
+            )
+        jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
+        if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
+            raise SourceError(
+                f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as that of two publishers or in "
+                "another unit; choose another one by --odom-topic, or none to map without"
             )
 
     def _first_errors(self) -> str:

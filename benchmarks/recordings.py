@@ -1,0 +1,268 @@
+"""Recordings as drivers and faulty robots make them: is the path right, or does a line say why not?
+
+    python benchmarks/recordings.py
+    python benchmarks/recordings.py --only intensities --pairs 0
+
+A robot drives a winding path of 3 to 9 s through a furnished room, at up to 1.6 rad/s. Each recording is a ROS 2 bag
+after the documentation of a driver, as in `tests/sources/test_drivers.py`, or has a fault that users report. It is read
+as `fcslam map` does. The error is that of the positions at all scans after a rigid alignment.
+
+- right: the error is at most 0.02 m.
+- said: the error is larger, and a line says what is wrong.
+- refused: no map is made, and a line says why.
+- wrong: the error is larger, and nothing is said.
+
+Clouds of 16 rings come at 10 Hz from a scanner that turns while the robot does. Pairs: two simulated robots in one
+building (60 m each), each with a scanner of 450 beams, 12 m and 2 cm noise, measured at once or one after the other.
+"""
+
+# ruff: noqa: ARG005  all changes have the same arguments
+
+import math
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import common
+import numpy as np
+from robustness import Recording
+
+from fcslam.geometry import se2
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.metrics.trajectory import align
+from fcslam.mission.mission import MissionConfig, run_mission
+
+sys.path.insert(0, str(common.REPOSITORY))
+from tests.sources import clouds as made
+from tests.sources import test_drivers as drivers
+from tests.sources.bag_messages import odom, quaternion, save, tf
+from tests.sources.test_drivers import START, Scanner, pose_at, times
+
+RIGHT_M = 0.02
+JOINED_M = 0.5
+"""Largest error of the positions in a joint map that is not falsely joined."""
+COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
+COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}
+CLOUD_COLUMNS = {"drive": "", "scans": "", "ATE (RMSE), m": ".4f"}
+PAIR_COLUMNS = {"beams": "", "seed": "", "maps": ".0f", "closures": ".0f", "ATE in one map, m": ".3f", "outcome": ""}
+MOUNTING = (0.1, 0.0, 0.4)
+YAW = 0.4
+"""Of the 3D LiDAR."""
+VELODYNE = times("f4", name="time")
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--only", default="", help="part of the names of the recordings")
+    parser.add_argument("--pairs", type=int, default=20, help="simulated pairs of each scanner")
+    chosen = parser.parse_args()
+    report = common.Report(__file__, __doc__, chosen)
+    rows = [row(*each) for each in recordings() if chosen.only in each[1]]
+    kinds = dict.fromkeys(kind for kind, *_ in rows)
+    counts = {kind: [outcome for its, _, _, outcome, _ in rows if its == kind] for kind in kinds}
+    report.table(
+        "Outcomes", COUNTS, [(kind, len(all_), *map(all_.count, list(COUNTS)[2:])) for kind, all_ in counts.items()]
+    )
+    report.table("Recordings", COLUMNS, rows)
+    if not chosen.only:
+        report.table(
+            "Clouds of 16 rings", CLOUD_COLUMNS, [rings(*each) for each in ((False, 0.0), (True, 0.0), (False, 6.0))]
+        )
+    if chosen.pairs:
+        pairs = [pair(spin, seed) for spin in (None, -1) for seed in range(chosen.pairs)]
+        report.table("Two robots with low-cost scanners", PAIR_COLUMNS, pairs)
+    report.write()
+
+
+def row(kind: str, name: str, messages: Iterable) -> tuple:
+    with TemporaryDirectory() as folder:
+        said, error_m = drivers.outcome(save(Path(folder) / "run.mcap", messages))
+        said = said.replace(folder + "/run.mcap: ", "")
+    if error_m is None:
+        return kind, name, math.nan, "refused", said
+    is_said = any(word in said for word in ("contradict", "not corrected", "have no times", "was lost"))
+    return kind, name, error_m, "right" if error_m <= RIGHT_M else "said" if is_said else "wrong", said or "-"
+
+
+def recordings() -> Iterator[tuple[str, str, Iterable]]:
+    """Kind, name and messages of each."""
+    yield from (("driver", name, drivers.recording(its)) for name, its in drivers.SCANNERS.items())
+    for name, its in drivers.CLOUDS.items():
+        yield "driver of a 3D LiDAR", name, [*drivers.readings(3.0), *drivers.clouds_of(its)]
+    yield from (("robot", name, make()) for name, (make, _) in drivers.ROBOTS.items())
+    yield from (("ranges", name, with_ranges(change)) for name, change in RANGES.items())
+    yield from (("odometry", name, with_odometry(change)) for name, change in ODOMETRY.items())
+    for turned_deg, roll_rad in ((90, 0.0), (180, 0.0), (-45, 0.0), (0, math.pi), (90, math.pi)):
+        name = f"turned by {turned_deg} deg" + ", upside down" * bool(roll_rad)
+        yield "mounting", name, mounted(quaternion(math.radians(turned_deg), roll_rad))
+        yield "mounting of a 3D LiDAR", name, with_clouds(quaternion(YAW + math.radians(turned_deg), roll_rad))
+    yield from (("cloud", name, with_clouds(**change)) for name, change in CLOUDS.items())
+
+
+def noise(number: int, scale: float, count: int):
+    return np.random.default_rng(number).normal(0.0, scale, count)
+
+
+RANGES = {
+    "intensities, whole": lambda k, r: np.round(60.0 / np.maximum(r, 0.3) + noise(k, 1.0, len(r))),
+    "intensities of 8 bits": lambda k, r: np.clip(np.round(200.0 - 10.0 * r + noise(k, 5.0, len(r))), 0, 255),
+    "intensities of 12 bits": lambda k, r: np.round(4000.0 / np.maximum(r, 0.5) + noise(k, 20.0, len(r))),
+    "intensities, fractions": lambda k, r: np.clip(1.0 - r / 12.0 + noise(k, 0.03, len(r)), 0.0, 1.0),
+    "intensities of surfaces": lambda k, r: 2.0 + 1.5 * np.sin(7.0 * r) + noise(k, 0.1, len(r)),
+    "intensities by the square of the distance": lambda k, r: 12.0 / np.maximum(r, 0.5) ** 2,
+    "quality of the returns": lambda k, r: np.clip(np.round(15.0 + noise(k, 3.0, len(r))), 0, 63),
+    "noise": lambda k, r: np.random.default_rng(k).uniform(0.2, 8.0, len(r)),
+    "squares of ranges": lambda k, r: r**2,
+    "two way distances": lambda k, r: 2.0 * r,
+    "whole metres": lambda k, r: np.floor(r),
+    "beams in another order": lambda k, r: r[np.random.default_rng(0).permutation(len(r))],
+    "beams in the opposite order": lambda k, r: r[::-1],
+    "beams that begin elsewhere": lambda k, r: np.roll(r, 60),
+    "every beam twice": lambda k, r: np.repeat(r[::2], 2),
+    "one scan for ever": lambda k, r: 2.0 + np.sin(np.arange(len(r)) / 20.0),
+    "centimetres": lambda k, r: np.round(100.0 * r),
+    "kilometres": lambda k, r: r / 1000.0,
+    "half of the beams 0": lambda k, r: np.where(np.arange(len(r)) % 2, r, 0.0),
+    "a placeholder in a third of the beams": lambda k, r: np.where(noise(k, 1.0, len(r)) > 0.43, 4.0, r),
+    "a cable before the laser": lambda k, r: np.where(np.abs(np.arange(len(r)) - 200) < 12, 0.18, r),
+}
+
+
+def with_ranges(change) -> Iterator:
+    number = 0
+    for each in drivers.recording(Scanner()):
+        if each.topic == "/scan":
+            number += 1
+            ranges = change(number, np.array(each.fields["ranges"], float))
+            yield each._replace(fields={**each.fields, "ranges": ranges})
+        else:
+            yield each
+
+
+ODOMETRY = {
+    "heading in degrees": lambda t, x, y, a: (x, y, math.degrees(a)),
+    "heading of the other sign": lambda t, x, y, a: (x, y, -a),
+    "heading never set": lambda t, x, y, a: (x, y, 0.0),
+    "position never set": lambda t, x, y, a: (0.0, 0.0, a),
+    "never set": lambda t, x, y, a: (0.0, 0.0, 0.0),
+    "turns of wheels of another distance": lambda t, x, y, a: (x, y, 1.3 * a),
+    "y of the other sign": lambda t, x, y, a: (x, -y, a),
+    "x and y swapped": lambda t, x, y, a: (y, x, a),
+    "backwards": lambda t, x, y, a: (-x, -y, a),
+    "inverse pose": lambda t, x, y, a: tuple(se2.inverse(np.array((x, y, a)))),
+    "half the distance": lambda t, x, y, a: (0.5 * x, 0.5 * y, a),
+    "centimetres": lambda t, x, y, a: (100.0 * x, 100.0 * y, a),
+    "of another robot": lambda t, x, y, a: (0.3 * t, 0.0, 0.4 * math.sin(t)),
+    "two publishers that begin elsewhere": lambda t, x, y, a: (x + 5.0 * (round(t / 0.08) % 2), y, a),
+    "reset after 4 s": lambda t, x, y, a: tuple(se2.between(pose_at(4.0 * (t > 4.0)), np.array((x, y, a)))),
+    "in steps of 0.5 s": lambda t, x, y, a: tuple(pose_at(0.5 * math.floor(2.0 * t))),
+    "NaN at times": lambda t, x, y, a: (math.nan if round(t / 0.08) % 7 == 0 else x, y, a),
+}
+
+
+def with_odometry(change) -> Iterator:
+    for each in drivers.recording(Scanner()):
+        if each.topic == "/odom":
+            t = each.fields["stamp"] - START
+            yield odom(START + t, change(t, *pose_at(t).tolist()), bag_time=each.bag_time)
+        else:
+            yield each
+
+
+def mounted(rotation) -> Iterator:
+    """A laser that tf has so, though it is level and looks ahead."""
+    yield tf(START, "base_link", "laser", (0.12, 0.0, 0.2), rotation, topic="/tf_static")
+    yield from (each for each in drivers.recording(Scanner()) if each.topic != "/tf_static")
+
+
+def with_clouds(
+    rotation=None, layout=VELODYNE, count=60, change=lambda message: message, holes=0.0, height=1, **fields
+) -> Iterator:
+    yield tf(START, "base_link", "lidar", MOUNTING, rotation or quaternion(YAW), topic="/tf_static")
+    yield from drivers.readings(0.1 * count)
+    for number in range(count):
+        begin = 0.1 * number
+        turn = cloud_at(begin, 4, 360)
+        turn.points[::50] *= holes
+        message = made.cloud(START + begin, turn, layout, height=height, **fields)
+        yield made.said("/points", START + begin, change(message))
+
+
+def cloud_at(begin: float, count: int, columns: int, clockwise: bool = True) -> made.Measured:
+    return made.spinning(
+        lambda t: pose_at(begin + t), MOUNTING, made.rotation(yaw=YAW), count, columns, clockwise, math.pi
+    )
+
+
+def swapped(message):
+    size = message.point_step
+    rows = np.array(message.data).reshape(-1, size)
+    message.data = rows.reshape(len(rows), size // 4, 4)[:, :, ::-1].reshape(-1)
+    message.is_bigendian = True
+    return message
+
+
+def padded(message):
+    rows = np.array(message.data).reshape(message.height, -1)
+    message.data = np.pad(rows, ((0, 0), (0, 40))).reshape(-1)
+    message.row_step = rows.shape[1] + 40
+    return message
+
+
+CLOUDS = {
+    "big-endian": {"change": swapped},
+    "rows with padding": {"height": 4, "change": padded},
+    "row_step 0": {"row_step": 0},
+    "NaN in an organised cloud": {"height": 4, "holes": math.nan},
+    "doubles": {"layout": (32, made.xyz("f8"))},
+    "other order of fields": {
+        "layout": (
+            64,
+            [(name, "f4", at, value) for (name, _, _, value), at in zip(made.xyz(), (40, 12, 24), strict=True)],
+        )
+    },
+    "times that are all 0": {"layout": times("u4", 0.0, name="t")},
+    "millimetres": {"layout": (16, [(n, "f4", at, lambda m, v=v: 1000.0 * v(m)) for n, _, at, v in made.xyz()])},
+    "whole millimetres": {"layout": (16, [(n, "i2", at, lambda m, v=v: 1000.0 * v(m)) for n, _, at, v in made.xyz()])},
+    "no return": {"layout": (16, [(n, "f4", at, lambda m, v=v: np.nan * v(m)) for n, _, at, v in made.xyz()])},
+    "axes of a camera in an upright frame": {"layout": (16, [(n, k, (at + 4) % 12, v) for n, k, at, v in made.xyz()])},
+    "4 s": {"count": 40},
+}
+
+
+def rings(clockwise: bool, pitch_deg: float) -> tuple:
+    """A drive of 14 s; the sensor leans by ``pitch_deg`` as tf says."""
+    R = made.rotation(pitch=math.radians(pitch_deg), yaw=YAW)
+    messages = [
+        tf(START, "base_link", "lidar", MOUNTING, quaternion(YAW, 0.0, math.radians(pitch_deg)), topic="/tf_static")
+    ]
+    messages += drivers.readings(14.0)
+    for begin in np.arange(0.0, 14.0, 0.1).tolist():
+        turn = made.spinning(lambda t, begin=begin: pose_at(begin + t), MOUNTING, R, 16, 900, clockwise)
+        messages.append(made.said("/points", START + begin, made.cloud(START + begin, turn, VELODYNE)))
+    with TemporaryDirectory() as folder:
+        _, error_m = drivers.outcome(save(Path(folder) / "run.mcap", messages))
+    return f"{'clockwise' if clockwise else 'counter-clockwise'}, leaning by {pitch_deg:g} deg", 140, error_m
+
+
+def pair(spin: int | None, seed: int) -> tuple:
+    """Two simulated robots in one building."""
+    lidar = LidarSettings(beams=450, rate_hz=7.0, range_noise_m=0.02, spin=spin)
+    fleet = simulate_fleet(SimulationSettings(robots=2, path_length_m=60.0, camera=None, lidar=lidar), seed)
+    run = run_mission([Recording(robot.name, list(robot.scans())) for robot in fleet.robots], MissionConfig())
+    maps = run.metrics["maps"].value
+    found = np.vstack([run.trajectories[robot.name].T_map_base for robot in fleet.robots])
+    truth = np.vstack([robot.T_building_base for robot in fleet.robots])
+    error_m = math.nan
+    if maps == 1:
+        off = se2.compose(align(truth, found), found) - truth
+        error_m = float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
+    outcome = "apart" if maps > 1 else "joined" if error_m < JOINED_M else "falsely joined"
+    closures = run.metrics["inter_robot_closures_accepted"].value
+    return "at once" if spin is None else "one after the other", seed, maps, closures, error_m, outcome
+
+
+if __name__ == "__main__":
+    main()
