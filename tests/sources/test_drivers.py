@@ -111,7 +111,7 @@ def outcome(path, options=None):
         frontend = RobotFrontend("r", RobotConfig())
         for record in source.records():
             frontend.process(record)
-        notes = " ".join(source.survey().notes)
+        said = " ".join(source.survey().notes) + f" {source.faults}" * bool(source.faults)
     except SourceError as error:
         return str(error), None
     frontend.finish()
@@ -120,7 +120,7 @@ def outcome(path, options=None):
         true, estimated = pose_at(np.array(track.stamps) - START), track.T_odom_base()
         off.append(se2.compose(align(true, estimated), estimated)[:, :2] - true[:, :2])
     lost = " the robot was lost" * (len(off) > 1)
-    return notes + lost, float(np.sqrt(np.mean(np.sum(np.vstack(off) ** 2, axis=1))))
+    return said + lost, float(np.sqrt(np.mean(np.sum(np.vstack(off) ** 2, axis=1))))
 
 
 MILLIMETRES, INCHES = "they seem to be millimetres", "inches: by 39.37"
