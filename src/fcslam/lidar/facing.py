@@ -59,7 +59,7 @@ SIGMAS: Final = 5.0
 """Least ratio of the gain to its standard deviation."""
 CLEAR_LEAD, CLEAR_AGREEMENT = 0.15, 0.75
 """A mounting with this agreement and gain is certain, too: a short drive has too few pairs for the deviation."""
-NO_AGREEMENT: Final = 0.35
+NO_AGREEMENT: Final = 0.4
 """Scans agree less with the stated mounting only if something is wrong."""
 ENOUGH_PAIRS: Final = 10
 """Pairs with which that is certain, although no other mounting is."""
