@@ -143,10 +143,26 @@ def test_a_tilted_laser(tmp_path):
     assert open_source(bag, BagOptions(laser_poses=((0.0, 0.0, 0.0),))).survey().scan_count == 20
 
 
-def test_clocks_that_differ(tmp_path):
-    said = [message._replace(fields={**message.fields, "stamp": message.fields["stamp"] + 5e8})
-            if message.topic == "/scan" else message for message in drive(20)]  # fmt: skip
-    message = refusal(save(tmp_path / "run.bag", said))
+def later(said, topic, by_s, recorded_s=0.0):
+    """The messages of a topic by another clock, and recorded as if it were right."""
+    for each in said:
+        stamp = each.fields["stamp"] + (by_s if each.topic == topic else 0.0)
+        bag_time = each.bag_time + (recorded_s if each.topic == topic else 0.0)
+        yield each._replace(fields={**each.fields, "stamp": stamp}, bag_time=bag_time)
+
+
+@pytest.mark.parametrize("by_s", [5e8, 3.0, -50.0])
+def test_clocks_that_differ_are_those_of_the_recording(tmp_path, by_s):
+    usual = scans_of(open_source(save(tmp_path / "usual.bag", drive(20))))
+    source = open_source(save(tmp_path / "run.bag", later(drive(20), "/scan", by_s)))
+    for expected, found in zip(usual, scans_of(source), strict=True):
+        assert found.stamp == pytest.approx(expected.stamp + by_s, abs=1e-6)
+        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=0.03)
+    assert any("by the times of recording; corrected" in note for note in source.survey().notes)
+
+
+def test_clocks_that_differ_also_in_the_times_of_recording(tmp_path):
+    message = refusal(save(tmp_path / "run.bag", later(drive(20), "/scan", 5e8, 5e8)))
     assert "20 of 20 scans in /scan have no odometry" in message
     assert "500000100.050 s, /odom goes from 99.900 s to 104.000 s" in message
 

@@ -367,7 +367,7 @@ ROBOTS = {
     "turtlebot4: odometry in tf": (in_tf, ""),
     "micro-ROS: no stamps": (unstamped, ""),
     "micro-ROS: a clock of its own": (lambda: late(0.25), "the clock of the odometry is 250 ms ahead"),
-    "micro-ROS: a clock since boot": (lambda: late(-START), "have no odometry within 1 s"),
+    "micro-ROS: a clock since boot": (lambda: late(-START), "by the times of recording; corrected"),
     "namespace": (namespaced, ""),
     "frames with a slash": (slashed, ""),
     "wheels of another radius": (scaled, "the robot's distance is 1.2"),

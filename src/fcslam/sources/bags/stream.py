@@ -6,6 +6,7 @@ from functools import cached_property
 from itertools import islice
 from math import degrees, tau
 from pathlib import Path
+from statistics import quantiles
 from typing import NamedTuple
 
 from fcslam.config import one_line
@@ -49,6 +50,9 @@ _IMAGES_TRIED = 5
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
 _READINGS_TRIED = 20
+_FEWEST_LAGS = 4
+_LARGEST_DELAY_S = 2.0
+"""Messages of one clock are recorded within this time of each other's delay."""
 
 
 class RecordedLaser(NamedTuple):
@@ -292,7 +296,42 @@ class BagStream:
 
     def _in_time(self, reading: OdometryReading) -> OdometryReading:
         """The reading with its stamp by the clock of the scans."""
-        return reading._replace(stamp=reading.stamp - self._options.correction.odometry_delay_s)
+        ahead_s = self._clock_ahead_s + self._options.correction.odometry_delay_s
+        return reading._replace(stamp=reading.stamp - ahead_s)
+
+    @cached_property
+    def _clock_ahead_s(self) -> float:
+        """The clock of the odometry against that of the scans by the times of recording; 0 if they are alike."""
+        if self.odometry is None:
+            return 0.0
+        found = []
+        for topics in (self.topics.scans[:1], self.odometry.topics):
+            lags_s: list[float] = []
+            for message in islice(self.bag.messages(list(topics)), _READINGS_TRIED):
+                with suppress(ValueError):
+                    lags_s += [message.bag_time_ns / 1e9 - stamp for stamp in self._ends_in(message)]
+            if len(lags_s) < _FEWEST_LAGS:
+                return 0.0
+            low_s, middle_s, high_s = quantiles(lags_s, n=4)
+            if high_s - low_s > _LARGEST_DELAY_S:
+                return 0.0
+            found.append(middle_s)
+        ahead_s = found[0] - found[1]
+        if abs(ahead_s) < _LARGEST_DELAY_S:
+            return 0.0
+        self.odometry_notes.append(
+            f"{self.path}: the clock of {self.odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the times "
+            "of recording; corrected"
+        )
+        return ahead_s
+
+    def _ends_in(self, message: RawMessage) -> list[float]:
+        """When a message of scans or odometry was complete, by its stamps; raises ValueError if it is invalid."""
+        if message.topic in self.topics.scans:
+            return [self._scan_in(message).end]
+        if message.topic.type == ODOMETRY:
+            return [odometry_of(self.bag.decode(message), message.bag_time_ns).stamp]
+        return [each.stamp for each in self.odometry.readings_in(self._transforms_in(message))] if self.odometry else []
 
     def _corrected(self, scan: ScanMessage) -> ScanMessage:
         """The scan with the times of its beams as they were found."""
