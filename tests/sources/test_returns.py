@@ -73,6 +73,11 @@ def test_other_units_in_a_log_are_refused(tmp_path, factor, unit):
     assert "only 0.0% of the beams measure a range (0 m to 50 m)" in refusal(save_log(tmp_path / "no.log", nothing))
 
 
+def test_a_range_max_below_most_ranges_is_refused(tmp_path):
+    message = refusal(bag(tmp_path / "run.bag", range_max=1.0))
+    assert "beyond the range_max of 1 m" in message
+
+
 @pytest.mark.parametrize("strength", [9.0, 60.0, 900.0])
 def test_intensities_in_place_of_ranges_are_refused(tmp_path, strength):
     """A return is weaker from afar, and its intensity is a whole number."""

@@ -320,8 +320,8 @@ class BagStream:
         if abs(ahead_s) < _LARGEST_DELAY_S:
             return 0.0
         self.odometry_notes.append(
-            f"{self.path}: the clock of {self.odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the times "
-            "of recording; corrected"
+            f"{self.path}: the clock of {self.odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the "
+            "times of recording; corrected"
         )
         return ahead_s
 
