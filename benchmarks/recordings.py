@@ -1,7 +1,7 @@
 """Recordings as drivers and faulty robots make them: is the path right, or does a line say why not?
 
     python benchmarks/recordings.py
-    python benchmarks/recordings.py --only intensities --pairs 0
+    python benchmarks/recordings.py --only intensities
 
 A robot drives a winding path of 3 to 9 s through a furnished room, at up to 1.6 rad/s. Each recording is a ROS 2 bag
 after the documentation of a driver, as in `tests/sources/test_drivers.py`, or has a fault that users report. It is read
@@ -12,8 +12,7 @@ as `fcslam map` does. The error is that of the positions at all scans after a ri
 - refused: no map is made, and a line says why.
 - wrong: the error is larger, and nothing is said.
 
-Clouds of 16 rings come at 10 Hz from a scanner that turns while the robot does. Pairs: two simulated robots in one
-building (60 m each), each with a scanner of 450 beams, 12 m and 2 cm noise, measured at once or one after the other.
+Clouds of 16 rings come at 10 Hz from a scanner that turns while the robot does.
 """
 
 # ruff: noqa: ARG005  all changes have the same arguments
@@ -26,13 +25,8 @@ from tempfile import TemporaryDirectory
 
 import common
 import numpy as np
-from robustness import Recording
 
 from fcslam.geometry import se2
-from fcslam.lab.simulation.noise import LidarSettings
-from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
-from fcslam.metrics.trajectory import align
-from fcslam.mission.mission import MissionConfig, run_mission
 
 sys.path.insert(0, str(common.REPOSITORY))
 from tests.sources import clouds as made
@@ -43,12 +37,9 @@ from tests.sources.test_drivers import START, Scanner, pose_at, times
 RIGHT_M = 0.02
 SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still"
 """Parts of the lines that say what is wrong."""
-JOINED_M = 0.5
-"""Largest error of the positions in a joint map that is not falsely joined."""
 COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
 COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}
 CLOUD_COLUMNS = {"drive": "", "scans": "", "ATE (RMSE), m": ".4f"}
-PAIR_COLUMNS = {"beams": "", "seed": "", "maps": ".0f", "closures": ".0f", "ATE in one map, m": ".3f", "outcome": ""}
 MOUNTING = (0.1, 0.0, 0.4)
 YAW = 0.4
 """Of the 3D LiDAR."""
@@ -58,7 +49,6 @@ VELODYNE = times("f4", name="time")
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--only", default="", help="part of the names of the recordings")
-    parser.add_argument("--pairs", type=int, default=20, help="simulated pairs of each scanner")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     rows = [row(*each) for each in recordings() if chosen.only in each[1]]
@@ -72,9 +62,6 @@ def main() -> None:
         report.table(
             "Clouds of 16 rings", CLOUD_COLUMNS, [rings(*each) for each in ((False, 0.0), (True, 0.0), (False, 6.0))]
         )
-    if chosen.pairs:
-        pairs = [pair(spin, seed) for spin in (0, -1) for seed in range(chosen.pairs)]
-        report.table("Two robots with low-cost scanners", PAIR_COLUMNS, pairs)
     report.write()
 
 
@@ -257,23 +244,6 @@ def rings(clockwise: bool, pitch_deg: float) -> tuple:
     with TemporaryDirectory() as folder:
         _, error_m = drivers.outcome(save(Path(folder) / "run.mcap", messages))
     return f"{'clockwise' if clockwise else 'counter-clockwise'}, leaning by {pitch_deg:g} deg", 140, error_m
-
-
-def pair(spin: int, seed: int) -> tuple:
-    """Two simulated robots in one building."""
-    lidar = LidarSettings(beams=450, rate_hz=7.0, range_noise_m=0.02, spin=spin)
-    fleet = simulate_fleet(SimulationSettings(robots=2, path_length_m=60.0, camera=None, lidar=lidar), seed)
-    run = run_mission([Recording(robot.name, list(robot.scans())) for robot in fleet.robots], MissionConfig())
-    maps = run.metrics["maps"].value
-    found = np.vstack([run.trajectories[robot.name].T_map_base for robot in fleet.robots])
-    truth = np.vstack([robot.T_building_base for robot in fleet.robots])
-    error_m = math.nan
-    if maps == 1:
-        off = se2.compose(align(truth, found), found) - truth
-        error_m = float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
-    outcome = "apart" if maps > 1 else "joined" if error_m < JOINED_M else "falsely joined"
-    closures = run.metrics["inter_robot_closures_accepted"].value
-    return "one after the other" if spin else "at once", seed, maps, closures, error_m, outcome
 
 
 if __name__ == "__main__":
