@@ -2,9 +2,9 @@
 
     python benchmarks/low_cost_pairs.py
 
-Two simulated robots start anywhere in one building of each seed and drive 40 m each. The scanner has 450 beams, 12 m and
-2 cm noise at 7 Hz; its beams are measured at once, or one after the other while the robot moves. Joined: one map, and the
-error of both paths together after one rigid alignment is below 0.5 m.
+Two simulated robots start anywhere in one building of each seed and drive 40 m each. The scanner has 450 beams, 12 m
+and 2 cm noise at 7 Hz; its beams are measured at once, or one after the other while the robot moves. Joined: one map,
+and the error of both paths together after one rigid alignment is below 0.5 m.
 """
 
 import math
