@@ -23,6 +23,8 @@ def test_the_text_says_what_is_in_it_and_that_it_can_be_mapped(bag, capsys):
     assert lines[0] == f"{bag}: ROS bag"
     assert "  /scan: sensor_msgs/LaserScan, 40 messages, 5.0 Hz, frame laser" in lines
     assert "transforms: base_link -> laser" in lines
+    assert "robot: run1" in lines
+    assert "odometry: 82 readings of /odom at 10.5 Hz" in lines
     assert any(line.startswith("laser 0: 40 scans at 5.0 Hz, 8 beams from -90.0 to 67.5 degrees") for line in lines)
     assert lines[-1] == "can be mapped"
     assert err == ""

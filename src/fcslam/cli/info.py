@@ -118,9 +118,11 @@ def _lines(found: "Inspection") -> "Iterator[str]":
     if found.problem is not None:
         yield f"cannot be mapped: {found.problem}"
         return
+    yield f"robot: {found.robot}"
     yield f"{found.scans} scans in {found.duration_s:.1f} s, path of {found.path_length_m:.1f} m by odometry"
     if found.odometry_from is not None:
-        yield f"odometry: {found.odometry} readings of {found.odometry_from}"
+        rate = f" at {found.odometry / found.duration_s:.1f} Hz" if found.duration_s > 0.0 else ""
+        yield f"odometry: {found.odometry} readings of {found.odometry_from}{rate}"
     for number, laser in enumerate(found.lasers):
         yield f"laser {number}: {_laser(laser)}"
     if found.camera is not None:

@@ -45,6 +45,8 @@ class Inspection:
     format: str
     bag: BagContents | None
     """None for other formats."""
+    robot: str = ""
+    """Name of its robot; empty if it cannot be mapped or has several."""
     scans: int = 0
     duration_s: float = 0.0
     path_length_m: float = 0.0
@@ -116,7 +118,7 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
     steps_s = np.diff(np.array(stamps))
     back_s = -steps_s[steps_s < 0.0]
     return Inspection(
-        path, name, bag, len(stamps), survey.duration_s, survey.path_length_m,
+        path, name, bag, source.name, len(stamps), survey.duration_s, survey.path_length_m,
         tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in by_laser),
         odometry, origin.name if origin else None, survey.camera, images, _gaps(stamps), len(back_s),
         float(back_s.max(initial=0.0)), str(source.faults) if source.faults else "", survey.notes,
