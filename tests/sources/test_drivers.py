@@ -281,6 +281,13 @@ def in_tf():
     yield tf(START, "base_footprint", "base_link", topic="/tf_static")
 
 
+def never_set():
+    """A topic of odometry that never moves, beside the tf of the same robot."""
+    yield from in_tf()
+    yield from (each._replace(fields={**each.fields, "at": (0.0, 0.0, 0.0), "rotation": quaternion(0.0),
+                                      "child": "base_footprint"}) for each in readings(9.0))  # fmt: skip
+
+
 def unstamped():
     """A microcontroller without a clock: all stamps are 0."""
     for each in recording(LASER._replace(turns_s=None)):
@@ -365,6 +372,7 @@ def packed_depth():
 
 ROBOTS = {
     "turtlebot4: odometry in tf": (in_tf, ""),
+    "odometry that is set in tf only": (never_set, "/odom never changes"),
     "micro-ROS: no stamps": (unstamped, ""),
     "micro-ROS: a clock of its own": (lambda: late(0.25), "the clock of the odometry is 250 ms ahead"),
     "micro-ROS: a clock since boot": (lambda: late(-START), "by the times of recording; corrected"),
