@@ -375,7 +375,7 @@ ROBOTS = {
     "odometry that is set in tf only": (never_set, "/odom never changes"),
     "micro-ROS: no stamps": (unstamped, ""),
     "micro-ROS: a clock of its own": (lambda: late(0.25), "the clock of the odometry is 250 ms ahead"),
-    "micro-ROS: a clock since boot": (lambda: late(-START), "by the times of recording; corrected"),
+    "micro-ROS: a clock since boot": (lambda: late(5.0 - START), "by the times of recording; corrected"),
     "namespace": (namespaced, ""),
     "frames with a slash": (slashed, ""),
     "wheels of another radius": (scaled, "the robot's distance is 1.2"),
