@@ -168,15 +168,17 @@ def _marginal(information: csc_array, wanted: NDArray[np.int64]) -> FloatArray:
     return 0.5 * (inverse + inverse.T)
 
 
-def relative_error(poses: FloatArray, covariance: FloatArray, within_m: float) -> FloatArray:
+def relative_error(
+    poses: FloatArray, covariance: FloatArray, within_m: float, wanted: NDArray[np.int64] | None = None
+) -> FloatArray:
     """Root mean square error of the positions within a distance of each place as seen from it, shape (P,), metres.
 
-    Of a place without any so near, that of the nearest one.
+    Of a place without any so near, that of the nearest one. Places that are not ``wanted`` have the smallest error.
     """
     result = np.full(len(poses), FLOOR_M)
     blocks = covariance.reshape(len(poses), 3, len(poses), 3).transpose(0, 2, 1, 3)
     tree = cKDTree(poses[:, :2])
-    for k in range(len(poses)):
+    for k in range(len(poses)) if wanted is None else wanted:
         others = np.array(tree.query_ball_point(poses[k, :2], within_m), np.int64)
         near = np.sort(others[others != k])
         if not len(near) and len(poses) > 1:
@@ -311,7 +313,8 @@ def _drives(
             continue
         length_m = float(np.hypot(*(places.poses[a, :2] - places.poses[b, :2])))
         updated = _with_motion(places, a, b, AGAIN_M + AGAIN_PER_M * length_m)
-        gain = int(weight[(QUANTILE * relative_error(places.poses, updated, within_m) <= bar_m) & ~is_good].sum())
+        after = relative_error(places.poses, updated, within_m, bad)
+        gain = int(weight[bad[QUANTILE * after[bad] <= bar_m]].sum())
         if gain:
             ends = [[round(float(value), 1) for value in places.poses[k, :2]] for k in (a, b)]
             found.append({
