@@ -101,7 +101,7 @@ def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotC
         robot.process(record)
     robot.finish()
     settings = RobotLearningSettings(held_out=HeldOutSettings(every=HELD_OUT))
-    examples = own_examples(keyframes, settings, (), 0)
+    examples = own_examples(keyframes, settings)
     noise = seeded_noise(source.name, config.seed)
     return RobotClient(
         source.name, keyframes, folder / "cache", noise, revisits=examples.revisits, held_out=examples.held_out
