@@ -65,9 +65,8 @@ from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSett
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
-from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.flower import InProcessGrid
 from fcslam.learning.federated.held_out import PlacePoints
 from fcslam.learning.federated.held_out import inliers as place_inliers
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
@@ -377,10 +376,7 @@ def federated(
         evaluate_fn=lambda _weights: {},  # without metrics the last version counts, as in the other arms
         on_round=lambda row, _best: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
     )
-    grid = InProcessGrid(
-        build_client_app(lambda context: clients[int(context.node_config["partition-id"])]), len(clients)
-    )
-    state = Coordinator(grid, settings, start, folder / "rounds", hooks).run()
+    state = Coordinator(in_process_grid(clients), settings, start, folder / "rounds", hooks).run()
     return weights_to_network(state.average, settings.training.encoder)
 
 

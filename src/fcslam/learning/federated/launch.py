@@ -89,4 +89,4 @@ def join(link: RobotLink, client: RobotClient, on_notice: OnNotice) -> None:
         CloudError: the server's certificate is not trusted.
     """
     with link:
-        serve_requests(link, build_client_app(lambda _context: client), robot_context(), on_notice)
+        serve_requests(link, build_client_app(client), robot_context(), on_notice)

@@ -116,7 +116,7 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, idle: threadi
         TrainingError: the server does not accept the robot.
         CloudError: the server's address or certificate cannot be used.
     """
-    app, context = build_client_app(lambda _context: client), robot_context()
+    app, context = build_client_app(client), robot_context()
     told = ""
 
     def notice(line: str) -> None:
