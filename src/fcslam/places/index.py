@@ -33,9 +33,8 @@ class PlaceIndex(Generic[PlaceId]):
     order of arrival, from 0, as in Algorithm 1 of FC-SLAM.
     """
 
-    def __init__(self, config: VocabularyConfig, rng: np.random.Generator, descriptor_version: str = "") -> None:
+    def __init__(self, config: VocabularyConfig, rng: np.random.Generator) -> None:
         self._config = config
-        self._descriptor_version = descriptor_version
         self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
         self._postings = self._no_postings()
         self._buffers = empty_buffers(0)
@@ -196,7 +195,7 @@ class PlaceIndex(Generic[PlaceId]):
         """Algorithm 1, line 11: train V_t and describe all stored places in its words."""
         stored = self._postings.gather(self._rows())
         self._vocabulary.train(codes)
-        self._training = Training(places, len(codes), self._descriptor_version)
+        self._training = Training(places, len(codes))
         self._describe_again(stored)
         if self._config.strategy is Strategy.INCREMENTAL:
             self._split(np.flatnonzero(self._postings.entries.sizes > self._config.leaf_capacity))
