@@ -5,7 +5,7 @@
 Simulated fleets of three robots, 45 m each, by day, in the evening and with a third of the lamps off; half of the
 furniture moves before the second and the third robot. In the training buildings three more robots drive later, in the
 same three kinds of light, among other furniture. Each training fleet is mapped by camera places alone, and all examples
-come from estimated poses (`learning/revisits.py`, `cloud/teaching.py`). True poses serve the evaluation only.
+come from estimated poses (`learning/revisits.py`). True poses serve the evaluation only.
 
 All networks start from the bundled one. Robots train the layers of the codes (`learning/code_training.py`), on pairs of
 their own keyframes that show the same points of their map; in one arm also those of the keypoints. Federated arms have
@@ -15,8 +15,7 @@ all robots together, and a robot alone as many as one that trains in every round
 - homographies: as many pairs, each of two views of one image under a random homography, federated
 - own map: pairs of each robot's own keyframes, federated
 - keypoints too: that, and keypoints that other views of the robot's map show again or do not
-- closures: as own map, and codes on which places of at least two other keyframes agree, federated
-- poisoned: as closures, but one robot of five sends codes at random and reverses its updates, ten times as long
+- poisoned: as own map, but one robot of five reverses its updates, ten times as long
 - central: pairs of one robot and across robots, whose images are in one place
 - alone: own map, one robot in each of three buildings; each of the networks is measured in every third building
 
@@ -37,7 +36,6 @@ import pickle
 import shutil
 import sys
 import tempfile
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -48,8 +46,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from fcslam.cloud.teaching import HEAD_BYTES, RECORD_BYTES, PlacePoints, teach
-from fcslam.features.codes import Matches, mutual_matches
+from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.lidar_depth import LidarView
@@ -58,7 +55,7 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import evaluate_homography
 from fcslam.lab.evaluation.detectors.measures import mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.lab.evaluation.federated.mapped_drives import MappedDrive, Tie, map_drives, ties
+from fcslam.lab.evaluation.federated.mapped_drives import MappedDrive, map_drives
 from fcslam.lab.evaluation.federated.poison import PoisonedClient
 from fcslam.lab.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
 from fcslam.lab.evaluation.places.simulated_views import EVERY_M, EVERY_RAD, lidar_overlap
@@ -68,9 +65,10 @@ from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSett
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
-from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.flower import InProcessGrid
+from fcslam.learning.federated.held_out import PlacePoints
+from fcslam.learning.federated.held_out import inliers as place_inliers
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.settings import FederatedSettings
@@ -79,8 +77,8 @@ from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
-from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair, TaughtImage, VotedImage, vote
-from fcslam.learning.revisits import FARTHEST_M, FEWEST_SHARED, Keyframe, predict, revisits_in_map
+from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair, VotedImage, vote
+from fcslam.learning.revisits import Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
@@ -89,8 +87,6 @@ from fcslam.metrics.framing import HomographyGroundTruth
 from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig
-from fcslam.places.hypotheses import rigid_hypotheses
-from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan
 from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import Recording
@@ -109,18 +105,17 @@ PAIRS_A_BUILDING = 120
 """Most pairs of views per building on which keypoint recall is measured."""
 ALONE = 3
 """Robots that train alone; each building of the test measures the network of one of them."""
-ARMS = ("bundled", "homographies", "own map", "keypoints too", "closures", "poisoned", "central", "alone")
+ARMS = ("bundled", "homographies", "own map", "keypoints too", "poisoned", "central", "alone")
 REPEATED = ("own map", "keypoints too")
 """Arms with all training seeds; the others have the first."""
-LATER_DRIVEN = ("bundled", "own map", "keypoints too", "closures")
+LATER_DRIVEN = ("bundled", "own map", "keypoints too")
 """Arms that are also measured on later drives."""
 COMPARED = (
     ("own map", "homographies"),
     ("keypoints too", "own map"),
     ("own map", "alone"),
     ("own map", "central"),
-    ("closures", "own map"),
-    ("poisoned", "closures"),
+    ("poisoned", "own map"),
 )
 """Arms that are compared with one another."""
 UNSEEN, LATER_DRIVES = "unseen buildings", "later drives"
@@ -154,9 +149,6 @@ class Learner:
     """Its images, with its keypoints as labels."""
     pairs: tuple[RevisitPair, ...]
     voted: tuple[VotedImage, ...]
-    taught: tuple[TaughtImage, ...]
-    misled: tuple[TaughtImage, ...]
-    """As ``taught``, if the liar of the building sends codes at random."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +158,6 @@ class Fleet:
     learners: tuple[Learner, ...]
     together: RevisitExamples
     """Images of all robots in one place, with pairs across robots; positions in the fleet's map."""
-    taught_bytes: int
 
 
 def main() -> None:
@@ -219,18 +210,13 @@ def main() -> None:
     report.write()
 
 
-EXAMPLES = {"building": "d", "keyframes": "d", "pairs of one robot": "d", "pairs across robots": "d",
-            "taught images": "d", "taught points": "d", "kB received": ".0f"}  # fmt: skip
+EXAMPLES = {"building": "d", "keyframes": "d", "pairs of one robot": "d", "pairs across robots": "d"}
 
 
 def examples_row(seed: int, fleet: Fleet) -> tuple:
     learners = fleet.learners
-    taught = [image for learner in learners for image in learner.taught]
     own = sum(len(learner.pairs) for learner in learners)
-    return (
-        seed, sum(len(learner.keyframes) for learner in learners), own, len(fleet.together.pairs) - own, len(taught),
-        sum(len(image.points) for image in taught), fleet.taught_bytes / 1e3,
-    )  # fmt: skip
+    return seed, sum(len(learner.keyframes) for learner in learners), own, len(fleet.together.pairs) - own
 
 
 def recorded(seed: int, robots: int, folder: Path) -> Path:
@@ -251,21 +237,18 @@ def fleet_examples(folder: Path, kept: Path) -> Fleet:
     if not file.exists():
         config = MissionConfig(robot=RobotConfig(channels=(Channel.CAMERA,)))
         sources = [Recording(folder / name, name) for name in ROBOTS]
-        drives, run = map_drives(sources, config, OnnxDetector(OnnxConfig()))
-        file.write_bytes(pickle.dumps((drives, list(ties(drives, run)))))
+        file.write_bytes(pickle.dumps(map_drives(sources, config, OnnxDetector(OnnxConfig()))))
     examples = kept / f"examples-{folder.name}-{common.commit()}.pickle"
     if not examples.exists():
-        drives, tied = pickle.loads(file.read_bytes())
-        examples.write_bytes(pickle.dumps(fleet_of(drives, tied)))
+        examples.write_bytes(pickle.dumps(fleet_of(pickle.loads(file.read_bytes()))))
     fleet: Fleet = pickle.loads(examples.read_bytes())
     print(folder.name, examples_row(int(folder.name), fleet), file=sys.stderr, flush=True)
     return fleet
 
 
-def fleet_of(drives: dict[str, MappedDrive], tied: Sequence[Tie]) -> Fleet:
-    """Pairs that each robot finds in its own map, and codes for keyframes that accepted closures connect."""
+def fleet_of(drives: dict[str, MappedDrive]) -> Fleet:
+    """Pairs that each robot finds in its own map, and those of all robots in the fleet's map."""
     learners = []
-    honest, misled = taught_images(drives, tied, None), taught_images(drives, tied, LIAR)
     for name, drive in drives.items():
         frames, poses = drive.keyframes, drive.T_own_base
         found = revisits_in_map(frames, poses)
@@ -276,7 +259,7 @@ def fleet_of(drives: dict[str, MappedDrive], tied: Sequence[Tie]) -> Fleet:
             for f in drive.keyframes
         )
         votes = tuple(each for each in voted if each is not None)
-        learners.append(Learner(name, keyframes, tuple(pairs), votes, tuple(honest[name]), tuple(misled[name])))
+        learners.append(Learner(name, keyframes, tuple(pairs), votes))
     largest = max(np.bincount([drive.map_index for drive in drives.values()]).argmax(), 0)
     joint = [drive for drive in drives.values() if drive.map_index == largest]
     frames = [frame for drive in joint for frame in drive.keyframes]
@@ -284,55 +267,12 @@ def fleet_of(drives: dict[str, MappedDrive], tied: Sequence[Tie]) -> Fleet:
     everything = [
         pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses).pairs
     ]
-    received = sum(HEAD_BYTES + RECORD_BYTES * len(image.points) for name in drives for image in honest[name])
-    return Fleet(tuple(learners), RevisitExamples([frame.image for frame in frames], everything), received)
-
-
-def taught_images(
-    drives: dict[str, MappedDrive], tied: Sequence[Tie], liar: str | None
-) -> dict[str, list[TaughtImage]]:
-    """By robot, the codes that others gave to its points; the liar, if there is one, sends codes at random."""
-    rng = np.random.default_rng(1)
-    sent = {
-        (name, k): points_of(frame, np.zeros(3))
-        for name, drive in drives.items()
-        for k, frame in enumerate(drive.keyframes)
-    }
-    for (name, k), points in sent.items():
-        if name == liar:
-            sent[name, k] = PlacePoints(points.positions, rng.integers(0, 256, points.codes.shape).astype(np.uint8))
-    others_of = defaultdict(list)
-    for tie in tied:
-        if np.hypot(*tie.T_i_j[:2]) <= FARTHEST_M:
-            ends = (tie.robot_i, tie.i), (tie.robot_j, tie.j)
-            others_of[ends[0]].append(moved(sent[ends[1]], tie.T_i_j))
-            others_of[ends[1]].append(moved(sent[ends[0]], se2.inverse(tie.T_i_j)))
-    taught: dict[str, list[TaughtImage]] = {name: [] for name in drives}
-    for (name, k), others in others_of.items():
-        drive = drives[name]
-        frame = drive.keyframes[k]
-        codes = teach(points_of(frame, np.zeros(3)), others)
-        if len(codes.rows) >= FEWEST_SHARED:
-            placed = moved(points_of(frame, np.zeros(3)), drive.T_own_base[k])
-            pixels = frame.features.keypoints_px[frame.placed][codes.rows]
-            taught[name].append(TaughtImage(k, pixels, codes.codes, placed.positions[codes.rows]))
-    return taught
+    return Fleet(tuple(learners), RevisitExamples([frame.image for frame in frames], everything))
 
 
 def ranked(count: int) -> np.ndarray:
     """Qualities (count,) of keypoints that fall with their rank."""
     return np.linspace(1.0, WORST_QUALITY, count, dtype=np.float32)
-
-
-def points_of(frame: Keyframe, T: FloatArray) -> PlacePoints:
-    """What the cloud knows of a keyframe, moved by a pose (3,)."""
-    return moved(PlacePoints(frame.positions[frame.placed], frame.features.descriptors[frame.placed]), T)
-
-
-def moved(points: PlacePoints, T: FloatArray) -> PlacePoints:
-    positions = points.positions.copy()
-    positions[:, :2] = se2.transform(T, positions[:, :2])
-    return PlacePoints(positions, points.codes)
 
 
 def pair_of(
@@ -358,14 +298,12 @@ def homography_pairs(learner: Learner, seed: int) -> RevisitExamples:
     return RevisitExamples(images, pairs)
 
 
-def revisits_of(arm: str, learner: Learner, lied_to: bool, seed: int) -> RevisitExamples:
+def revisits_of(arm: str, learner: Learner, seed: int) -> RevisitExamples:
     """What a robot of the fleet trains on in an arm."""
     if arm == "homographies":
         return homography_pairs(learner, seed)
     images = [example.image for example in learner.keyframes]
-    if arm in ("own map", "keypoints too", "alone"):
-        return RevisitExamples(images, learner.pairs, voted=learner.voted)
-    return RevisitExamples(images, learner.pairs, learner.misled if lied_to else learner.taught)
+    return RevisitExamples(images, learner.pairs, learner.voted)
 
 
 def joined(fleets: Sequence[Fleet]) -> RevisitExamples:
@@ -396,7 +334,7 @@ def trained(
         networks = [trained_here(start, joined(fleets), settings, seed, steps * a_round)]
     elif arm == "alone":
         own = [learners[round(k)][1] for k in np.linspace(0, len(learners) - 1, ALONE)]
-        networks = [trained_here(start, revisits_of(arm, each, False, seed), settings, seed, steps) for each in own]
+        networks = [trained_here(start, revisits_of(arm, each, seed), settings, seed, steps) for each in own]
     else:
         networks = [federated(arm, seed, learners, start, settings, folder)]
     paths = [folder / f"{k}.onnx" for k in range(len(networks))]
@@ -429,21 +367,16 @@ def federated(
     for building, learner in learners:
         name = f"{building}-{learner.robot}"
         (folder / name).mkdir()
-        lied_to = arm == "poisoned" and building in POISONED
         noise = seeded_noise(name, settings.training.seed)
-        client = RobotClient(
-            name, folder / name, folder / name, noise, revisits=revisits_of(arm, learner, lied_to, seed)
-        )
-        clients.append(PoisonedClient(client, "reversed") if lied_to and learner.robot == LIAR else client)
+        client = RobotClient(name, folder / name, folder / name, noise, revisits=revisits_of(arm, learner, seed))
+        is_poisoned = arm == "poisoned" and building in POISONED and learner.robot == LIAR
+        clients.append(PoisonedClient(client, "reversed") if is_poisoned else client)
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
         evaluate_fn=lambda _weights: {},  # without metrics the last version counts, as in the other arms
         on_round=lambda row, _best: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
     )
-    grid = InProcessGrid(
-        build_client_app(lambda context: clients[int(context.node_config["partition-id"])]), len(clients)
-    )
-    state = Coordinator(grid, settings, start, folder / "rounds", hooks).run()
+    state = Coordinator(in_process_grid(clients), settings, start, folder / "rounds", hooks).run()
     return weights_to_network(state.average, settings.training.encoder)
 
 
@@ -561,13 +494,10 @@ def keypoint_counts(first: Keyframe, second: Keyframe, T_first_second: FloatArra
 
 def inliers(first: Keyframe, second: Keyframe) -> int:
     """Keypoints that the best motion explains, as the cloud proposes it; 0 without a motion."""
-    a, b = points_of(first, np.zeros(3)), points_of(second, np.zeros(3))
-    matches = mutual_matches(a.codes, b.codes, LARGEST_HAMMING)
-    rows = matches.pairs
-    level = np.abs(a.positions[rows[:, 0], 2] - b.positions[rows[:, 1], 2]) <= LARGEST_LEVEL_M
-    kept = Matches(rows[level], matches.distances[level])
-    best = rigid_hypotheses(a.positions[:, :2], b.positions[:, :2], kept)
-    return max((hypothesis.inlier_count for hypothesis in best), default=0)
+    points = (
+        PlacePoints(each.positions[each.placed], each.features.descriptors[each.placed]) for each in (first, second)
+    )
+    return place_inliers(*points)
 
 
 def by_building(rows: Sequence[tuple], arm: str, on: str) -> FloatArray:

@@ -182,9 +182,8 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     import torch
 
     from fcslam.learning.federated import client
-    from fcslam.learning.federated.client_app import build_client_app
+    from fcslam.learning.federated.client_app import in_process_grid
     from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-    from fcslam.learning.federated.flower import InProcessGrid
     from fcslam.learning.federated.networks import network_to_weights, weights_version
     from fcslam.learning.federated.public_images import public_evaluation, read_public_images
     from fcslam.learning.federated.settings import FederatedSettings
@@ -206,10 +205,9 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     training_time, evaluation_time = Stopwatch(), Stopwatch()
     evaluate = public_evaluation(read_public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
     hooks = CoordinatorHooks(partial(weights_version, encoder="light"), evaluation_time.around(evaluate))
-    grid = InProcessGrid(build_client_app(lambda context: fleet[int(context.node_config["partition-id"])]), len(fleet))
     local_training, client.local_training = client.local_training, training_time.around(client.local_training)
     began = time.process_time()
-    Coordinator(grid, settings, start, folder / "run", hooks).run()
+    Coordinator(in_process_grid(fleet), settings, start, folder / "run", hooks).run()
     total_s = time.process_time() - began
     client.local_training = local_training
     rest_s = (total_s - training_time.spent_s - evaluation_time.spent_s) / count

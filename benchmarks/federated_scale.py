@@ -31,12 +31,12 @@ import numpy as np
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client import ClientUpdate
-from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.client_app import build_client_app, in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
-from fcslam.learning.federated.flower import InProcessGrid, RobotGrid
+from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import read_detector_weights
 from fcslam.learning.federated.settings import FederatedSettings
@@ -123,9 +123,7 @@ def main() -> None:
 def one_process(names: list[str], missing: float, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
     """The reference."""
     robots = [DrawnRobot(name, missing, fail) for name in names]
-    return train(
-        InProcessGrid(build_client_app(lambda c: robots[c.node_config["partition-id"]]), len(robots)), settings
-    )
+    return train(in_process_grid(robots), settings)
 
 
 def fail(robot: DrawnRobot, _is_silent: bool) -> None:
@@ -212,7 +210,7 @@ def answer(name: str, missing: float, port: int) -> None:
         time.sleep(DEADLINE_S + LATE_S)
 
     client = DrawnRobot(name, missing, stay_away)
-    app = build_client_app(lambda _: client)
+    app = build_client_app(client)
     while True:
         try:
             with RobotLink(f"http://127.0.0.1:{port}", name, name) as link:

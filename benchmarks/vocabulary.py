@@ -34,14 +34,7 @@ FLIP_HALVINGS = 4
 SEED = 1
 COSTS = {"index": "", "places": ",", "insert, ms": ".2f", "slowest, ms": ".0f", "query, ms": ".2f",
          "insert + query, ms": ".2f", "memory a place, kB": ".1f", "peak, MB": ".0f", "words": ","}  # fmt: skip
-FILES = {
-    "index": "",
-    "places": ",",
-    "save, s": ".2f",
-    "load, s": ".2f",
-    "MB": ".0f",
-    "1,000 descriptors to words, ms": ".3f",
-}
+WORDS = {"index": "", "places": ",", "1,000 descriptors to words, ms": ".3f"}
 
 
 def main() -> None:
@@ -60,7 +53,7 @@ def main() -> None:
     if len(grown) == 2:
         ratio = grown[1][5] / grown[0][5]
         report.say(f"Incremental, insert + query from 10,000 to 100,000 places: {ratio:.2f} times the time.")
-    report.table("Files and words", FILES, [files for _, files in measured if files])
+    report.table("Words", WORDS, [words for _, words in measured if words])
     report.picture("Cost of a place", draw(rows))
     report.write()
 
@@ -104,7 +97,7 @@ def places(real: Any, rng: Any) -> Iterator[Any]:
 
 
 def grow(method: str, real: Path, most: int) -> tuple[list[tuple], tuple | None]:
-    """Rows of ``COSTS`` for one method, and of ``FILES`` if it has files."""
+    """Rows of ``COSTS`` for one method, and of ``WORDS`` if it has words."""
     import numpy as np
 
     arrived = np.load(real)
@@ -122,7 +115,7 @@ def grow(method: str, real: Path, most: int) -> tuple[list[tuple], tuple | None]
                          1e3 * growth / (number + 1), memory_mb("VmHWM"), index.word_count))  # fmt: skip
             inserted_ms.clear()
             print(*rows[-1], flush=True)
-    return rows, None if method == "brute force" else files_row(method, index, next(questions))
+    return rows, None if method == "brute force" else words_row(method, index, next(questions))
 
 
 def make_index(method: str, warm_up: Any = None) -> Any:
@@ -165,21 +158,15 @@ class BruteForce:
         return sorted(range(len(near)), key=near.__getitem__, reverse=True)[:top_k]
 
 
-def files_row(method: str, index: Any, descriptors: Any) -> tuple:
+def words_row(method: str, index: Any, descriptors: Any) -> tuple:
     import numpy as np
 
     from fcslam.features.codes import code_words
     from fcslam.places.kmeans_tree import find_leaves
-    from fcslam.places.persistence import load_index, save_index
 
     codes = code_words(np.resize(descriptors, (1_000, 32)))
     tree = index._vocabulary.tree
-    descent_ms = np.median([timed_ms(lambda: find_leaves(tree, codes)) for _ in range(20)])
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place) / "index"
-        save_s = timed_s(lambda: save_index(index, path))
-        load_s = timed_s(lambda: load_index(path, int))
-        return method, len(index), save_s, load_s, path.stat().st_size / 1e6, descent_ms
+    return method, len(index), np.median([timed_ms(lambda: find_leaves(tree, codes)) for _ in range(20)])
 
 
 def timed_ms(work: Callable[[], Any]) -> float:
@@ -187,13 +174,6 @@ def timed_ms(work: Callable[[], Any]) -> float:
     began = time.thread_time()
     work()
     return 1e3 * (time.thread_time() - began)
-
-
-def timed_s(work: Callable[[], Any]) -> float:
-    """Wall-clock time, as files are waited for."""
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began
 
 
 def memory_mb(name: str) -> float:

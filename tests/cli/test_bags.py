@@ -86,7 +86,7 @@ def test_a_robot_that_stands_still_makes_one_small_map(tmp_path):
 @pytest.mark.parametrize("copy", ["copy.bag", "copy.mcap"])
 def test_a_copy_of_a_recording_under_another_name_is_refused(tmp_path, capsys, copy):
     bag, copy = save(tmp_path / "run.bag", drive(40)), save(tmp_path / copy, drive(40))
-    assert "copy and run are copies of one recording" in refused(capsys, "map", bag, copy, "-o", tmp_path / "out")
+    assert "copy and run share 40 scans" in refused(capsys, "map", bag, copy, "-o", tmp_path / "out")
     cut = save(tmp_path / "cut.mcap", [mounted(), *drive(40)[30:]])
     assert "cut and run share " in refused(capsys, "map", bag, cut, "-o", tmp_path / "out")
     other = save(tmp_path / "other.bag", drive(40, start=150.0))

@@ -201,21 +201,21 @@ def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypat
         def __init__(self, plan, robot, _notify):
             told.append((plan, robot))
 
-        def set_idle(self, first_epoch):
-            told.append(first_epoch)
+        def set_idle(self, is_idle):
+            told.append(is_idle)
 
         def close(self):
             told.append("closed")
 
     monkeypatch.setattr("fcslam.learning.federated.learning_beside.LearningBeside", Process)
-    robot = SimpleNamespace(name="anna", first_epoch=3, stand_still=lambda: told.append("keyframes are placed"))
+    robot = SimpleNamespace(name="anna", stand_still=lambda: told.append("keyframes are placed"))
     with live._learning("plan", robot, told.append) as follow:
         watch = live._watch(told.append, follow)
         for scan in range(1, 30):
             x = 0.0 if scan < 20 else 1.0
             watch(scan, SimpleNamespace(stamp=float(scan), T_odom_base=np.array((x, 0.0, 0.0)), T_map_base=np.zeros(3)))
             watch(scan, None)  # another record, of no scan
-    assert told == [("plan", "anna"), "keyframes are placed", 3, None, "closed"]
+    assert told == [("plan", "anna"), "keyframes are placed", True, False, "closed"]
 
 
 @pytest.mark.parametrize("failure", [CloudError("the token is not known (401)"), StateError("the disk is full")])
@@ -252,8 +252,8 @@ def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
         def __init__(self, *_):
             """No process."""
 
-        def set_idle(self, first_epoch):
-            told.append(first_epoch)
+        def set_idle(self, is_idle):
+            told.append(is_idle)
 
         def close(self):
             """Nothing to close."""
@@ -262,8 +262,8 @@ def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
         raise CloudError("the token is not known (401)")
 
     monkeypatch.setattr("fcslam.learning.federated.learning_beside.LearningBeside", Process)
-    robot = SimpleNamespace(name="anna", first_epoch=3, stand_still=stand_still)
+    robot = SimpleNamespace(name="anna", stand_still=stand_still)
     with live._learning("plan", robot, told.append) as follow:
         for scan in range(1, 30):
             follow(SimpleNamespace(stamp=float(scan), T_odom_base=np.zeros(3), T_map_base=np.zeros(3)))
-    assert 3 not in told
+    assert True not in told

@@ -22,7 +22,7 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
-from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import encode
 from fcslam.wire.quantisation import dequantise
 
@@ -64,8 +64,6 @@ def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
     yield Correction("alice", size, 0, motion)
     yield Acknowledgement("alice", 7, size)
     yield DetectorUpdate("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))
-    taught = rng.integers(0, 256, (size, 32), np.uint8)
-    yield TaughtPlace("alice", size, "light-1", MAXIMUM_KEYPOINTS, np.arange(size, dtype=np.uint16), taught)
 
 
 def flip(rng: random.Random, corpus: list[bytes]) -> bytes:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import InputError
-from fcslam.graph.g2o import read_g2o, write_g2o
+from fcslam.graph.g2o import g2o_text, read_g2o
 from tests.graph.graph_worlds import manhattan
 
 VERTICES = "VERTEX_SE2 3 0 0 0\nVERTEX_SE2 7 1 0 0\n"
@@ -18,7 +18,8 @@ EDGE = "EDGE_SE2 3 7 1 0 0.1 9 1 2 8 3 7\n"
 def test_round_trip_is_exact(tmp_path: Path, name: str) -> None:
     graph, _, _ = manhattan(0, steps=40, closures=20, outlier_share=0.3)
     ids = [10 + k for k in range(len(graph))]
-    write_g2o(tmp_path / name, graph, ids, fixed=(10,))
+    text = g2o_text(graph, ids, fixed=(10,)).encode("ascii")
+    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
     back = read_g2o(tmp_path / name)
     assert back.ids == tuple(ids)
     assert back.fixed == (10,)
@@ -28,9 +29,7 @@ def test_round_trip_is_exact(tmp_path: Path, name: str) -> None:
         assert new.robust == (abs(old.i - old.j) != 1)
         assert old.T_i_j.tobytes() == new.T_i_j.tobytes()
         assert old.information.tobytes() == new.information.tobytes()
-    first = (tmp_path / name).read_bytes()
-    write_g2o(tmp_path / name, back.graph, back.ids, back.fixed)
-    assert (tmp_path / name).read_bytes() == first
+    assert g2o_text(back.graph, back.ids, back.fixed).encode("ascii") == text
 
 
 def test_both_formats_give_the_same_matrix(tmp_path: Path) -> None:
@@ -85,11 +84,11 @@ def test_a_broken_archive_is_refused(tmp_path: Path) -> None:
         read_g2o(tmp_path / "nowhere.g2o")
 
 
-def test_ids_must_fit(tmp_path: Path) -> None:
+def test_ids_must_fit() -> None:
     graph, _, _ = manhattan(0, steps=2, closures=0)
     for ids in ([1, 2], [1, 2, 2]):
         with pytest.raises(ValueError, match="different ids"):
-            write_g2o(tmp_path / "a.g2o", graph, ids)
+            g2o_text(graph, ids)
     assert np.isfinite(graph.poses()).all()
 
 

@@ -9,7 +9,7 @@ from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
-from fcslam.learning.network import Description, sample_codes  # noqa: E402
+from fcslam.learning.network import Description  # noqa: E402
 from fcslam.learning.objective import (  # noqa: E402
     MIN_NEGATIVE_DISTANCE_M,
     MIN_NEGATIVE_DISTANCE_PX,
@@ -22,7 +22,6 @@ from fcslam.learning.revisit_batches import (  # noqa: E402
     VIEWS,
     RevisitExamples,
     RevisitPair,
-    TaughtImage,
     draw_revisits,
 )
 from fcslam.learning.settings import LossSettings  # noqa: E402
@@ -33,44 +32,26 @@ POINTS = RNG.uniform(8, SIZE - 8, (40, 2)).astype(np.float32)
 POSITIONS = RNG.uniform(0, 5, (40, 3))
 IMAGES = [textured(seed)[:SIZE, :SIZE] for seed in range(3)]
 PAIR = RevisitPair((0, 1), (POINTS, POINTS[::-1].copy()), POSITIONS)
-TAUGHT = TaughtImage(2, POINTS, RNG.integers(0, 256, (40, 32)).astype(np.uint8), POSITIONS)
 
 
-@pytest.mark.parametrize(
-    ("examples", "pairs", "taught", "images"),
-    [
-        (RevisitExamples(IMAGES, [PAIR]), 2, 0, [0, 0, 1, 1]),
-        (RevisitExamples(IMAGES, taught=[TAUGHT]), 0, 4, [2, 2, 2, 2]),
-        (RevisitExamples(IMAGES, [PAIR], [TAUGHT]), 1, 2, [0, 2, 2, 1]),
-    ],
-)
-def test_a_batch_holds_views_and_fixed_codes(examples, pairs, taught, images):
-    batch = draw_revisits(examples, 1, 5)
-    count = pairs + taught
-    assert batch.images.tolist() == images
-    assert len(images) == VIEWS
-    assert batch.points.shape == (2 * count, MOST_POINTS, 2)
-    assert batch.codes.shape == (taught, MOST_POINTS, 256)
-    assert batch.valid.sum(1).tolist() == [40] * count
+def test_a_batch_holds_pairs_of_views():
+    batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
+    assert batch.images.tolist() == [0, 0, 1, 1]
+    assert batch.points.shape == (VIEWS, MOST_POINTS, 2)
+    assert batch.valid.sum(1).tolist() == [40, 40]
     firsts, seconds = batch.points.chunk(2)
-    for k in range(pairs):  # the points of a pair stay together, and with their positions
+    for k in range(VIEWS // 2):  # the points of a pair stay together, and with their positions
         rows = (firsts[k, :40], seconds[k, :40], batch.positions[k, :40])
         both = {(*a, *b, *c) for a, b, c in zip(*(each.tolist() for each in rows), strict=True)}
         wanted = (*PAIR.points, PAIR.positions.astype(np.float32))
         assert both == {(*a, *b, *c) for a, b, c in zip(*(each.tolist() for each in wanted), strict=True)}
-    for k in range(taught):
-        assert torch.equal(firsts[pairs + k], seconds[pairs + k])
-        order = [POINTS.tolist().index(point) for point in firsts[pairs + k, :40].tolist()]
-        expected = 2.0 * np.unpackbits(TAUGHT.codes, axis=1)[order] - 1.0
-        assert np.array_equal(batch.codes[k, :40].numpy(), expected)
-    again = draw_revisits(examples, 1, 5)
-    assert all(torch.equal(getattr(batch, name), getattr(again, name)) for name in ("images", "points", "codes"))
+    again = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
+    assert torch.equal(batch.points, again.points)
 
 
 def test_examples_are_false_only_without_any():
     assert not RevisitExamples(IMAGES)
     assert RevisitExamples(IMAGES, [PAIR])
-    assert RevisitExamples(IMAGES, taught=[TAUGHT])
 
 
 def test_points_of_two_pairs_differ_if_they_are_far_apart_in_the_map_and_of_one_pair_if_in_both_images():
@@ -98,13 +79,12 @@ def objective(code_logits, batch, context=0.0, **weights):
 
 
 def test_codes_that_agree_cost_least_and_equal_codes_of_all_points_do_not_pay():
-    batch = draw_revisits(RevisitExamples(IMAGES, taught=[TAUGHT]), 1, 5)
-    cells = SIZE // 8
-    columns = torch.randn(4, 256, cells, cells, generator=torch.Generator().manual_seed(1))
-    logits = sample_codes(columns, batch.points[:4])
-    agreeing = replace(batch, codes=torch.where(logits >= 0, 1.0, -1.0) * batch.valid[..., None])
-    _, good = objective(4.0 * columns, agreeing)
-    _, other = objective(4.0 * columns, batch)
+    batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
+    columns = torch.randn(4, 256, SIZE // 8, SIZE // 8, generator=torch.Generator().manual_seed(1))
+    # In a pair of an image with itself, the two codes of a point agree.
+    agreeing = replace(batch, points=batch.points[:2].repeat(2, 1, 1))
+    _, good = objective(4.0 * torch.cat((columns[:2], columns[:2])), agreeing)
+    _, other = objective(4.0 * columns, agreeing)
     _, collapsed = objective(torch.full_like(columns, 4.0), agreeing)
     assert good["contrastive"] < 0.5 * other["contrastive"]
     assert collapsed["contrastive"] > 2.0 * good["contrastive"]

@@ -291,13 +291,13 @@ def test_windowed_keeps_the_vocabulary_in_between_and_static_for_ever():
 def test_a_vocabulary_of_other_places_stays_where_it_is_static_and_follows_where_it_is_incremental():
     foreign, own = random_places(np.random.default_rng(4), 10), random_places(np.random.default_rng(5), 60)
     for strategy, follows in ((Strategy.STATIC, False), (Strategy.INCREMENTAL, True)):
-        index = PlaceIndex[int](config(strategy), np.random.default_rng(0), "detector-1")
+        index = PlaceIndex[int](config(strategy), np.random.default_rng(0))
         index.train(foreign)
         before = index.word_count
         for number, place in enumerate(own):
             index.add(number, place)
         assert (index.word_count > before) is follows
-        assert (index.training.places, index.training.descriptor_version) == (10, "detector-1")
+        assert index.training.places == 10
         check_stored(index, dict(enumerate(own)))
 
 

@@ -4,7 +4,6 @@ import contextlib
 import copy
 import math
 import resource
-import shutil
 import struct
 import subprocess
 import sys
@@ -29,7 +28,6 @@ from tests.sources.camera_records import CAMERA, LASER, drive, image, png, same,
 
 GOLDEN = Path(__file__).parent / "golden" / "robot.fcslam"
 FILES = ("meta.yaml", "scans.bin", "ranges.bin", "odometry.bin", "images.bin")
-EARLIER = [GOLDEN.with_name(f"version-{version}.fcslam") for version in (1, 2)]
 ENTRY = 8 + 8 + 24
 HEADER, SCAN, IMAGE = 16, ENTRY + 4 + 4 + 8 + 8 + 8 + 4 + 64 + 4, ENTRY + 4 + 4 + 4 + 4
 REAR = LaserModel(9, -1.0, 0.25, 8.0, (-0.25, 0.0, 3.0))
@@ -157,25 +155,6 @@ def test_the_golden_recording_is_read_and_written(tmp_path):
     assert all(map(same, sensed(records), source.records()))
     assert [truth.T_building_base[0] for truth in source.ground_truth()] == [1.0, 1.125, 1.25]
     assert contents(written(tmp_path, records)) == contents(GOLDEN)
-
-
-@pytest.mark.parametrize("earlier", EARLIER, ids=lambda path: path.stem)
-def test_a_recording_of_an_earlier_version_is_read_but_not_continued(tmp_path, earlier):
-    source = Recording(earlier, "robot")
-    assert source.survey().lasers[0] == LASER
-    read = list(source.records())
-    assert len(read) == len(sensed(drive(3)))
-    assert all(map(same, sensed(drive(3)), read))
-    copy = shutil.copytree(earlier, tmp_path / "robot.fcslam")
-    with pytest.raises(SourceError, match=r"is of version \d, which is read but not continued"):
-        RecordingWriter.resume(copy)
-
-
-def test_the_beams_of_version_1_are_those_of_its_frames(tmp_path):
-    copy = shutil.copytree(EARLIER[0], tmp_path / "robot.fcslam")
-    edit(copy, lambda content: content["laser"].update(beam_count=13))
-    with pytest.raises(SourceError, match="does not fit"):
-        open_source(copy).survey()
 
 
 def test_a_recording_without_odometry_says_so(tmp_path):

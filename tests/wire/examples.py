@@ -22,7 +22,7 @@ from fcslam.records import (
     WordPlace,
     frozen,
 )
-from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import encode
 from fcslam.wire.quantisation import dequantise
 
@@ -94,14 +94,6 @@ ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
 DETECTOR_UPDATE = DetectorUpdate(
     "alice", DetectorFile(Channel.CAMERA, "light-0a1b2c3d4e5f", 1, 1588335, bytes(range(32)))
 )
-TAUGHT_PLACE = TaughtPlace(
-    "alice",
-    12,
-    "cnn-0.3+r12",
-    7,
-    frozen([0, 3, 6], np.uint16),
-    frozen(np.arange(96).reshape(3, 32), np.uint8),
-)
 
 
 def packet(body: Body) -> Packet:
@@ -125,7 +117,6 @@ EXAMPLES = {
     "correction": packet(CORRECTION),
     "acknowledgement": packet(ACKNOWLEDGEMENT),
     "detector_update": packet(DETECTOR_UPDATE),
-    "taught_place": packet(TAUGHT_PLACE),
 }
 
 

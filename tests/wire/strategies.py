@@ -17,10 +17,9 @@ from fcslam.records import (
     Place,
     Sweep,
     WordPlace,
-    frozen,
 )
 from fcslam.wire.limits import KEYPOINT_AXES
-from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise_keypoints
 from fcslam.wire.streams import ascending
 
@@ -166,16 +165,7 @@ def bodies(robot, epoch, time):
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), EPOCHS, SEQUENCES),
         st.builds(DetectorUpdate, st.just(robot), detector_files()),
-        taught_places(robot),
     )
-
-
-@st.composite
-def taught_places(draw, robot):
-    rows = sorted(draw(st.sets(st.integers(0, 2047), min_size=1, max_size=8)))
-    codes = draw(hnp.arrays(np.uint8, (len(rows), 32)))
-    count = draw(st.integers(rows[-1] + 1, 2048))
-    return TaughtPlace(robot, draw(NUMBERS), draw(NAMES), count, frozen(rows, np.uint16), frozen(codes, np.uint8))
 
 
 @st.composite

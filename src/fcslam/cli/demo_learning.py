@@ -41,8 +41,7 @@ def learn_together(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import parse
     from fcslam.features.detector import BUNDLED_NETWORK
-    from fcslam.learning.federated.client_app import build_client_app
-    from fcslam.learning.federated.flower import Context, InProcessGrid
+    from fcslam.learning.federated.client_app import in_process_grid
     from fcslam.learning.federated.history import RoundReport
     from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
     from fcslam.learning.federated.live_settings import GateSettings, LiveRounds
@@ -65,13 +64,8 @@ def learn_together(
             display.show("looking for what was seen again", number, len(sources))
             clients.append(_learner(source, config, folder / "robots" / source.name))
         display.show("looking for what was seen again", len(sources), len(sources))
-
-        def client_of(context: Context) -> "RobotClient":
-            return clients[int(context.node_config["partition-id"])]
-
         job = FederatedJob(folder, settings, BUNDLED_NETWORK, gate=GateSettings())
-        grid = InProcessGrid(build_client_app(client_of), len(clients))
-        files = run_job(job, ExecutionOptions(), ProgressCallbacks(rounds=watch), grid)
+        files = run_job(job, ExecutionOptions(), ProgressCallbacks(rounds=watch), in_process_grid(clients))
     best = next((report for report in reversed(reports) if report.released), None)
     if best is None:
         print_line(console, f"the fleet keeps the bundled detector: {reports[-1].reason}")
@@ -101,7 +95,7 @@ def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotC
         robot.process(record)
     robot.finish()
     settings = RobotLearningSettings(held_out=HeldOutSettings(every=HELD_OUT))
-    examples = own_examples(keyframes, settings, (), 0)
+    examples = own_examples(keyframes, settings)
     noise = seeded_noise(source.name, config.seed)
     return RobotClient(
         source.name, keyframes, folder / "cache", noise, revisits=examples.revisits, held_out=examples.held_out

@@ -159,9 +159,9 @@ def _learning(
                 robot.stand_still()
             except (CloudError, StateError):  # an event named it; the robot maps on, but does not learn
                 return
-            learning.set_idle(robot.first_epoch)
+            learning.set_idle(True)
 
-        yield Standstill(stop, lambda: learning.set_idle(None)).follow
+        yield Standstill(stop, lambda: learning.set_idle(False)).follow
 
 
 def _watch(

@@ -127,7 +127,7 @@ def _learn(
     learning = LearningBeside(plan, robot.name, tell)
     began_s = time.monotonic()
     try:
-        learning.set_idle(robot.first_epoch)
+        learning.set_idle(True)
         while (passed_s := time.monotonic() - began_s) < plan.settings.time_s and not learning.has_ended:
             robot.stand_still()
             watch(robot.status())

@@ -44,7 +44,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.storage.state_file import State
-from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 
 
 class _Replayed(NamedTuple):
@@ -119,7 +119,7 @@ class Fleet:
                 self._place(self._words.place(place, self._sessions.vocabularies(place.id.robot)))
             case MapTile() as tile:
                 self._sessions.add_tile(tile, packet.sequence)
-            case Correction() | Acknowledgement() | DetectorUpdate() | TaughtPlace():
+            case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
     def _timed(self, verify_pairs: VerifyPairs) -> VerifyPairs:

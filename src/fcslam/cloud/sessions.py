@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from fcslam.errors import PacketError
 from fcslam.records import Constraint, Correction, Keyscan, KeyscanId, MapTile, Place, WordPlace
-from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 
 _SESSION = re.compile(r"(.+)\+(\d+)", re.ASCII)
 
@@ -58,5 +58,5 @@ def _renamed(body: Body, session: str) -> Body:
     match body:
         case Keyscan() | Place() | WordPlace():
             return replace(body, id=KeyscanId(session, body.id.number))
-        case Hello() | Constraint() | MapTile() | Correction() | Acknowledgement() | DetectorUpdate() | TaughtPlace():
+        case Hello() | Constraint() | MapTile() | Correction() | Acknowledgement() | DetectorUpdate():
             return replace(body, robot=session)

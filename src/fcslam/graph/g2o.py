@@ -1,4 +1,4 @@
-"""Pose graphs as text files: reads g2o (2D) and TORO, writes g2o; plain or gzip by the name of the file.
+"""Pose graphs as text files: reads g2o (2D) and TORO, plain or gzip by the name of the file, and writes g2o.
 
     VERTEX_SE2 id x y theta                     VERTEX2 id x y theta                    (TORO)
     EDGE_SE2 i j x y theta xx xy xt yy yt tt    EDGE2 i j x y theta xx xy yy tt xt yt   (TORO)
@@ -7,7 +7,6 @@
 The formats do not mark closures: the first edge between two consecutive ids is odometry, all others are closures.
 """
 
-import gzip
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -88,12 +87,6 @@ def g2o_text(graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence
         numbers = [*edge.T_i_j.tolist(), *edge.information[upper].tolist()]
         lines.append(f"EDGE_SE2 {names[edge.i]} {names[edge.j]} {_text(numbers)}")
     return "\n".join(lines) + "\n"
-
-
-def write_g2o(path: Path, graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> None:
-    """Write ``g2o_text`` to a file, compressed if its name ends in ``.gz``."""
-    data = g2o_text(graph, ids, fixed).encode("ascii")
-    path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
 
 
 def _text(numbers: list[float]) -> str:

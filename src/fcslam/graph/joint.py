@@ -28,7 +28,7 @@ from fcslam.graph.contradiction import Strains, contradicting_robots
 from fcslam.graph.evidence import Uniqueness, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
-from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_inliers
+from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
@@ -120,7 +120,6 @@ def not_compared(*_: object) -> Overlap:
 def solve_jointly(
     evidence: JointEvidence,
     consistency: ConsistencySettings,
-    gnc: GncSettings | None = None,
     examine: ExaminePair = not_examined,
     contradiction: float = np.inf,
     compare: CompareJointMaps = not_compared,
@@ -137,7 +136,6 @@ def solve_jointly(
     Args:
         evidence: graph of N variables and E edges, with the role of every edge.
         consistency: when closures are consistent, and what a cluster needs.
-        gnc: settings of graduated non-convexity.
         examine: called for two robots where only the amount of evidence is open.
         contradiction: strain above which one of the robots of a map contradicts the others.
         compare: called for robots of one map that only one other sender connects.
@@ -148,7 +146,7 @@ def solve_jointly(
     # 1. Optimise each robot's own graph.
     factors = FactorCache(evidence.graph, find_chains(evidence.graph))
     initial = evidence.graph.poses()
-    own = [_solve_own_graph(evidence, robot, initial[robot], consistency, gnc, factors) for robot in evidence.robots]
+    own = [_solve_own_graph(evidence, robot, initial[robot], consistency, factors) for robot in evidence.robots]
     paths = [path for path, _ in own]
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
@@ -162,13 +160,13 @@ def solve_jointly(
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
         supported = within_maps & _supported_edges(evidence, [inliers for _, inliers in own], joining)
-        solution = _solve_supported(evidence, supported, paths, frames, bool(known or joining), gnc, factors)
-        solution = _refine_inliers(factors, within_maps, solution, gnc)
+        solution = _solve_supported(evidence, supported, paths, frames, bool(known or joining), factors)
+        solution = _refine_inliers(factors, within_maps, solution)
         # 5. Withdraw isolated closures and decide once more.
         isolated = _isolated_closures(evidence, paths, solution, consistency)
         if isolated.any():
             trusted = replace(solution, weights=solution.weights * ~isolated)
-            solution = _refine_inliers(factors, within_maps, trusted, gnc)
+            solution = _refine_inliers(factors, within_maps, trusted)
         # 6. Repeat without the links that the joint solution contradicts.
         confirmed = [
             link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
@@ -195,7 +193,6 @@ def _solve_own_graph(
     robot: NDArray[np.int64],
     initial: FloatArray,
     consistency: ConsistencySettings,
-    gnc: GncSettings | None,
     factors: FactorCache,
 ) -> tuple[Trajectory, NDArray[np.int64]]:
     """Trajectory of one robot from its own measurements and initial poses, and those of its edges that are inliers."""
@@ -215,7 +212,7 @@ def _solve_own_graph(
     )
     same = np.array_equal(robot, np.arange(len(graph)))  # then its factors are those of the joint graph
     own_factors = factors.restricted(own_graph, ~evidence.excluded[edges.robust]) if same else None
-    solution = solve_single_robot(own_graph, consistency, gnc, own_factors)
+    solution = solve_single_robot(own_graph, consistency, own_factors)
     return robot_trajectory(own_graph, solution.poses, consistency), mine[solution.weights > INLIER_WEIGHT]
 
 
@@ -317,7 +314,6 @@ def _solve_supported(
     own: Sequence[Trajectory],
     frames: Sequence[FloatArray],
     joined: bool,
-    gnc: GncSettings | None,
     factors: FactorCache,
 ) -> Solution:
     """Graduated non-convexity with supported closures only, so that false ones cannot distort its start.
@@ -333,19 +329,17 @@ def _solve_supported(
     subgraph = _subgraph(graph, start, supported)
     kept = factors.restricted(subgraph, supported[graph.arrays().robust])
     starts = (start, initialize(subgraph)) if joined else (start,)
-    solutions = [optimize_gnc(subgraph, poses, settings=gnc, factors=kept) for poses in starts]
+    solutions = [optimize_gnc(subgraph, poses, factors=kept) for poses in starts]
     best = min(solutions, key=lambda solution: solution.stats.final_cost)
     return _expand_weights(best, supported)
 
 
-def _refine_inliers(
-    factors: FactorCache, within_maps: NDArray[np.bool_], trusted: Solution, gnc: GncSettings | None
-) -> Solution:
+def _refine_inliers(factors: FactorCache, within_maps: NDArray[np.bool_], trusted: Solution) -> Solution:
     """Decide every edge within a map, starting from the inliers of a trusted solution."""
     graph = factors.graph
     subgraph = _subgraph(graph, trusted.poses, within_maps)
     kept = factors.restricted(subgraph, within_maps[graph.arrays().robust])
-    refined = refine_inliers(subgraph, None, trusted.weights[within_maps], settings=gnc, factors=kept)
+    refined = refine_inliers(subgraph, None, trusted.weights[within_maps], factors=kept)
     return _expand_weights(refined, within_maps)
 
 

@@ -6,7 +6,7 @@ from fcslam.graph.chains import Chains, find_chains
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize, initialize_robust
-from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_inliers
+from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
 from fcslam.records import FloatArray
@@ -18,7 +18,6 @@ _UNMEASURED_VARIANCE = 1e6
 def solve_single_robot(
     graph: PoseGraph,
     consistency: ConsistencySettings,
-    gnc: GncSettings | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
     """Optimise the graph of one robot robustly; its variables are in the order of its path.
@@ -34,7 +33,6 @@ def solve_single_robot(
     Args:
         graph: N variables and E edges of one robot.
         consistency: when closures support each other.
-        gnc: settings of graduated non-convexity.
         factors: those of ``graph``, where they are built already.
 
     Returns:
@@ -42,7 +40,7 @@ def solve_single_robot(
     """
     robust, factors = graph.arrays().robust, factors or FactorCache(graph, find_chains(graph))
     odometry = initialize(graph, (~robust).astype(float))
-    by_odometry = refine_inliers(graph, odometry, ~robust, settings=gnc, factors=factors)
+    by_odometry = refine_inliers(graph, odometry, ~robust, factors=factors)
     if not robust.any():
         return by_odometry
     supported = ~robust
@@ -56,15 +54,14 @@ def solve_single_robot(
     first = optimize_gnc(
         supported_graph,
         _robust_start(supported_graph, factors.chains),
-        settings=gnc,
         factors=factors.restricted(supported_graph, supported[robust]),
     )
     weights = np.zeros(len(robust))
     weights[supported] = first.weights
     solutions = (
         by_odometry,
-        refine_inliers(graph, first.poses, weights, settings=gnc, factors=factors),
-        optimize_gnc(graph, odometry, settings=gnc, factors=factors),
+        refine_inliers(graph, first.poses, weights, factors=factors),
+        optimize_gnc(graph, odometry, factors=factors),
     )
     return min(solutions, key=lambda solution: solution.stats.final_cost)
 

@@ -100,27 +100,21 @@ def revisit_objective(
     """The sum to minimise for points that were seen again, and the losses in it by name.
 
     The codes of a point in both views must agree and differ from those of all other points of the batch, also in
-    images of other places. Fixed codes of other robots count as a second view. The balance of the bits, and the
-    negatives, keep codes from becoming all the same.
+    images of other places. The balance of the bits, and the negatives, keep codes from becoming all the same.
 
     Args:
         described: by the network, for the batch's images.
         before: by the network that training started from.
-        batch: points and codes.
+        batch: the points.
         weights: of the losses.
     """
-    count, fixed = len(batch.valid), len(batch.codes)
-    places = batch.points[: 2 * count - fixed]
-    seen = torch.cat((batch.valid, batch.valid[: count - fixed]))
-    logits = sample_codes(described.code_logits.float(), places)
-    # The second views of pairs follow all first views; fixed codes stand behind them.
-    soft = torch.cat((torch.tanh(logits), batch.codes))
+    soft = torch.tanh(sample_codes(described.code_logits.float(), batch.points))
     first, second = (side[batch.valid] for side in soft.chunk(2))
     every = torch.ones(len(first), dtype=torch.bool, device=first.device)
     moved = (described.context.float() - before.context.float()).square().mean()
     parts = {
         "contrastive": losses.contrastive_loss(first, second, revisit_negatives(batch), every, weights.temperature),
-        "balance": losses.balance_loss(torch.tanh(logits), seen),
+        "balance": losses.balance_loss(soft, batch.valid.repeat(2, 1)),
         "keypoints": moved / before.context.float().var().clamp(min=_STILL),
     }
     total = sum((getattr(weights, name) * part for name, part in parts.items()), start=torch.zeros_like(moved))

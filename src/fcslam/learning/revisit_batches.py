@@ -1,4 +1,4 @@
-"""Batches of points that a robot saw again: in pairs of its images, and with codes that other robots gave to them."""
+"""Batches of points that a robot saw again, in pairs of its images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -9,16 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fcslam.features.codes import CODE_BITS
 from fcslam.features.detector import GreyImage
 from fcslam.learning.labels import Points
 from fcslam.learning.revisits import Sightings
-from fcslam.records import Codes, FloatArray
+from fcslam.records import FloatArray
 
 VIEWS: Final = 4
 """Images in a batch."""
 MOST_POINTS: Final = 100
-"""Most points of a pair or of a taught image in a batch."""
+"""Most points of a pair in a batch."""
 VOTED_VIEWS: Final = 2
 """Images in a step that trains keypoints."""
 FEWEST_VOTES: Final = 3
@@ -44,20 +43,6 @@ class RevisitPair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TaughtImage:
-    """An image and the codes that other robots gave to its points."""
-
-    image: int
-    """Its number in ``RevisitExamples``."""
-    points: Points
-    """Shape (M, 2), pixels."""
-    codes: Codes
-    """Shape (M, 32)."""
-    positions: FloatArray
-    """Positions of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class VotedImage:
     """An image with keypoints of which other views tell whether they are found again."""
 
@@ -71,32 +56,29 @@ class VotedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RevisitExamples:
-    """Training data of a robot: its own revisits, and the closures with others."""
+    """Training data of a robot: its own revisits."""
 
     images: Sequence[GreyImage] = field(default=())
     """All of one size."""
     pairs: Sequence[RevisitPair] = field(default=())
-    taught: Sequence[TaughtImage] = field(default=())
     voted: Sequence[VotedImage] = field(default=())
 
     def __bool__(self) -> bool:
-        return bool(self.pairs or self.taught)
+        return bool(self.pairs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RevisitBatch:
-    """B pairs of views; of the last T pairs, fixed codes stand for the second view."""
+    """B pairs of views."""
 
     images: Tensor
-    """Numbers of the images, shape (2B - T,): B first views, then B - T second views."""
+    """Numbers of the images, shape (2B,): B first views, then B second views."""
     points: Tensor
-    """Shape (2B, N, 2) [px]: in the first views, then in the second ones; where these are codes, those of the first."""
+    """Shape (2B, N, 2) [px]: in the first views, then in the second ones."""
     positions: Tensor
     """Shape (B, N, 3), metres; NaN where unknown."""
     valid: Tensor
     """Shape (B, N), bool."""
-    codes: Tensor
-    """Shape (T, N, 256): -1 for a bit 0, 1 for a bit 1, 0 where not valid."""
 
     def to(self, device: torch.device) -> "RevisitBatch":
         """The batch on another device."""
@@ -118,32 +100,21 @@ def draw_voted(examples: RevisitExamples, seed: int, step: int) -> list[VotedIma
 
 
 def draw_revisits(examples: RevisitExamples, seed: int, step: int) -> RevisitBatch:
-    """The batch of a step, with ``VIEWS`` images: pairs, taught images, or both."""
+    """The pairs of a step, with ``VIEWS`` images."""
     rng = np.random.default_rng([seed, step, VIEWS])
-    taught_count = (VIEWS // 2 if examples.pairs else VIEWS) if examples.taught else 0
-    pairs = [examples.pairs[k] for k in rng.integers(len(examples.pairs) or 1, size=(VIEWS - taught_count) // 2)]
-    taught = [examples.taught[k] for k in rng.integers(len(examples.taught) or 1, size=taught_count)]
-    firsts, seconds, positions, valid, codes = [], [], [], [], []
+    pairs = [examples.pairs[k] for k in rng.integers(len(examples.pairs), size=VIEWS // 2)]
+    firsts, seconds, positions, valid = [], [], [], []
     for pair in pairs:
         chosen = _some(len(pair.positions), rng)
         firsts.append(_padded(pair.points[0][chosen]))
         seconds.append(_padded(pair.points[1][chosen]))
         positions.append(_padded(pair.positions[chosen]))
         valid.append(np.arange(MOST_POINTS) < len(chosen))
-    for image in taught:
-        chosen = _some(len(image.positions), rng)
-        firsts.append(_padded(image.points[chosen]))
-        seconds.append(firsts[-1])
-        positions.append(_padded(image.positions[chosen]))
-        valid.append(np.arange(MOST_POINTS) < len(chosen))
-        codes.append(_padded(2.0 * np.unpackbits(image.codes[chosen], axis=1) - 1.0))
-    images = [pair.images[0] for pair in pairs] + [image.image for image in taught] + [pair.images[1] for pair in pairs]
     return RevisitBatch(
-        torch.tensor(images),
+        torch.tensor([pair.images[view] for view in (0, 1) for pair in pairs]),
         torch.from_numpy(np.stack(firsts + seconds)),
         torch.from_numpy(np.stack(positions)),
         torch.from_numpy(np.stack(valid)),
-        torch.from_numpy(np.array(codes, np.float32).reshape(-1, MOST_POINTS, CODE_BITS)),
     )
 
 

@@ -409,11 +409,6 @@ class Robot(LiveTracker):
                 self._uplink.between_records()
             self._take(self._frontend.ready())
 
-    @property
-    def first_epoch(self) -> int:
-        """Epoch of the first session of this start, as the server knows it."""
-        return 0 if self._outbox is None else self._outbox.first_epoch
-
     def wait_for_room(self, watch: Callable[[RobotStatus], None] | None = None) -> None:
         """Wait until the back end, the map, the disk and the server have caught up enough to take more, for a program
         that adds records faster than a robot.

@@ -1,7 +1,7 @@
 """The place index: an inverted index over a dynamic vocabulary that retrieves the places most similar to a query."""
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from typing import Any, Generic, Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from fcslam.places.scoring import TINY, empty_buffers, score_matches, score_word
 from fcslam.places.similarity import BagOfWords, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray
+from fcslam.storage.state_file import State
 
 _MOST_LEVELS = 16
 """Depth limit of a tree whose leaves split; no tree reaches it in practice."""
@@ -25,27 +26,6 @@ _ROWS_KEPT = 2
 _NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
 
 
-@dataclass(frozen=True, slots=True)
-class IndexState(Generic[PlaceId]):
-    """The complete state of an index; the postings are computed from it."""
-
-    config: VocabularyConfig
-    descriptor_version: str
-    training: Training | None
-    places_seen: int
-    tree: TreeState
-    ids: Sequence[PlaceId]
-    counts: NDArray[np.int32]
-    """Shape (P,): descriptors of each place."""
-    codes: CodeWords
-    """Shape (D, 4): codes of all descriptors, place by place."""
-    leaves: NDArray[np.int32]
-    """Shape (D,): leaf of each descriptor, as a vertex of ``tree``."""
-    norms: FloatArray | None = None
-    """Shape (P,): norms of the places under ``Scoring.WORDS``, whose rounding depends on their history; None: they are
-    computed."""
-
-
 class PlaceIndex(Generic[PlaceId]):
     """Stored places by the words they contain, with the dynamic vocabulary.
 
@@ -53,9 +33,8 @@ class PlaceIndex(Generic[PlaceId]):
     order of arrival, from 0, as in Algorithm 1 of FC-SLAM.
     """
 
-    def __init__(self, config: VocabularyConfig, rng: np.random.Generator, descriptor_version: str = "") -> None:
+    def __init__(self, config: VocabularyConfig, rng: np.random.Generator) -> None:
         self._config = config
-        self._descriptor_version = descriptor_version
         self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
         self._postings = self._no_postings()
         self._buffers = empty_buffers(0)
@@ -156,28 +135,43 @@ class PlaceIndex(Generic[PlaceId]):
         """Train the tree now on the descriptors of these places, each (N, 32), which need not be stored."""
         self._train(np.concatenate([_NO_CODES, *map(code_words, places)]), len(places))
 
-    def state(self) -> IndexState[PlaceId]:
-        """The complete state, from which ``restored`` makes an equal index."""
+    def state(self) -> State:
+        """The state without what the stored places hold, from which ``restored`` makes an equal index."""
         rows = self._rows()
         tree, number_of = self._vocabulary.state()
         leaves = np.concatenate([np.empty(0, np.int32), *map(self._postings.leaves, rows.tolist())])
-        return IndexState(
-            self._config, self._descriptor_version, self._training, self._places_seen, tree, list(self._row_of),
-            self._postings.entries.counts[rows], self._postings.gather(rows), number_of[leaves],
-            self._postings.entries.log_documents[rows] if self._config.scoring is Scoring.WORDS else None,
-        )  # fmt: skip
+        return {
+            "size": len(self),
+            "training": asdict(self._training) if self._training else None,
+            "places_seen": self._places_seen,
+            **tree._asdict(),
+            "leaves": number_of[leaves],
+            "norms": self._postings.entries.log_documents[rows] if self._config.scoring is Scoring.WORDS else None,
+        }
 
     @classmethod
-    def restored(cls, state: IndexState[PlaceId]) -> Self:
-        """Restore an index from its state; it behaves exactly like the original."""
-        index = cls(state.config, np.random.default_rng(0), state.descriptor_version)
-        index._training, index._places_seen = state.training, state.places_seen
-        index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
+    def restored(
+        cls, config: VocabularyConfig, state: State, ids: Sequence[PlaceId], descriptors: Sequence[Codes]
+    ) -> Self:
+        """Restore an index from its ``state``; it behaves exactly like the original.
+
+        Args:
+            config: that of the original.
+            state: of the original.
+            ids: the stored places, in the order in which they were added.
+            descriptors: of each place, shape (N, 32).
+        """
+        index = cls(config, np.random.default_rng(0))
+        index._training = Training(**state["training"]) if state["training"] else None
+        index._places_seen = state["places_seen"]
+        tree = TreeState(*(state[name] for name in TreeState._fields))
+        index._vocabulary = Vocabulary.restored(_shape(config), tree)
         index._postings = index._no_postings()
-        index._postings.fill(state.codes, state.leaves, state.counts)
-        if state.norms is not None:
-            index._postings.entries.log_documents[: len(state.norms)] = state.norms
-        index._ids = list(state.ids)
+        counts = np.array([len(each) for each in descriptors], np.int32)
+        index._postings.fill(np.concatenate([_NO_CODES, *map(code_words, descriptors)]), state["leaves"], counts)
+        if state["norms"] is not None:  # their rounding depends on their history
+            index._postings.entries.log_documents[: len(counts)] = state["norms"]
+        index._ids = list(ids)
         index._row_of = {place: row for row, place in enumerate(index._ids)}
         return index
 
@@ -201,7 +195,7 @@ class PlaceIndex(Generic[PlaceId]):
         """Algorithm 1, line 11: train V_t and describe all stored places in its words."""
         stored = self._postings.gather(self._rows())
         self._vocabulary.train(codes)
-        self._training = Training(places, len(codes), self._descriptor_version)
+        self._training = Training(places, len(codes))
         self._describe_again(stored)
         if self._config.strategy is Strategy.INCREMENTAL:
             self._split(np.flatnonzero(self._postings.entries.sizes > self._config.leaf_capacity))

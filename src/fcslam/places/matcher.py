@@ -20,7 +20,6 @@ from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.motions import Motion, propose_motions
-from fcslam.places.persistence import index_state, restored_index
 from fcslam.places.query_result import QueryResult
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
@@ -274,7 +273,7 @@ class PlaceMatcher:
             "counts": np.array([len(place.descriptors) for place in places], np.int64),
             "keypoints": np.concatenate([place.keypoints for place in places]) if places else np.zeros((0, 2)),
             "descriptors": np.concatenate([NO_DESCRIPTORS, *(place.descriptors for place in places)]),
-            "index": index_state(self._index),
+            "index": self._index.state(),
         }
 
     def restore(self, state: State, channel: Channel, detector_version: str) -> None:
@@ -287,7 +286,7 @@ class PlaceMatcher:
             identifier, (first, last), points, codes = row
             self._places[identifier] = Place(identifier, channel, detector_version, first, last, points, codes)
         indexed = state["index"]["size"]  # the oldest ones
-        self._index = restored_index(self._config.vocabulary, state["index"], ids[:indexed], descriptors[:indexed])
+        self._index = PlaceIndex.restored(self._config.vocabulary, state["index"], ids[:indexed], descriptors[:indexed])
         self._backlog = list(self._places.values())[indexed:]
 
     def _query(self, place: Place) -> QueryResult[KeyscanId]:

@@ -92,8 +92,6 @@ class Training:
 
     places: int
     descriptors: int
-    descriptor_version: str
-    """Version of the detector; empty if unknown."""
 
 
 class TreeState(NamedTuple):

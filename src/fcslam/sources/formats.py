@@ -4,7 +4,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
 
 _BAG = "ROS bag"
-_SCANS_COMPARED = 10
 _SCANS_SHARED = 20
 """Scans that two recordings share at least if they overlap."""
 
@@ -100,12 +98,6 @@ def check_copies(sources: Sequence[Source]) -> None:
     Raises:
         SourceError: two recordings share scans.
     """
-    known: dict[tuple[int, float, float], Source] = {}
-    for source in sources:
-        survey = source.survey()
-        other = known.setdefault((survey.scan_count, survey.duration_s, survey.path_length_m), source)
-        if other is not source and _first_scans(other) == _first_scans(source):
-            raise SourceError(f"{source.name} and {other.name} are copies of one recording; give each recording once")
     if len(sources) < 2:
         return
     owners: dict[int, Source] = {}
@@ -114,8 +106,8 @@ def check_copies(sources: Sequence[Source]) -> None:
         for name, shared in Counter(owners[scan].name for scan in own & owners.keys()).items():
             if shared >= _SCANS_SHARED:
                 raise SourceError(
-                    f"{source.name} and {name} share {shared} scans, so they are parts of one recording that overlap; "
-                    "give each scan once"
+                    f"{source.name} and {name} share {shared} scans, so they are copies or overlapping parts of one "
+                    "recording; give each scan once"
                 )
         owners.update(dict.fromkeys(own, source))
 
@@ -125,11 +117,6 @@ def _distinct_scans(source: Source) -> Iterator[int]:
     for record in source.records():
         if isinstance(record, LaserScan) and ((record.ranges_m > 0.0) & (record.ranges_m < np.inf)).any():
             yield hash((round(record.stamp, 3), record.ranges_m.tobytes()))
-
-
-def _first_scans(source: Source) -> list[tuple[float, bytes]]:
-    scans = (record for record in source.records() if isinstance(record, LaserScan))
-    return [(scan.stamp, scan.ranges_m.tobytes()) for scan in islice(scans, _SCANS_COMPARED)]
 
 
 def robot_in(path: Path) -> tuple[Path, str | None]:

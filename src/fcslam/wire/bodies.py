@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.records import (
-    CODE_BYTES,
     Beams,
     Channel,
     Codes,
@@ -31,14 +30,13 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import (
-    BYTES_PER_ROW,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASERS,
     SWEEP_NUMBERS,
 )
-from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind
 from fcslam.wire.quantisation import (
     dequantise,
     dequantise_keypoints,
@@ -300,25 +298,6 @@ def _read_detector_update(message: pb.DetectorUpdate, envelope: pb.Packet) -> De
     return DetectorUpdate(envelope.robot, file)
 
 
-def _write_taught_place(taught: TaughtPlace) -> pb.TaughtPlace:
-    return pb.TaughtPlace(
-        number=taught.number,
-        detector_version=taught.detector_version,
-        count=taught.count,
-        rows=taught.rows.astype("<u2").tobytes(),
-        codes=taught.codes.tobytes(),
-    )
-
-
-def _read_taught_place(message: pb.TaughtPlace, envelope: pb.Packet) -> TaughtPlace:
-    taught = len(message.rows) // BYTES_PER_ROW
-    if len(message.rows) != BYTES_PER_ROW * taught or len(message.codes) != CODE_BYTES * taught:
-        raise PacketError(f"taught place: {len(message.codes)} bytes of codes for {len(message.rows)} bytes of rows")
-    rows = frozen(np.frombuffer(message.rows, "<u2"), np.uint16)
-    codes = frozen(np.frombuffer(message.codes, np.uint8).reshape(taught, CODE_BYTES), np.uint8)
-    return TaughtPlace(envelope.robot, message.number, message.detector_version, message.count, rows, codes)
-
-
 def _write_pose(pose: FloatArray) -> pb.Pose:
     x, y, theta = pose.tolist()
     return pb.Pose(x_m=x, y_m=y, theta_rad=theta)
@@ -364,6 +343,5 @@ CODECS = {
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),
-    PacketKind.TAUGHT_PLACE: Codec(TaughtPlace, _write_taught_place, _read_taught_place),
 }
 CODEC_OF_TYPE = {codec.type: (kind, codec) for kind, codec in CODECS.items()}

@@ -48,7 +48,7 @@ from fcslam.wire.limits import (
     MINIMUM_RESOLUTION_M,
     TILE_CELLS,
 )
-from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet, TaughtPlace
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
 
 
@@ -244,19 +244,6 @@ def _check_detector_update(update: DetectorUpdate, _: Packet) -> None:
     )
 
 
-def _check_taught_place(taught: TaughtPlace, _: Packet) -> None:
-    _check_count(taught.number, "taught place: number", MAXIMUM_NUMBER)
-    check_name(taught.detector_version, "taught place: detector version")
-    _check_count(taught.count, "taught place: count", MAXIMUM_KEYPOINTS)
-    rows = taught.rows
-    _require(rows.dtype == np.uint16, f"taught place: rows are {rows.dtype}, not 16-bit numbers")
-    _check_shape(taught.codes, (len(rows), CODE_BYTES), "taught place: codes")
-    _require(taught.codes.dtype == np.uint8, f"taught place: codes are {taught.codes.dtype}, not bytes")
-    _require(len(rows) > 0, "taught place: it teaches nothing")
-    _require(bool((rows[1:] > rows[:-1]).all()), "taught place: rows are not ascending")
-    _require(int(rows[-1]) < taught.count, f"taught place: row {rows[-1]} of {taught.count} keypoints")
-
-
 _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Hello: _check_hello,
     Keyscan: _check_keyscan,
@@ -267,7 +254,6 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Correction: _check_correction,
     Acknowledgement: _check_acknowledgement,
     DetectorUpdate: _check_detector_update,
-    TaughtPlace: _check_taught_place,
 }
 
 

@@ -72,12 +72,6 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "DetectorUpdate.format": "nothing of the robot",
         "DetectorUpdate.size": "nothing of the robot",
         "DetectorUpdate.sha256": "nothing of the robot",
-        "TaughtPlace.number": "where along its way other robots saw the same",
-        "TaughtPlace.detector_version": "which network it uses, and so which training it took part in",
-        "TaughtPlace.count": "how much there is to see: a bare wall or full shelves",
-        "TaughtPlace.rows": "which spots two or more places of other robots show",
-        "TaughtPlace.codes": "256 bits of each spot's texture as others saw it, in their light and at their time: as a "
-        "descriptor, but the majority of several",
         "Acknowledgement.epoch": "nothing by itself",
         "Acknowledgement.sequence": "how much the cloud has",
     }

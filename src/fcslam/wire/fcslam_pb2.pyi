@@ -26,7 +26,7 @@ CONSTRAINT_KIND_ODOMETRY: ConstraintKind
 CONSTRAINT_KIND_CLOSURE: ConstraintKind
 
 class Packet(_message.Message):
-    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "correction", "acknowledgement", "detector_update", "taught_place")
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "correction", "acknowledgement", "detector_update")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     ROBOT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -41,7 +41,6 @@ class Packet(_message.Message):
     CORRECTION_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
     DETECTOR_UPDATE_FIELD_NUMBER: _ClassVar[int]
-    TAUGHT_PLACE_FIELD_NUMBER: _ClassVar[int]
     version: int
     robot: str
     epoch: int
@@ -56,8 +55,7 @@ class Packet(_message.Message):
     correction: Correction
     acknowledgement: Acknowledgement
     detector_update: DetectorUpdate
-    taught_place: TaughtPlace
-    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ..., taught_place: _Optional[_Union[TaughtPlace, _Mapping]] = ...) -> None: ...
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
 
 class Pose(_message.Message):
     __slots__ = ("x_m", "y_m", "theta_rad")
@@ -228,17 +226,3 @@ class DetectorUpdate(_message.Message):
     size: int
     sha256: bytes
     def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ..., format: _Optional[int] = ..., size: _Optional[int] = ..., sha256: _Optional[bytes] = ...) -> None: ...
-
-class TaughtPlace(_message.Message):
-    __slots__ = ("number", "detector_version", "count", "rows", "codes")
-    NUMBER_FIELD_NUMBER: _ClassVar[int]
-    DETECTOR_VERSION_FIELD_NUMBER: _ClassVar[int]
-    COUNT_FIELD_NUMBER: _ClassVar[int]
-    ROWS_FIELD_NUMBER: _ClassVar[int]
-    CODES_FIELD_NUMBER: _ClassVar[int]
-    number: int
-    detector_version: str
-    count: int
-    rows: bytes
-    codes: bytes
-    def __init__(self, number: _Optional[int] = ..., detector_version: _Optional[str] = ..., count: _Optional[int] = ..., rows: _Optional[bytes] = ..., codes: _Optional[bytes] = ...) -> None: ...

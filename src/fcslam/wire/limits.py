@@ -7,8 +7,6 @@ FLOOR_VERSION = 3
 """Version of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
 WORDS_VERSION = 4
 """Version of packets that only a robot with words in place of descriptors sends."""
-TAUGHT_VERSION = 5
-"""Version of packets with codes that the cloud gives to a robot that learns."""
 SWEEP_VERSION = 6
 """Version of a keyscan whose beams were measured at different times."""
 
@@ -41,8 +39,6 @@ BYTES_PER_AXIS = 2
 MAXIMUM_WORDS = 65536
 """Words of a vocabulary that robots and cloud share."""
 BYTES_PER_WORD = 2
-BYTES_PER_ROW = 2
-"""Size of the number of a keypoint in its place."""
 
 TILE_CELLS = 256
 """Cells along each side of a map tile."""

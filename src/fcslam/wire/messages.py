@@ -4,12 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fcslam.records import (
     Channel,
-    Codes,
     Constraint,
     Correction,
     DetectorFile,
@@ -33,7 +29,6 @@ class PacketKind(StrEnum):
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
     DETECTOR_UPDATE = "detector_update"
-    TAUGHT_PLACE = "taught_place"
 
 
 UPLINK = frozenset(
@@ -83,35 +78,7 @@ class DetectorUpdate:
     file: DetectorFile
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TaughtPlace:
-    """From cloud to robot: codes on which places of other robots agree, for keypoints of one of its camera places."""
-
-    robot: str
-    number: int
-    """The keyscan of the place, in the epoch of the packet."""
-    detector_version: str
-    """Detector version of the codes, and of the place as the robot sent it."""
-    count: int
-    """Keypoints of the place, as the robot sent it."""
-    rows: NDArray[np.uint16]
-    """Numbers of keypoints in the order in which they were sent, ascending, shape (M,)."""
-    codes: Codes
-    """Shape (M, 32)."""
-
-
-Body = (
-    Hello
-    | Keyscan
-    | Constraint
-    | Place
-    | WordPlace
-    | MapTile
-    | Correction
-    | Acknowledgement
-    | DetectorUpdate
-    | TaughtPlace
-)
+Body = Hello | Keyscan | Constraint | Place | WordPlace | MapTile | Correction | Acknowledgement | DetectorUpdate
 
 
 @dataclass(frozen=True, slots=True)

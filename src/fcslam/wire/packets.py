@@ -24,12 +24,11 @@ from fcslam.wire.limits import (
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
     SWEEP_VERSION,
-    TAUGHT_VERSION,
     WORDS_VERSION,
 )
-from fcslam.wire.messages import Body, Hello, Packet, PacketKind, TaughtPlace
+from fcslam.wire.messages import Body, Hello, Packet, PacketKind
 
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, TAUGHT_VERSION, SWEEP_VERSION)
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION)
 
 
 class Label(NamedTuple):
@@ -167,8 +166,6 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
 
 def _version(body: Body) -> int:
     match body:
-        case TaughtPlace():
-            return TAUGHT_VERSION
         case WordPlace() | MapTile():
             return WORDS_VERSION
         case Keyscan(ranges_m=ranges_m, sweep=sweep):

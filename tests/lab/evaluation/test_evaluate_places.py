@@ -12,10 +12,8 @@ from fcslam.lab.evaluation.places.scoring import (
     PretrainedVocabulary,
     brute_force,
     index_scores,
-    matching_descriptors,
     strategy_scorer,
 )
-from fcslam.lab.evaluation.places.sequences import in_sequence
 from fcslam.lab.evaluation.places.sets import read_place_set
 from fcslam.lab.evaluation.places.verification import ACCEPTED_INLIERS, PairVerifier
 from fcslam.metrics.retrieval import recall_at
@@ -122,32 +120,6 @@ def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsy
     curve = np.loadtxt(tmp_path / "generic" / "brute_force" / "curve_matches.csv", delimiter=",", skiprows=1, ndmin=2)
     assert curve[-1].tolist() == [curve[:, 0].min(), 1.0, 1.0]
     assert (tmp_path / "precision_recall.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.slow
-def test_the_order_of_a_stream_is_used_where_there_is_one(folders, tmp_path):
-    arguments = [*map(str, folders), "--strategy", "incremental", "--sequence", "-o", str(tmp_path)]
-    assert main(["evaluate", "places", *arguments]) == 0
-    with (tmp_path / "places.csv").open(encoding="utf-8", newline="") as file:
-        rows = {(row["set"], row["scorer"]) for row in csv.DictReader(file)}
-    both = ["brute force", "incremental"]
-    assert {scorer for name, scorer in rows if name == "generic"} == set(both)
-    kinds = ["", " NSS", " 3 in a row", " along 3", " NSS along 3"]
-    assert {scorer for name, scorer in rows if name == "tour"} == {scorer + kind for scorer in both for kind in kinds}
-
-
-def test_what_a_streams_order_adds_is_measured_on_the_same_pairs(described):
-    split, tour = described
-    assert list(in_sequence(split, brute_force)) == [""]
-    found = in_sequence(tour, brute_force)
-    np.testing.assert_array_equal(found[""], brute_force(tour))
-    assert all((similarity[~tour.place_set.admitted] == 0.0).all() for similarity in found.values())
-    for q, g in np.argwhere(found["NSS"]):
-        own = matching_descriptors(tour.queries[q].descriptors, tour.gallery[q - 1].descriptors)
-        assert found["NSS"][q, g] == pytest.approx(found[""][q, g] / own)
-    kept = {(int(q), int(g)) for q, g in np.argwhere(found["3 in a row"])}
-    assert {(q, q - 30) for q in range(32, 50)} <= kept  # the tour's second round from its third place on
-    assert (30, 0) not in kept
 
 
 @pytest.mark.parametrize(

@@ -49,9 +49,7 @@ class Fake:
 
 
 def grid_of(robots, **extra):
-    return InProcessGrid(
-        build_client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots), **extra
-    )
+    return InProcessGrid({robot.name: build_client_app(robot) for robot in robots}, **extra)
 
 
 def settings(**given):

@@ -74,7 +74,7 @@ class LiveFleet:
 
         def work():
             with contextlib.suppress(_EndedError), self.link(client.name) as link:
-                serve_requests(link, app or build_client_app(lambda _: client), robot_context(), self._end, _end)
+                serve_requests(link, app or build_client_app(client), robot_context(), self._end, _end)
 
         threading.Thread(target=work, daemon=True).start()
 

@@ -285,7 +285,7 @@ def test_a_stranger_finds_no_operation(fleet):
         httpx.Client(base_url=f"https://{fleet.address}", verify=ssl.create_default_context(cafile=fleet.ca)) as client,
     ):
         unknown = {client.request(method, path).status_code for path in paths for method in ("GET", "POST")}
-        operations = [f"/api/v1/robots/one/learning/{name}" for name in ("next", "alive", "reply/1", "taught")]
+        operations = [f"/api/v1/robots/one/learning/{name}" for name in ("next", "alive", "reply/1")]
         unsigned = {client.post(path).status_code for path in operations}
         client.headers["Authorization"] = "Bearer guessed"
         named = {client.post(path, content=b"x").status_code for path in operations}

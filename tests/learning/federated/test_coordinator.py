@@ -236,12 +236,6 @@ def test_only_a_share_takes_part_and_all_in_turn(tmp_path):
     assert len({report.robots for report in reports}) > 1
 
 
-def test_two_robots_of_one_name_count_once(tmp_path):
-    _, reports = run([Fake("twin"), Fake("twin"), Fake("other")], tmp_path)
-    assert [report.robots for report in reports] == [("other", "twin")] * 2
-    assert all("of one name" in report.left_out["another twin"] for report in reports)
-
-
 def test_bytes_are_those_of_the_arrays(tmp_path):
     _, reports = run([Fake("a"), Fake("b")], tmp_path)
     content = sum(array.nbytes for array in START.values())

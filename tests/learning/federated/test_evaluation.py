@@ -35,7 +35,7 @@ class Coming(InProcessGrid):
     """Robots that are there from some round on."""
 
     def __init__(self, robots, since):
-        super().__init__(build_client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots))
+        super().__init__({robot.name: build_client_app(robot) for robot in robots})
         self._first, self._since = robots[0], since
 
     def get_node_ids(self):

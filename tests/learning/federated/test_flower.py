@@ -36,7 +36,7 @@ def test_another_version_is_refused_with_the_one_that_is_needed(other):
 
 
 def test_a_message_asks_the_task_identity_who_sends_it():
-    flower.InProcessGrid(flower.ClientApp(), 1)
+    flower.InProcessGrid({"a": flower.ClientApp()})
     identity = flower.TaskIdentity
     assert (identity.task_id, identity.run_id, identity.node_id) == (flower.RUN_ID,) * 3
     message = flower.Message(flower.RecordDict({}), flower.FIRST_NODE, flower.MessageType.TRAIN)
@@ -53,7 +53,7 @@ def test_our_grids_implement_all_of_flowers_grid(grid):
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_a_strategy_asks_every_node_of_a_selection(strategy):
     chosen = create_strategy(FederatedSettings(strategy=strategy, normalisation="frozen"))
-    flower.InProcessGrid(flower.ClientApp(), 3)
+    flower.InProcessGrid({name: flower.ClientApp() for name in "abc"})
     arrays = flower.ArrayRecord({"a": flower.Array(np.zeros(2, np.float32))})
     messages = list(chosen.configure_train(1, arrays, flower.ConfigRecord(), flower.NodeSelection([2, 4])))
     assert sorted(message.metadata.dst_node_id for message in messages) == [2, 4]

@@ -28,7 +28,7 @@ def asked(tmp_path):
 
 
 def test_while_no_process_learns_a_robot_is_to_try_again(asked):
-    assert {asked(operation) for operation in ("next", "alive", "taught", "reply/7")} == {503}
+    assert {asked(operation) for operation in ("next", "alive", "reply/7")} == {503}
 
 
 @pytest.mark.attack

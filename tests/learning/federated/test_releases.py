@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.fleet_learning import RELEASE, MissionTeacher
+from fcslam.learning.federated.fleet_learning import RELEASE, MissionJudge
 from fcslam.learning.federated.live_settings import FleetLearningSettings
 from fcslam.learning.federated.releases import Releases
 
@@ -87,9 +87,9 @@ class Mission:
 def test_a_version_that_finds_fewer_places_of_the_mission_is_taken_back(releases, tmp_path, differences, in_use):
     releases.add("light-1", b"", weights(1.0))
     told = []
-    teacher = MissionTeacher(tmp_path, FleetLearningSettings(), releases, lambda *event: told.append(event))
+    judge = MissionJudge(tmp_path, FleetLearningSettings(), releases, lambda *event: told.append(event))
     mission = Mission(differences)
-    teacher.judge(mission)
+    judge.judge(mission)
     assert mission.asked == [("light-1", "light-0")]
     assert releases.in_use == in_use
     assert told == ([(RELEASE, 0)] if in_use == 0 else [])

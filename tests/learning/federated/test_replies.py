@@ -117,16 +117,6 @@ def test_who_judges_oddly_does_not_judge(odd, tmp_path):
     assert state.best_scores == {"good": 0.5}
 
 
-def test_who_does_not_say_a_name_is_not_asked(tmp_path):
-    def nameless(content):
-        del content["config"]
-
-    robots = [Fake("bad"), Fake("good")]
-    _, reports = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.QUERY, nameless))
-    assert [report.robots for report in reports] == [("good",)] * 2
-    assert robots[0].asked == []
-
-
 def test_reasons_are_short_lines(tmp_path):
     robots = [Fake("bad"), Fake("good")]
     grid = grid_of(robots)

@@ -41,14 +41,6 @@ def places(
     verify: Annotated[
         bool, typer.Option("--verify", help="Also verify the geometry of the most similar places.")
     ] = False,
-    sequence: Annotated[
-        bool,
-        typer.Option(
-            "--sequence",
-            help="For sets that are one stream, also evaluate similarities relative to the previous place's, and the "
-            "agreement of consecutive places.",
-        ),
-    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
@@ -59,9 +51,7 @@ def places(
     strategies = _strategies(strategy or ("static", "windowed", "incremental"))
     output = output or new_folder(EVALUATIONS)
     with ProgressDisplay(notices(quiet)) as display:
-        results = _evaluate(
-            sets, features, label or (), train_on or (), strategies, display, verify=verify, sequence=sequence
-        )
+        results = _evaluate(sets, features, label or (), train_on or (), strategies, display, verify=verify)
     write_results(output, results)
     save(curves_figure(results), output / "precision_recall.png")
     _show(answers(), results, output)
@@ -76,12 +66,10 @@ def _evaluate(
     display: "ProgressDisplay",
     *,
     verify: bool,
-    sequence: bool,
 ) -> "list[SetResult]":
     from fcslam.lab.evaluation.places.features import choose_features, describe_sets, describe_training
     from fcslam.lab.evaluation.places.report import evaluate_set
     from fcslam.lab.evaluation.places.scoring import choose_scorers
-    from fcslam.lab.evaluation.places.sequences import in_sequence, plain
     from fcslam.lab.evaluation.places.verification import PairVerifier
     from fcslam.places.vocabulary import VocabularyConfig
 
@@ -91,10 +79,8 @@ def _evaluate(
     described = describe_sets(sets, labels, chosen, described_one)
     scorers = choose_scorers(strategies, VocabularyConfig(), training, SEED)
     compared_one = display.start("comparing", len(scorers) * len(described))
-    variants = in_sequence if sequence else plain
     return [
-        evaluate_set(each, scorers, PairVerifier(each) if verify else None, SEED, compared_one, variants)
-        for each in described
+        evaluate_set(each, scorers, PairVerifier(each) if verify else None, SEED, compared_one) for each in described
     ]
 
 

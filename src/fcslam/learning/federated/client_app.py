@@ -1,13 +1,13 @@
 """Wraps a federated client into Flower's ``ClientApp``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from fcslam.errors import FcslamError
 from fcslam.learning.federated.client import FederatedClient, JudgingClient
 from fcslam.learning.federated.codec import weights_to_record
-from fcslam.learning.federated.flower import ClientApp, Context, Error, Message
-from fcslam.learning.federated.messages import PAIRS_KEY, client_reply, identity_reply, read_request
+from fcslam.learning.federated.flower import ClientApp, Context, Error, InProcessGrid, Message
+from fcslam.learning.federated.messages import PAIRS_KEY, client_reply, read_request
 
 CLIENT_ERROR: Final = 1000
 """Code of an error that a client explains; Flower's own codes are smaller."""
@@ -15,31 +15,27 @@ CLIENT_ERROR: Final = 1000
 Handler = Callable[[Message, FederatedClient], Message]
 
 
-def build_client_app(client_of: Callable[[Context], FederatedClient]) -> ClientApp:
-    """The app that answers queries for the name, training requests and evaluation requests.
+def in_process_grid(clients: Iterable[FederatedClient]) -> InProcessGrid:
+    """A fleet of these clients in this process."""
+    return InProcessGrid({client.name: build_client_app(client) for client in clients})
 
-    Args:
-        client_of: gives the client that a Flower context stands for.
-    """
+
+def build_client_app(client: FederatedClient) -> ClientApp:
+    """The app that answers the training and evaluation requests of a client."""
     app = ClientApp()
 
     def handled(handler: Handler) -> Callable[[Message, Context], Message]:
-        def handle(message: Message, context: Context) -> Message:
+        def handle(message: Message, _context: Context) -> Message:
             try:
-                return handler(message, client_of(context))
+                return handler(message, client)
             except FcslamError as error:
                 return Message(Error(CLIENT_ERROR, " ".join(str(error).split())), reply_to=message)
 
         return handle
 
-    app.query()(handled(_identify))
     app.train()(handled(_train))
     app.evaluate()(handled(_evaluate))
     return app
-
-
-def _identify(message: Message, client: FederatedClient) -> Message:
-    return Message(identity_reply(client.name), reply_to=message)
 
 
 def _train(message: Message, client: FederatedClient) -> Message:

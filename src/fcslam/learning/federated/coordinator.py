@@ -6,7 +6,7 @@ coordinator that was killed continues from its last checkpoint, with the same re
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
@@ -39,7 +39,6 @@ from fcslam.learning.federated.messages import (
     request_config,
 )
 from fcslam.learning.federated.privacy import epsilon
-from fcslam.learning.federated.registry import RobotRegistry, sample_robots
 from fcslam.learning.federated.replies import RoundReplies, printable_line, read_replies
 from fcslam.learning.federated.screening import screen, update_length
 from fcslam.learning.federated.settings import FederatedSettings
@@ -96,7 +95,6 @@ class Coordinator:
         self._grid, self._settings, self._folder, self._hooks = grid, settings, folder, hooks
         self._initial = self._model(initial)
         self._run_id = run_id(settings, self._initial.version)
-        self._robots = RobotRegistry(grid, settings.deadline_s)
         self._aggregator = Aggregator(settings, {}, hooks.strategy)
 
     def run(self) -> CoordinatorState:
@@ -186,7 +184,7 @@ class Coordinator:
         """One request to a sample of the robots. The state counts the robots that were asked."""
         connected = self._connected()
         rng = np.random.default_rng([self._settings.training.seed, state.rounds_done, _SAMPLING_SEED])
-        chosen = sample_robots(connected, self._settings.participation, self._settings.minimum_robots, rng)
+        chosen = _sample(connected, self._settings.participation, self._settings.minimum_robots, rng)
         # Counted before the request leaves: after a crash nobody could say which updates have left the robots.
         state = replace(state, times_asked=Counter(state.times_asked) + Counter(chosen))
         write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
@@ -202,8 +200,6 @@ class Coordinator:
         refused = screen(replies.weights, model.weights, self._settings.screening, frozen, state.update_length)
         for robot, reason in refused.items():
             replies.leave_out(robot, reason)
-        duplicates = self._robots.duplicates
-        replies.add_notes({f"another {robot}": "two of one name are there, one is not asked" for robot in duplicates})
         return replies, state
 
     def _aggregate(self, replies: RoundReplies, state: CoordinatorState) -> Weights:
@@ -235,7 +231,7 @@ class Coordinator:
         if newcomers and self._hooks.evaluate_fn is not None:
             best = {PublicImages(): self._hooks.evaluate_fn(state.best)}
         elif newcomers:
-            nodes = {robot: node for robot, node in self._robots.connected().items() if robot in newcomers}
+            nodes = {robot: node for robot, node in self._present().items() if robot in newcomers}
             measured, failed = self._measure_on(nodes, self._model(state.best), state.rounds_done)
             best = {robot: measured[robot] for robot in measured}
             replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
@@ -246,7 +242,7 @@ class Coordinator:
         self, gate: GateSettings, model: GlobalModel, state: CoordinatorState, replies: RoundReplies
     ) -> VersionComparison:
         """Have all robots that are there judge the model and the best one on the pairs that they hold out."""
-        connected, reports = self._robots.connected(), []
+        connected, reports = self._present(), []
         for judged in (model, self._model(state.best)):
             found, failed = self._ask(connected, judged, state.rounds_done, _judgement)
             replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
@@ -331,9 +327,15 @@ class Coordinator:
                 failed[robot] = printable_line(str(error))
         return found, failed
 
+    def _present(self) -> dict[str, int]:
+        """Node numbers by robot, in the order of the names."""
+        nodes = self._grid.get_node_ids()
+        names = self._grid.robot_names()  # asked last: whoever came meanwhile has a name
+        return dict(sorted((names[node], node) for node in nodes))
+
     def _connected(self) -> dict[str, int]:
         """Node numbers by robot, as soon as enough robots are connected."""
-        while len(connected := self._robots.connected()) < self._settings.minimum_robots:
+        while len(connected := self._present()) < self._settings.minimum_robots:
             self._wait_or_fail(f"{len(connected)} robots are there, {self._settings.minimum_robots} needed")
         return connected
 
@@ -368,3 +370,20 @@ def _means(rows: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Mean of each loss over the robots."""
     names = dict.fromkeys(name for row in rows.values() for name in row)
     return {name: float(np.mean([row[name] for row in rows.values() if name in row])) for name in names}
+
+
+def _sample(names: Iterable[str], fraction: float, minimum: int, rng: np.random.Generator) -> list[str]:
+    """Draw robots for a round.
+
+    Args:
+        names: of the connected robots.
+        fraction: share of them to draw, in (0, 1].
+        minimum: number of robots to draw at least, if enough are connected.
+        rng: source of randomness.
+
+    Returns:
+        Names in alphabetical order.
+    """
+    everyone = sorted(names)
+    count = min(max(int(np.ceil(fraction * len(everyone))), minimum), len(everyone))
+    return [everyone[index] for index in sorted(rng.choice(len(everyone), count, replace=False))]

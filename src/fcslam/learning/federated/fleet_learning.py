@@ -1,8 +1,7 @@
 """The process in which the fleet of a service learns: ``python -m fcslam.learning.federated.fleet_learning``.
 
-One thread runs the rounds. Another one teaches: it follows the open mission, gives robots the codes of others, and
-takes a released version back that turns out worse. On stdout the process writes events as the worker of a mission does.
-It ends with its stdin.
+One thread runs the rounds. Another one follows the open mission and takes a released version back that turns out worse.
+On stdout the process writes events as the worker of a mission does. It ends with its stdin.
 """
 
 import argparse
@@ -14,7 +13,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -30,7 +29,6 @@ from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.learning.federated.launch import open_port, waiting
-from fcslam.learning.federated.lessons import lessons
 from fcslam.learning.federated.live_settings import RELEASE, RELEASES, FleetLearningSettings
 from fcslam.learning.federated.mission_places import MissionPlaces
 from fcslam.learning.federated.networks import weights_version
@@ -42,35 +40,23 @@ from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import READY
 
 NICENESS: Final = 10
+MISSION_EVERY_S: Final = 30.0
+"""Time between two looks at the mission."""
 _log = logging.getLogger("fcslam.learning")
 
 Tell = Callable[[str, int], None]
 
 
 @dataclass(slots=True)
-class MissionTeacher:
-    """Follows the open mission, teaches its robots, and judges the version in use."""
+class MissionJudge:
+    """Follows the open mission and judges the version in use on it."""
 
     data: Path
     """The service's folder of missions."""
     settings: FleetLearningSettings
     releases: Releases
     tell: Tell
-    _batches: dict[str, bytes] = field(default_factory=dict)
     _mission: MissionPlaces | None = None
-    taught_bytes: int = 0
-    """Size of all codes that robots fetched, without repetitions."""
-    _fetched: dict[str, bytes] = field(default_factory=dict)
-
-    def teach(self, robot: str) -> bytes:
-        """The codes for a robot, as a batch of packets."""
-        batch = self._batches.get(robot, b"")
-        if batch != self._fetched.get(robot, b""):
-            self._fetched[robot] = batch
-            self.taught_bytes += len(batch)
-            _log.info("%s gets %.1f kB of codes, all robots %.1f kB so far", robot, len(batch) / 1e3,
-                      self.taught_bytes / 1e3)  # fmt: skip
-        return batch
 
     def step(self) -> None:
         """Look at the mission once.
@@ -81,11 +67,7 @@ class MissionTeacher:
         name = (self.data / "open").read_text(encoding="utf-8").strip()
         if self._mission is None or self._mission.folder.name != name:
             self._mission = MissionPlaces(MissionFolder(self.data / "missions" / name))
-            self._batches = {}
-        if not self._mission.follow():
-            return
-        self._batches = lessons(self._mission)
-        if self.releases.is_judged:
+        if self._mission.follow() and self.releases.is_judged:
             self.judge(self._mission)
 
     def judge(self, mission: MissionPlaces) -> None:
@@ -100,15 +82,15 @@ class MissionTeacher:
 
     def run(self, stop: threading.Event) -> None:
         """Follow the mission until ``stop`` is set."""
-        while not stop.wait(self.settings.teach_every_s):
+        while not stop.wait(MISSION_EVERY_S):
             try:
                 self.step()
             except (FcslamError, OSError) as error:  # the service may open another mission at this moment
-                _log.error("nothing is taught now: %s", error)
+                _log.error("the mission is not followed now: %s", error)
 
 
 def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket, tell: Tell) -> None:
-    """Learn until all rounds are done, and teach as long as the process lives.
+    """Learn until all rounds are done, and judge the version in use as long as the process lives.
 
     Raises:
         TrainingError: the output folder belongs to other rounds.
@@ -116,7 +98,7 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
     """
     start = _announced(data)
     releases = Releases.opened(output / RELEASES, start.read_bytes(), describe_detector_file(start).version)
-    teacher = MissionTeacher(data, settings, releases, tell)
+    judge = MissionJudge(data, settings, releases, tell)
     if releases.is_judged or releases.taken_back:
         tell(RELEASE, releases.in_use)
     encoder, options = settings.federated.training.encoder, ExecutionOptions(device="cpu", threads=1)
@@ -144,9 +126,9 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
             _log.info("%s", line)
 
     everybody = Authenticator(None)  # the service has asked for the token
-    with open_port(listener, None, everybody, say_once, teacher.teach) as grid:
+    with open_port(listener, None, everybody, say_once) as grid:
         stop = threading.Event()
-        thread = threading.Thread(target=teacher.run, args=(stop,), name="teacher", daemon=True)
+        thread = threading.Thread(target=judge.run, args=(stop,), name="judge", daemon=True)
         thread.start()
         tell(READY, 0)
         run_job(job, options, ProgressCallbacks(rounds=report, released=release), grid, waiting(say_once))

@@ -89,17 +89,6 @@ class RobotLink(HttpClient):
         status, _, answer = self._post(f"reply/{number}", body)
         return None if status == httpx.codes.NO_CONTENT else answer.decode(errors="replace") or f"status {status}"
 
-    def taught(self) -> bytes:
-        """A batch of packets with the codes that the fleet gives to this robot's places; empty without any.
-
-        Raises:
-            TrainingError, ConnectionError: as in ``fetch``.
-        """
-        status, _, body = self._post("taught")
-        if status not in (httpx.codes.OK, httpx.codes.NO_CONTENT):
-            raise ConnectionError(f"the server answers with status {status}")
-        return body
-
     def show_alive(self) -> None:
         """Show the server that the robot is still there.
 

@@ -3,7 +3,6 @@
     POST /api/v1/robots/ROBOT/learning/next            204, or a request with its number in a header; waits for one
     POST /api/v1/robots/ROBOT/learning/alive           204; a robot at work shows that it is still there
     POST /api/v1/robots/ROBOT/learning/reply/NUMBER    204; the reply to a request
-    POST /api/v1/robots/ROBOT/learning/taught          204, or codes that others gave to places of this robot
 
 A robot shows its token or its certificate, as for its packets; anybody else gets 401 before the body is read. No
 operation starts a run, adds a token or names a program: the operator does this on the server's command line.
@@ -48,13 +47,6 @@ MAX_UNWANTED_BYTES: Final = 64 * 2**20
 _UNWANTED: Final = "nobody waits for this reply"
 
 OnNotice = Callable[[str], None]
-Teach = Callable[[str], bytes]
-"""Gives what a robot is taught, a batch of packets; empty: nothing."""
-
-
-def teach_nothing(_robot: str) -> bytes:
-    """Default: teach nothing."""
-    return b""
 
 
 class FleetApp:
@@ -64,13 +56,10 @@ class FleetApp:
         grid: holds requests and replies.
         authenticator: knows the tokens of robots; an open one believes the name in the path.
         on_notice: called with one line for each kind of refused request; from the thread of the server.
-        teach: called with the name of a robot that asks what it is taught.
     """
 
-    def __init__(
-        self, grid: FleetGrid, authenticator: Authenticator, on_notice: OnNotice, teach: Teach = teach_nothing
-    ) -> None:
-        self._grid, self._authenticator, self._on_notice, self._teach = grid, authenticator, on_notice, teach
+    def __init__(self, grid: FleetGrid, authenticator: Authenticator, on_notice: OnNotice) -> None:
+        self._grid, self._authenticator, self._on_notice = grid, authenticator, on_notice
         self._open: Counter[str] = Counter()
         self._notices: set[str] = set()
         self._is_closing = False
@@ -81,12 +70,7 @@ class FleetApp:
 
     def asgi(self) -> Starlette:
         """The application for an ASGI server."""
-        operations = {
-            "next": self._next,
-            "alive": self._alive,
-            "reply/{number:int}": self._reply,
-            "taught": self._taught,
-        }
+        operations = {"next": self._next, "alive": self._alive, "reply/{number:int}": self._reply}
         routes = [
             Route(f"{PATH}/{operation}", self._guarded(handler), methods=["POST"])
             for operation, handler in operations.items()
@@ -149,10 +133,6 @@ class FleetApp:
             return self._refusal(request, 413, f"{robot}: {reason}")
         is_taken = await run_in_threadpool(self._grid.store_reply, robot, number, body)
         return Response(status_code=204) if is_taken else PlainTextResponse(_UNWANTED, 409)
-
-    async def _taught(self, _request: Request, robot: str) -> Response:
-        batch = self._teach(robot)
-        return Response(batch) if batch else Response(status_code=204)
 
     async def _body(self, request: Request, limit: int) -> bytes | None:
         """The body, read no further than ``limit`` bytes; None if it is longer."""

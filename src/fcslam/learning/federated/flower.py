@@ -124,8 +124,8 @@ class RobotGrid(Grid):
         use_own_identity()
 
     def robot_names(self) -> dict[int, str]:
-        """Names by node number of the robots whose names are known. The others are asked."""
-        return {}
+        """Names of the robots by node number."""
+        raise NotImplementedError
 
     def set_run(self, run: Any) -> None:
         """Do nothing: there is one run."""
@@ -148,21 +148,22 @@ class InProcessGrid(RobotGrid):
     Every robot has the whole deadline for itself, as if all worked at the same time.
 
     Args:
-        app: of the robots; ``partition-id`` in the context's node configuration is the number of the robot, from 0.
-        robots: number of robots.
+        apps: of the robots by name.
         clock: gives seconds since any fixed moment.
     """
 
-    def __init__(self, app: ClientApp, robots: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, apps: Mapping[str, ClientApp], clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
-        self._app, self._clock = app, clock
+        self._robots = dict(enumerate(apps.items(), FIRST_NODE))
+        self._clock = clock
         self._replies: dict[str, Message] = {}
         self._pushed = 0
         # Contexts stay from round to round, as Flower's daemons keep them.
-        self._contexts = {
-            FIRST_NODE + index: Context(RUN_ID, FIRST_NODE + index, {"partition-id": index}, RecordDict(), {})
-            for index in range(robots)
-        }
+        self._contexts = {node: Context(RUN_ID, node, {}, RecordDict(), {}) for node in self._robots}
+
+    def robot_names(self) -> dict[int, str]:
+        """Names of the robots by node number."""
+        return {node: name for node, (name, _) in self._robots.items()}
 
     def get_node_ids(self) -> list[int]:
         """Node numbers of all robots; in one process they are always connected."""
@@ -192,8 +193,9 @@ class InProcessGrid(RobotGrid):
         return replies
 
     def _ask(self, message: Message) -> Message:
+        node = message.metadata.dst_node_id
         try:
-            return self._app(message, self._contexts[message.metadata.dst_node_id])
+            return self._robots[node][1](message, self._contexts[node])
         except Exception as error:  # as across a network, one robot's failure does not end the training of the others
             return error_reply(f"{type(error).__name__}: {error}", message)
 

@@ -6,13 +6,12 @@ choice is made once for each keyframe and stays, also when the map moves.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.cloud.teaching import PlacePoints
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.features.dense import find_peaks, sample_codes
 from fcslam.features.detector import ImageFeatures, OnnxConfig
@@ -21,7 +20,7 @@ from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
 from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
-from fcslam.records import FloatArray, frozen
+from fcslam.records import Codes, FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")
 """Columns that a robot reports about each pair: right matches as a share of the shared points, and whether the pair is
@@ -35,6 +34,15 @@ MOST_PAIRS: Final = 1000
 
 Judgement = NDArray[np.float32]
 """Shape (P, 2): a row for each pair, by ``COLUMNS``; a place is found (1), not found (0), or NaN without others."""
+
+
+class PlacePoints(NamedTuple):
+    """The keypoints of a camera place in space."""
+
+    positions: FloatArray
+    """Shape (N, 3), metres."""
+    codes: Codes
+    """Shape (N, 32)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

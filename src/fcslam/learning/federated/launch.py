@@ -11,7 +11,7 @@ from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
-from fcslam.learning.federated.fleet_server import FleetApp, Teach, listening, teach_nothing
+from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.service.http.authentication import Authenticator
@@ -69,11 +69,10 @@ def open_port(
     tls: tuple[Path, Path] | None,
     authenticator: Authenticator,
     on_notice: OnNotice,
-    teach: Teach = teach_nothing,
 ) -> Iterator[FleetGrid]:
     """Let robots fetch requests while the block runs; arguments as for ``serve`` and ``FleetApp``."""
     grid = FleetGrid()
-    with listening(FleetApp(grid, authenticator, on_notice, teach), listener, tls):
+    with listening(FleetApp(grid, authenticator, on_notice), listener, tls):
         yield grid
 
 
@@ -90,4 +89,4 @@ def join(link: RobotLink, client: RobotClient, on_notice: OnNotice) -> None:
         CloudError: the server's certificate is not trusted.
     """
     with link:
-        serve_requests(link, build_client_app(lambda _context: client), robot_context(), on_notice)
+        serve_requests(link, build_client_app(client), robot_context(), on_notice)

@@ -53,11 +53,11 @@ class LearningBeside:
         """Whether it has ended by itself."""
         return self._process.poll() is not None
 
-    def set_idle(self, first_epoch: int | None) -> None:
-        """Say that the robot is idle, with the epoch of its first session; None: it is busy."""
+    def set_idle(self, is_idle: bool) -> None:
+        """Say whether the robot is idle, or busy."""
         assert self._process.stdin is not None
         with suppress(OSError):
-            self._process.stdin.write(b"busy\n" if first_epoch is None else f"idle {first_epoch}\n".encode())
+            self._process.stdin.write(b"idle\n" if is_idle else b"busy\n")
             self._process.stdin.flush()
 
     def close(self) -> None:

@@ -104,7 +104,3 @@ class FleetLearningSettings(Settings):
         default_factory=LiveRounds, description="rounds of training; other keys are those of the federated settings"
     )
     gate: GateSettings = Field(default_factory=GateSettings, description="release of versions")
-    teach_every_s: float = Field(
-        default=30.0, gt=0.0, description="time between two computations of taught codes, and of the judgement on a "
-        "released version [s]"
-    )  # fmt: skip

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client import RobotClient, seeded_noise
-from fcslam.learning.federated.client_app import build_client_app
-from fcslam.learning.federated.flower import Context, InProcessGrid
+from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.learning.trainer import ExecutionOptions
 
@@ -48,8 +47,4 @@ def federate_locally(
         )
         for name, folder in zip(names, folders, strict=True)
     ]
-
-    def client_of(context: Context) -> RobotClient:
-        return clients[int(context.node_config["partition-id"])]
-
-    return run_job(job, options, callbacks, InProcessGrid(build_client_app(client_of), len(clients)))
+    return run_job(job, options, callbacks, in_process_grid(clients))

@@ -61,11 +61,6 @@ def read_request(content: RecordDict) -> ClientRequest:
         ) from error
 
 
-def identity_reply(robot: str) -> RecordDict:
-    """The reply to a query for the robot's name."""
-    return client_reply(robot, "", {})  # it is about no weights, so it has no version
-
-
 def client_reply(
     robot: str, version: str, metrics: Mapping[str, float], arrays: ArrayRecord | None = None
 ) -> RecordDict:

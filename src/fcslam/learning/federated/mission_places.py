@@ -4,7 +4,7 @@ They come from the packets that the service stored and from the live run folder,
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -12,10 +12,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fcslam.cloud.sessions import robot_of, session_name
-from fcslam.cloud.teaching import PlacePoints
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
-from fcslam.learning.federated.held_out import APART_M, inliers
+from fcslam.learning.federated.held_out import APART_M, PlacePoints, inliers
 from fcslam.learning.revisits import FARTHEST_M, WIDEST_RAD
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel, ClosureStatus, FloatArray, Place
@@ -69,14 +68,9 @@ class MissionPlaces:
         self._live = live
         return True
 
-    def pairs(self) -> Iterator[tuple[PlaceKey, PlaceKey, FloatArray]]:
-        """Places of two robots that accepted closures connect, each pair once, with the pose of the second base in the
-        first by the fleet's map, shape (3,)."""
-        seen = set()
-        for first, second, T_first_second in self._near_closures():
-            if (first, second) not in seen:
-                seen.add((first, second))
-                yield first, second, T_first_second
+    def pairs(self) -> Iterable[tuple[PlaceKey, PlaceKey]]:
+        """Places of two robots that accepted closures connect, each pair once."""
+        return dict.fromkeys(self._near_closures())
 
     def described_by(self, first: str, second: str) -> dict[PlaceKey, tuple[PlacePoints, PlacePoints]]:
         """The places that two detector versions described, by both."""
@@ -90,7 +84,7 @@ class MissionPlaces:
         """For each pair of places that both versions described: found (1) or not (0) with the version, less with the
         one before, shape (N,). A pair is found if it is more similar than any two different places."""
         described = self.described_by(version, before)
-        same = [(a, b) for a, b, _ in self.pairs() if a in described and b in described]
+        same = [(a, b) for a, b in self.pairs() if a in described and b in described]
         apart = self._apart(described)
         if not apart:
             return np.empty(0)
@@ -116,7 +110,7 @@ class MissionPlaces:
         finally:
             store.close()
 
-    def _near_closures(self) -> Iterator[tuple[PlaceKey, PlaceKey, FloatArray]]:
+    def _near_closures(self) -> Iterator[tuple[PlaceKey, PlaceKey]]:
         if self.run is None:
             return
         by_session = defaultdict(list)
@@ -133,7 +127,7 @@ class MissionPlaces:
                 for j in _near(b, closure.stamp_j, by_session[names[1]]):
                     T_i_j = se2.between(a.T_map_base[i], b.T_map_base[j])
                     if np.hypot(*T_i_j[:2]) <= FARTHEST_M and abs(T_i_j[2]) <= WIDEST_RAD:
-                        yield (PlaceKey(names[0], i), PlaceKey(names[1], j), T_i_j)
+                        yield (PlaceKey(names[0], i), PlaceKey(names[1], j))
 
     def _apart(self, described: Mapping[PlaceKey, object]) -> list[tuple[PlaceKey, PlaceKey]]:
         """Pairs of these places that are far from each other in one map."""

@@ -1,4 +1,4 @@
-"""Examples of one robot: revisits in its own map, and codes that the fleet gave to its own points."""
+"""Examples of one robot: what it saw again in its own map."""
 
 import json
 from collections.abc import Sequence
@@ -14,14 +14,11 @@ from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.geometry import se2
 from fcslam.learning.federated.held_out import HeldOutPairs
 from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, TaughtImage, vote
-from fcslam.learning.revisits import FEWEST_SHARED, Keyframe, revisits_in_map
+from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, vote
+from fcslam.learning.revisits import Keyframe, revisits_in_map
 from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
 from fcslam.storage.files import write_file
-from fcslam.wire.messages import Packet, TaughtPlace
-from fcslam.wire.quantisation import quantise_keypoints
-from fcslam.wire.streams import ascending
 
 SPLIT_FILE: Final = "split.json"
 """Says of each keyframe that was ever used whether it is held out."""
@@ -35,16 +32,12 @@ class OwnExamples:
     held_out: HeldOutPairs
 
 
-def own_examples(
-    folder: Path, settings: RobotLearningSettings, taught: Sequence[Packet], first_epoch: int
-) -> OwnExamples:
+def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
     """Read the keyframes of a robot and find what it saw again.
 
     Args:
         folder: of the keyframes.
         settings: of the robot.
-        taught: what the fleet teaches, checked; what does not fit a keyframe is left out.
-        first_epoch: epoch of the first session of this start.
     """
     kept = read_keyframes(folder, settings.most_keyframes)
     version = kept[-1].detector_version if kept else ""
@@ -56,16 +49,8 @@ def own_examples(
     found = revisits_in_map(frames, poses)
     pairs = [_pair(frames, poses, i, j, rows) for i, j, rows in found.pairs]
     voted = [vote(k, frames[k].features.keypoints_px, each) for k, each in enumerate(found.sightings)]
-    numbers = {(first_epoch + frame.part, frame.image.keyscan): number for number, (frame, _) in enumerate(trained)}
-    images = []
-    for packet in taught:
-        body = packet.body
-        if isinstance(body, TaughtPlace) and body.detector_version == version:
-            number = numbers.get((packet.epoch, body.number))
-            image = None if number is None else _taught(frames[number], trained[number][0], number, body)
-            images += [] if image is None else [image]
     votes = [each for each in voted if each is not None]
-    examples = RevisitExamples([frame.image for frame in frames], pairs, images, votes)
+    examples = RevisitExamples([frame.image for frame in frames], pairs, votes)
     return OwnExamples(examples, HeldOutPairs.of(*_keyframes(judged)))
 
 
@@ -105,16 +90,3 @@ def _in_map(frame: Keyframe, T_own_base: FloatArray) -> FloatArray:
     positions = frame.positions.copy()
     positions[:, :2] = se2.transform(T_own_base, positions[:, :2])
     return positions
-
-
-def _taught(frame: Keyframe, kept: KeptKeyframe, number: int, taught: TaughtPlace) -> TaughtImage | None:
-    """The taught codes at the pixels of their keypoints; None if they are few, or of another place."""
-    rows = np.flatnonzero(frame.placed)[: taught.count]
-    if len(rows) < taught.count or len(taught.rows) < FEWEST_SHARED:
-        return None
-    # The place was sent in the coordinates of its keyscan, rounded and sorted by position.
-    sent = frame.positions[rows]
-    sent[:, :2] = se2.transform(kept.image.T_keyscan_image, sent[:, :2])
-    chosen = rows[ascending(quantise_keypoints(sent.astype(np.float32)))][taught.rows]
-    positions = _in_map(frame, kept.T_own_base)[chosen]
-    return TaughtImage(number, frame.features.keypoints_px[chosen], taught.codes, positions)

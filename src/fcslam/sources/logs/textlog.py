@@ -26,7 +26,6 @@ from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLi
 from fcslam.sources.logs.laser import SICK_MAX_RANGE_M, Interleaving, LogBeams, first_beams
 from fcslam.sources.logs.overview import LogReading, Overview
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
-from fcslam.sources.logs.turns import TurnCheck
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import UNKNOWN_POSE, Pose, pose_array
 from fcslam.sources.returns import RangeSample, placeholder_note, without
@@ -104,7 +103,7 @@ class TextLog:
     def _reading(self) -> LogReading:
         """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit = Audit()
-        overview, sample, turns = Overview(), RangeSample(), TurnCheck()
+        overview, sample = Overview(), RangeSample()
         declared, interleaving = self._first_look()
         gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
         for number, line in _sound(self._all_lines(), audit):
@@ -112,28 +111,21 @@ class TextLog:
                 if not gate.admits(number, line.stamp, log_beams.of(line)):
                     continue
                 _note_clock(number, line, audit)
-                self._sample(sample, turns, line, declared)
+                self._sample(sample, line)
             overview.add(line)
         reading = overview.conclude(self._path, audit.faults(), interleaving)
         sample.check(self._path, "", "the unit of the ranges")
         placeholders = sample.placeholders()
-        found = (*placeholder_note(self._path, placeholders, ""), *turns.note(self._path, declared))
-        notes = (*reading.survey.notes, *found)
+        notes = (*reading.survey.notes, *placeholder_note(self._path, placeholders, ""))
         return reading._replace(survey=replace(reading.survey, notes=notes), placeholders=placeholders)
 
-    def _sample(self, sample: RangeSample, turns: TurnCheck, line: ScanLine, declared: Beams) -> None:
-        for_sample = sample.wants(line.T_odom_base)
-        is_assumed = line.stated is None and line.beam_count == declared.beam_count
-        for_turns = is_assumed and turns.wants(line.T_odom_base)
-        if not (for_sample or for_turns):
+    def _sample(self, sample: RangeSample, line: ScanLine) -> None:
+        if not sample.wants(line.T_odom_base):
             return
         max_range_m = line.stated.max_range_m if line.stated is not None else SICK_MAX_RANGE_M
         with suppress(ValueError):
             ranges_m = parse_ranges(line, self._dialect.metres_per_range_unit, 0, Audit())
-            if for_sample:
-                sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
-            if for_turns:
-                turns.add(line.T_odom_base, ranges_m, declared)
+            sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
 
     def _first_look(self) -> tuple[Beams, Interleaving | None]:
         """The usual beams of the first scans, and whether they interleave."""

@@ -62,14 +62,12 @@ class Frame(NamedTuple):
     @property
     def laser(self) -> int:
         """Index of the scan's laser."""
-        return 0 if self._is_version_1 else int(self.content["laser"])
+        return int(self.content["laser"])
 
     def beams(self, lasers: Sequence[LaserModel]) -> Beams:
         """The scan's beams; raises ValueError if it has no laser of the recording or no sane beams."""
         if not self.laser < len(lasers):
             raise ValueError("no laser of this recording")
-        if self._is_version_1:
-            return lasers[self.laser].beams
         beam_count, *angles_rad = (self.content[name].item() for name in Beams._fields)
         beams = Beams(beam_count, *angles_rad)
         check_beams(beams)
@@ -77,8 +75,6 @@ class Frame(NamedTuple):
 
     def sweep(self) -> Sweep | None:
         """The scan's sweep; None: all beams were measured at the stamp. Raises ValueError if it is not sane."""
-        if self.file.version < 3:
-            return None
         first_s, last_s, vx, vy, vtheta, ax, ay, atheta = numbers = self.content["sweep"].tolist()
         if all(map(isnan, numbers)):
             return None
@@ -88,16 +84,10 @@ class Frame(NamedTuple):
 
     def ranges_m(self, ranges: "RangesFile") -> Ranges:
         """Ranges of the scan in metres; raises ValueError if they are damaged."""
-        if self._is_version_1:
-            return np.array(self.content["ranges_m"], np.float32)
         content = ranges.read(int(self.content["offset"]), int(self.content["beam_count"]))
         if crc32(content) != self.content["ranges_crc32"]:
             raise ValueError("other ranges")
         return np.frombuffer(content, RANGE).astype(np.float32)
-
-    @property
-    def _is_version_1(self) -> bool:
-        return self.file.version == 1
 
 
 class RangesFile:

@@ -3,8 +3,7 @@
 ``scans.bin``, ``odometry.bin`` and ``images.bin`` have a header and frames of constant size, each with a checksum. So
 damage affects single frames, and the length of a file shows a frame that a crash cut off. The frames of all files share
 one sequence of numbers, which is the order of the recording. The ranges of a scan, as many as it has beams, are in
-``ranges.bin``, and its frame says where. Versions 1 and 2 are read and no longer written. In version 2, all beams of a
-scan were measured at its stamp. In version 1 also, the ranges were in the frame, and all scans had the same beams.
+``ranges.bin``, and its frame says where.
 """
 
 from dataclasses import dataclass
@@ -32,9 +31,6 @@ RANGES = "ranges.bin"
 IMAGES = "images"
 GROUND_TRUTH = "ground_truth.tum"
 VERSION = 3
-"""Version that is written."""
-VERSIONS = (1, 2, 3)
-"""Versions that are read."""
 RANGE = np.dtype("<f4")
 """A range in metres."""
 
@@ -98,15 +94,6 @@ _PLACE: list[Any] = [("offset", "<u8"), ("ranges_crc32", "<u4")]
 SWEEP_NUMBERS = 8
 _SWEEP: list[Any] = [("sweep", "<f8", (SWEEP_NUMBERS,))]
 SCANS_FILE = FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, *_BEAMS, *_PLACE, *_SWEEP, *_CRC]), version=3)
-_SCANS_FILE_2 = FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, *_BEAMS, *_PLACE, *_CRC]), version=2)
-
-
-def scans_file(meta: "Meta") -> FrameFile:
-    """The file of the scans of a recording."""
-    if meta.version > 1:
-        return SCANS_FILE if meta.version > 2 else _SCANS_FILE_2
-    (laser,) = meta.lasers
-    return FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, ("ranges_m", RANGE, (laser.beam_count,)), *_CRC]))
 
 
 def image_path(folder: Path, index: int, suffix: str) -> Path:
@@ -117,7 +104,7 @@ def image_path(folder: Path, index: int, suffix: str) -> Path:
 class Meta(Settings):
     """The sensors of the robot."""
 
-    version: Literal[1, 2, 3] = 3
+    version: Literal[3] = 3
     lasers: tuple[LaserModel, ...]
     camera: CameraModel | None = None
 
@@ -177,11 +164,8 @@ def read_meta(folder: Path) -> Meta:
     version = content.get("version") if isinstance(content, dict) else None
     if type(version) is not int:
         raise SourceError(f"{path}: does not describe a recording (no version); copy it again")
-    if version not in VERSIONS:
-        known = f"{VERSIONS[0]} to {VERSIONS[-1]}"
-        raise SourceError(f"{path}: is of version {str(version)[:20]}, but {known} are read here; update fcslam")
-    if isinstance(content, dict) and version == 1 and "laser" in content:
-        content["lasers"] = [content.pop("laser")]
+    if version != VERSION:
+        raise SourceError(f"{path}: is of version {str(version)[:20]}, but {VERSION} is read here; update fcslam")
     try:
         return Meta.model_validate(content)
     except ValidationError as error:

@@ -40,10 +40,10 @@ from fcslam.sources.recording.layout import (
     META,
     ODOMETRY_FILE,
     SCANS,
+    SCANS_FILE,
     Meta,
     image_path,
     read_meta,
-    scans_file,
 )
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 from fcslam.untrusted import read_bytes
@@ -132,8 +132,7 @@ class Recording:
     def _survey(self) -> Survey:
         """Summary from one pass over the whole recording; rejects a recording that cannot be mapped."""
         audit, scans, odometry, notes = _audit(), PathSummary(), PathSummary(), list[str]()
-        if self._meta.version > 1:
-            RangesFile(self._path).check()
+        RangesFile(self._path).check()
         for _, frame in self._checked(audit):
             if frame.is_scan:
                 if not scans.count and frame.T_odom_base == UNKNOWN_POSE:
@@ -164,7 +163,7 @@ class Recording:
     def _checked(self, audit: Audit) -> Iterator[tuple[int, Frame]]:
         """The usable frames, each with its number."""
         lasers = self._meta.lasers
-        files = [scans_file(self._meta), ODOMETRY_FILE]
+        files = [SCANS_FILE, ODOMETRY_FILE]
         if self._camera_and_notes()[0] is not None:
             files.append(IMAGES_FILE)
         gates = [ScanGate(laser.beams, audit) for laser in lasers]

@@ -38,7 +38,6 @@ from fcslam.sources.recording.layout import (
     SCANS,
     SCANS_FILE,
     SWEEP_NUMBERS,
-    VERSION,
     FrameFile,
     Meta,
     check_sweep,
@@ -94,13 +93,10 @@ class RecordingWriter:
         """Continue the recording at ``folder``; incomplete last records are removed.
 
         Raises:
-            SourceError: the folder has no recording, or one of an earlier version.
+            SourceError: the folder has no recording, or one of another version.
             OutputError: the recording cannot be written.
         """
-        meta = read_meta(folder)
-        if meta.version != VERSION:
-            raise SourceError(f"{folder}: is of version {meta.version}, which is read but not continued; record again")
-        return cls._opened(folder, meta)
+        return cls._opened(folder, read_meta(folder))
 
     @classmethod
     def _opened(cls, folder: Path, meta: Meta) -> Self:

@@ -11,9 +11,8 @@ from pydantic import Field
 from fcslam.config import Settings, parse
 from fcslam.lab.evaluation.federated.poison import Poison, PoisonedClient
 from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
-from fcslam.learning.federated.client_app import build_client_app
+from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.flower import Context, InProcessGrid
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
@@ -102,18 +101,13 @@ def train_arm(context: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork
     ]
     if arm.poison is not None:
         clients[-1] = PoisonedClient(clients[-1], arm.poison)
-
-    def client_of(flower_context: Context) -> FederatedClient:
-        return clients[int(flower_context.node_config["partition-id"])]
-
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
         # Without metrics no version is better than another: the last one counts, as in the other arms.
         evaluate_fn=lambda _weights: {},
         on_round=lambda report: context.on_progress(name, report.round_number, settings.rounds),
     )
-    grid = InProcessGrid(build_client_app(client_of), len(clients))
-    state = Coordinator(grid, settings, context.start, folder, hooks).run()
+    state = Coordinator(in_process_grid(clients), settings, context.start, folder, hooks).run()
     return [weights_to_network(state.average, settings.training.encoder)]
 
 

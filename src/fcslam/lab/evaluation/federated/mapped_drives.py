@@ -1,10 +1,10 @@
-"""Training data from a mission: the robots' keyframes at their estimated poses, and the accepted closures.
+"""Training data from a mission: the robots' keyframes at their estimated poses.
 
 Images and LiDAR returns stay on the robots. The study has them all in one process and takes from them only what each
 robot, or the cloud, would have.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from fcslam.geometry import se2
 from fcslam.learning.revisits import Keyframe
 from fcslam.mission.driving import legs
 from fcslam.mission.mission import MissionConfig, run_mission
-from fcslam.records import ClosureStatus, FloatArray
+from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionEnd
 from fcslam.robot.beside import Inline
 from fcslam.robot.frontend import RobotFrontend
@@ -24,9 +24,6 @@ from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.runs import Run
 from fcslam.sources import Source
 from fcslam.wire.messages import Body
-
-REACH_M = 3.0
-"""Keyframes this close to an end of a closure belong to it: their motion to it is hardly off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,20 +42,7 @@ class MappedDrive:
     """Index of the fleet's map that the robot is in."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tie:
-    """Two keyframes that an accepted closure connects, and the estimated pose of the second base in the first, (3,)."""
-
-    robot_i: str
-    i: int
-    robot_j: str
-    j: int
-    T_i_j: FloatArray
-
-
-def map_drives(
-    sources: Sequence[Source], config: MissionConfig, detector: FeatureDetector
-) -> tuple[dict[str, MappedDrive], Run]:
+def map_drives(sources: Sequence[Source], config: MissionConfig, detector: FeatureDetector) -> dict[str, MappedDrive]:
     """Map recordings together and keep what their robots know.
 
     Args:
@@ -71,29 +55,7 @@ def map_drives(
     run = run_mission(
         sources, config, drive=lambda given, _: nullcontext([legs(source, fronts[source.name]) for source in given])
     )
-    return {name: _drive(fronts[name], runner.kept, run, detector) for name, runner in runners.items()}, run
-
-
-def ties(drives: dict[str, MappedDrive], run: Run) -> Iterator[Tie]:
-    """Pairs of keyframes of two robots near both ends of an accepted closure between them, each once.
-
-    Their relative poses are those of the fleet's map.
-    """
-    seen: set[tuple[str, int, str, int]] = set()
-    for closure in run.closures:
-        names = closure.robot_i, closure.robot_j
-        if closure.status is not ClosureStatus.ACCEPTED or names[0] == names[1] or not set(names) <= drives.keys():
-            continue
-        a, b = (drives[name] for name in names)
-        if a.map_index != b.map_index:
-            continue
-        for i in _near(a, closure.stamp_i):
-            for j in _near(b, closure.stamp_j):
-                key = min((names[0], i, names[1], j), (names[1], j, names[0], i))
-                if key not in seen:
-                    seen.add(key)
-                    first, second = (drives[name].T_map_base[k] for name, k in (key[:2], key[2:]))
-                    yield Tie(*key, se2.between(first, second))
+    return {name: _drive(fronts[name], runner.kept, run, detector) for name, runner in runners.items()}
 
 
 class _Keeping(Inline):
@@ -130,17 +92,3 @@ def _drive(
         front.robot, tuple(keyframes), fleet.stamps[scans], se2.compose(own.T_local_base[scans], moved),
         se2.compose(fleet.T_map_base[scans], moved), fleet.map_index,
     )  # fmt: skip
-
-
-def _near(drive: MappedDrive, stamp: float) -> list[int]:
-    """Keyframes within ``REACH_M`` of the one at the stamp, by the robot's own map, and close to it in time."""
-    if not len(drive.stamps):
-        return []
-    here = int(np.argmin(np.abs(drive.stamps - stamp)))
-    gaps_m = np.hypot(*(drive.T_own_base[:, :2] - drive.T_own_base[here, :2]).T)
-    near, low, high = gaps_m <= REACH_M, here, here
-    while low > 0 and near[low - 1]:
-        low -= 1
-    while high + 1 < len(near) and near[high + 1]:
-        high += 1
-    return list(range(low, high + 1))

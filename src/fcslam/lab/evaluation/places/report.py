@@ -10,7 +10,6 @@ import numpy as np
 
 from fcslam.errors import OutputError
 from fcslam.lab.evaluation.places.scoring import DescribedSet, Scorer
-from fcslam.lab.evaluation.places.sequences import plain
 from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval, mean_interval, measure_interval
@@ -66,7 +65,6 @@ def evaluate_set(
     checker: PairVerifier | None,
     seed: int,
     watch: Callable[[], None] = lambda: None,
-    variants: Callable[[DescribedSet, Scorer], Mapping[str, FloatArray]] = plain,
 ) -> SetResult:
     """Evaluate every scorer on every question of a set.
 
@@ -76,20 +74,17 @@ def evaluate_set(
         checker: geometric verification; None: none.
         seed: seed of the bootstrap.
         watch: called after each scorer.
-        variants: postprocessing of a scorer's similarities, by a suffix of the scorer's name.
     """
     similarities: dict[str, FloatArray] = {}
     verified: dict[str, FloatArray] = {}
     scores: list[Score] = []
-    for scorer_name, scorer in scorers.items():
-        for variant, similarity in variants(described, scorer).items():
-            name = f"{scorer_name} {variant}".rstrip()
-            similarities[name] = similarity
-            stages = [(similarity, False)]
-            if checker is not None:
-                verified[name] = checker.verified(similarity)
-                stages.append((verified[name], True))
-            scores += _scores(described.place_set, name, stages, seed)
+    for name, scorer in scorers.items():
+        similarity = similarities[name] = scorer(described)
+        stages = [(similarity, False)]
+        if checker is not None:
+            verified[name] = checker.verified(similarity)
+            stages.append((verified[name], True))
+        scores += _scores(described.place_set, name, stages, seed)
         watch()
     return SetResult(described.place_set, similarities, verified, tuple(scores))
 

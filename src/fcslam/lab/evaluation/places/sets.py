@@ -32,8 +32,7 @@ from fcslam.errors import EvaluationError
 from fcslam.lab.evaluation.places.simulated_views import read_fleet_views
 from fcslam.lab.evaluation.places.tum_sequence import read_sequence
 from fcslam.lab.evaluation.places.view_overlap import view_overlap
-from fcslam.metrics.retrieval import Pairs, PairTruth
-from fcslam.places.sequence import excluding_recent
+from fcslam.metrics.retrieval import Pairs, PairTruth, excluding_recent
 from fcslam.untrusted import read_text
 
 LABELLED: Final = "dataset.csv"

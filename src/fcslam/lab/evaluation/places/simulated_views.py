@@ -20,7 +20,7 @@ from fcslam.metrics.trajectory import interpolate
 from fcslam.records import CameraModel, FloatArray, LaserModel, Ranges
 from fcslam.runs import read_tum
 from fcslam.sources.recording.frames import RangesFile, merged_frames
-from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, image_path, read_meta, scans_file
+from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, SCANS_FILE, image_path, read_meta
 
 EVERY_M: Final = 1.0
 EVERY_RAD: Final = 0.5
@@ -115,7 +115,7 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
     scan = None
     meta = read_meta(robot)
     with RangesFile(robot) as ranges:
-        for frame in merged_frames(robot, [scans_file(meta), IMAGES_FILE]):
+        for frame in merged_frames(robot, [SCANS_FILE, IMAGES_FILE]):
             if frame.fault is not None:
                 continue
             if frame.is_scan and frame.laser == 0:

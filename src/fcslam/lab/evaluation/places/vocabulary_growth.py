@@ -7,7 +7,7 @@ described in the present vocabulary, and eq. (4), scaled to [0, 1], compares the
 
 import copy
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -142,9 +142,8 @@ def grow_vocabulary(
     groups: Sequence[ProbeGroup],
     config: VocabularyConfig,
     seed: int,
-    watch: Callable[[], None] = lambda: None,
 ) -> Growth:
-    """Add the places in whole batches and measure after each; ``watch`` is called after each batch."""
+    """Add the places in whole batches and measure after each."""
     # Places count from 0: with this L, the first training happens at the last place of the first batch.
     timing = {"strategy": strategy, "train_batch": BATCH - 2, "rebuild_every": WINDOW_BATCHES * BATCH}
     index: PlaceIndex[str] = PlaceIndex(config.model_copy(update=timing), np.random.default_rng(seed))
@@ -158,7 +157,6 @@ def grow_vocabulary(
         for g, group in enumerate(groups):
             target = index.bag(group.target)
             similarities[update, g] = [similarity(target, index.bag(other)) for other in group.others]
-        watch()
     asked = np.zeros((len(groups), 1 + DISTRACTORS))
     for g, group in enumerate(groups):
         answer = index.compare(group.target)
@@ -208,15 +206,3 @@ def ahead_of(first: Growth, other: Growth, measure: str, seed: int) -> Interval:
     """Mean difference of a measure, ``first`` minus ``other``, after the last batch, paired by group."""
     values = first.measures(-1)[measure] - other.measures(-1)[measure]
     return mean_interval(values, np.random.default_rng(seed))
-
-
-def growth_rows(growths: Mapping[str, Growth], seed: int) -> list[tuple[str, int, str, float, float, float]]:
-    """Rows of a table: strategy, places, measure, value, lower and upper bound."""
-    rows: list[tuple[str, int, str, float, float, float]] = []
-    for name, growth in growths.items():
-        for update, places in enumerate(growth.places.astype(int)):
-            intervals = growth.intervals(update, seed).items()
-            rows += [(name, int(places), measure, *value) for measure, value in intervals]
-            rows.append((name, int(places), "words", float(growth.words[update]), np.nan, np.nan))
-            rows.append((name, int(places), "seconds", float(growth.seconds[update]), np.nan, np.nan))
-    return rows
