@@ -26,8 +26,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-IGNORED = ("config.yaml", "settings.yaml", "simulation.yaml", "mission.json", "*.log")
-"""Configuration with its comments, and files that hold times of the clock."""
+IGNORED = ("config.yaml", "mission.state", "settings.yaml", "simulation.yaml", "mission.json", "*.log")
+"""Configuration with its comments, files that hold times of the clock, and states that hold a hash of the code."""
 DOWNLINK = re.compile(r"downlink|acknowledgement|correction|release|detector_update")
 
 RUN = """

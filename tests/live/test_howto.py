@@ -48,7 +48,7 @@ def test_the_programs_of_the_page_run(my_robot, tmp_path, monkeypatch, capsys):
         assert len(programs()) == 7
         for number, program in enumerate(programs()):
             if number == 1:  # the first one has shown that a program gets a process beside it
-                monkeypatch.setattr("fcslam.live.robot.worker_process", SameThread)
+                monkeypatch.setattr("fcslam.live.records.worker_process", SameThread)
             exec(compile(program, f"program {number}", "exec"), {"__name__": "__main__"})
         assert cloud.cloud.stored
     assert capsys.readouterr().out.count("True") == len(my_robot.scans())
