@@ -1,8 +1,6 @@
 """All kinds of building: furniture moves within its room, sizes are as said."""
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,17 +110,6 @@ def test_a_lamp_fails_even_where_there_is_one_room():
     plan = draw_floor_plan(np.random.default_rng(0), Building.FLAT)
     few = replace(plan, rooms=plan.rooms[:1], lanes=())
     assert len(light_of(few, Lighting.LAMP_OFF, np.random.default_rng(0)).lamps) == 0
-
-
-def test_the_documented_building_can_be_built_and_driven_in():
-    text = (Path(__file__).parents[3] / "docs" / "howto" / "simulation.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    made = {}
-    exec(compile(example, "simulation.md", "exec"), made)
-    plan = made["plan"]
-    assert len(plan.rooms) == 7
-    _, poses = drive(route(plan, 50.0, np.random.default_rng(0)), 0.25)
-    assert distances(poses[:, :2], plan.segments).min() > 0.25
 
 
 def test_furniture_moves_in_the_visited_rooms_only():
