@@ -94,6 +94,12 @@ def test_no_pose_in_the_map_of_another_building(fleet):
     assert len(run.trajectories["robot"].stamps) == 0
 
 
+def test_a_small_map_of_another_building_with_such_rooms_does_not_place_a_robot():
+    elsewhere = map_of(small_fleet.draw(1, 15.0, seed=7).robots)
+    for robot in small_fleet.draw(3, 15.0, seed=1).robots:
+        assert localized(robot.scans(), elsewhere).metrics["fixes"].value == 0
+
+
 def test_an_initial_pose_is_used_if_the_walls_confirm_it(fleet, building):
     robot = fleet.robots[2]
     start = robot.T_building_base[0]

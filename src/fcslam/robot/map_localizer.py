@@ -44,7 +44,8 @@ LEAST_EVIDENCE = 3.0
 """Evidence that fixes the pose: the number of separate stretches whose best alignments agree, plus the least of their
 ratios, less one."""
 LARGEST_VIOLATION = 0.10
-"""Largest share of the walls in free space of the map, or the reverse."""
+"""Largest share of the walls in free space of the map, or the reverse. The ratio of an alignment counts less in
+proportion to the walls of the robot in free space: in another building with such rooms, 5 % and more are."""
 SUPPORTED = 0.30
 """Least share of a keyscan's points on walls of the map; below it, the robot's own motion alone counts."""
 CHECK_EVERY_M = 2.0
@@ -226,7 +227,7 @@ class MapLocalizer:
         if rival is None or rival.violation > LARGEST_VIOLATION:
             return
         here = align_map(self._map, submap, T_map_base)
-        ratio = rival.score_m / max(LEAST_RIVAL_M, here.score_m)
+        ratio = self._clear(submap, rival.T_a_b) * rival.score_m / max(LEAST_RIVAL_M, here.score_m)
         if ratio >= LEAST_RATIO:
             self._lose()
             self._vote(rival.T_a_b, ratio, keyscan)
@@ -252,9 +253,14 @@ class MapLocalizer:
             return
         best, rival = found
         ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
+        ratio *= self._clear(submap, best.T_a_b)
         if ratio < LEAST_RATIO or best.violation > LARGEST_VIOLATION:
             return
         self._vote(best.T_a_b, ratio, keyscan)
+
+    def _clear(self, submap: Submap, T_map_base: FloatArray) -> float:
+        """1 if no wall of the robot lies in free space of the map there, 0 for the largest share that may."""
+        return max(0.0, 1.0 - agreement(submap, self._map, T_map_base).violation / LARGEST_VIOLATION)
 
     def _try_suggested(self, keyscan: MappedKeyscan) -> None:
         """Fix the suggested pose if the walls seen since then lie on walls of the map there."""
