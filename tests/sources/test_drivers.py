@@ -376,6 +376,7 @@ ROBOTS = {
     "micro-ROS: no stamps": (unstamped, ""),
     "micro-ROS: a clock of its own": (lambda: late(0.25), "the clock of the odometry is 250 ms ahead"),
     "micro-ROS: a clock since boot": (lambda: late(5.0 - START), "by the times of recording; corrected"),
+    "micro-ROS: a clock since the drive began": (lambda: late(-START), "by the times of recording; corrected"),
     "namespace": (namespaced, ""),
     "frames with a slash": (slashed, ""),
     "wheels of another radius": (scaled, "the robot's distance is 1.2"),
