@@ -41,11 +41,14 @@ LEAST_RATIO = 1.5
 """Least ratio of the score of the best alignment with the map to that of the best one elsewhere; below it, the
 alignment does not count."""
 LEAST_EVIDENCE = 3.0
-"""Evidence that fixes the pose: the number of separate stretches whose best alignments agree, plus the least of their
-ratios, less one."""
+"""Evidence that fixes the pose, if one of the stretches is clear: the number of separate stretches whose best
+alignments agree, plus the least of their ratios, less one."""
 LARGEST_VIOLATION = 0.10
-"""Largest share of the walls in free space of the map, or the reverse. The ratio of an alignment counts less in
-proportion to the walls of the robot in free space: in another building with such rooms, 5 % and more are."""
+"""Largest share of the walls in free space of the map, or the reverse. The lead of an alignment counts less in
+proportion to the walls of the robot there."""
+CLEAR_VIOLATION = 0.045
+"""Largest share of the walls of a stretch in free space of the map, of one stretch at least: in another building with
+such rooms, more of each are."""
 SUPPORTED = 0.30
 """Least share of a keyscan's points on walls of the map; below it, the robot's own motion alone counts."""
 CHECK_EVERY_M = 2.0
@@ -88,7 +91,9 @@ class _Vote:
 
     T_map_odom: FloatArray
     ratio: float
-    """Ratio of its score to the best one elsewhere."""
+    """Ratio of its score to the best one elsewhere, its lead less for walls in free space of the map."""
+    is_clear: bool
+    """Whether few walls of the stretch are in free space of the map."""
 
 
 class MapLocalizer:
@@ -227,10 +232,10 @@ class MapLocalizer:
         if rival is None or rival.violation > LARGEST_VIOLATION:
             return
         here = align_map(self._map, submap, T_map_base)
-        ratio = self._clear(submap, rival.T_a_b) * rival.score_m / max(LEAST_RIVAL_M, here.score_m)
+        ratio = rival.score_m / max(LEAST_RIVAL_M, here.score_m)
         if ratio >= LEAST_RATIO:
             self._lose()
-            self._vote(rival.T_a_b, ratio, keyscan)
+            self._vote(rival.T_a_b, ratio, submap, keyscan)
 
     def _agreement(self, T_map_base: FloatArray, reach_m: float) -> Agreement:
         return agreement(self._submap(reach_m), self._map, T_map_base)
@@ -253,14 +258,9 @@ class MapLocalizer:
             return
         best, rival = found
         ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
-        ratio *= self._clear(submap, best.T_a_b)
         if ratio < LEAST_RATIO or best.violation > LARGEST_VIOLATION:
             return
-        self._vote(best.T_a_b, ratio, keyscan)
-
-    def _clear(self, submap: Submap, T_map_base: FloatArray) -> float:
-        """1 if no wall of the robot lies in free space of the map there, 0 for the largest share that may."""
-        return max(0.0, 1.0 - agreement(submap, self._map, T_map_base).violation / LARGEST_VIOLATION)
+        self._vote(best.T_a_b, ratio, submap, keyscan)
 
     def _try_suggested(self, keyscan: MappedKeyscan) -> None:
         """Fix the suggested pose if the walls seen since then lie on walls of the map there."""
@@ -279,11 +279,15 @@ class MapLocalizer:
         if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= LARGEST_VIOLATION:
             self._fix(near.T_a_b, keyscan)
 
-    def _vote(self, T_map_base: FloatArray, ratio: float, keyscan: MappedKeyscan) -> None:
+    def _vote(self, T_map_base: FloatArray, ratio: float, stretch: Submap, keyscan: MappedKeyscan) -> None:
         """Count the best alignment of a stretch; with enough evidence it fixes the pose."""
-        vote = _Vote(se2.compose(T_map_base, se2.inverse(keyscan.T_local_base)), ratio)
+        violation = agreement(stretch, self._map, T_map_base).violation
+        cleared = 1.0 + max(0.0, 1.0 - violation / LARGEST_VIOLATION) * (ratio - 1.0)
+        T_map_odom = se2.compose(T_map_base, se2.inverse(keyscan.T_local_base))
+        vote = _Vote(T_map_odom, cleared, violation <= CLEAR_VIOLATION)
         self._votes = [*(other for other in self._votes if self._agree(vote, other, keyscan)), vote]
-        if len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0 >= LEAST_EVIDENCE:
+        evidence = len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0
+        if evidence >= LEAST_EVIDENCE and any(vote.is_clear for vote in self._votes):
             self._fix(T_map_base, keyscan)
         self._begin_stretch(keyscan.travel_m)
 
