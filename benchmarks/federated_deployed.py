@@ -62,7 +62,7 @@ def drawn(folder: Path, count: int, seed: int, side: tuple[int, int] = (320, 240
 @contextmanager
 def federate(*words: object, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A command in the background, interrupted at the end of the block."""
-    command = [sys.executable, "-m", "fcslam.cli", "federate", *map(str, words)]
+    command = [sys.executable, "-m", "fcslam.cli", "learn", "federate", *map(str, words)]
     with log.open("wb") as file:
         process = subprocess.Popen(
             command,

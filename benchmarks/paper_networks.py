@@ -97,7 +97,7 @@ def train(
     settings = folder / f"{run.name}.yaml"
     settings.write_text(yaml.safe_dump({"loss": LOSSES[losses]}), encoding="utf-8")
     cost = common.run_fcslam(
-        "train", *roots, "--encoder", encoder, "--steps", steps, "--config", settings, "--teacher", teacher,
+        "learn", "train", *roots, "--encoder", encoder, "--steps", steps, "--config", settings, "--teacher", teacher,
         "--device", "cpu", "--output", run, environment={"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     last: dict[str, float] = {}

@@ -71,7 +71,7 @@ def cases(data: Path, work: Path) -> Iterator[Case]:
     fleet = [str(work / "before" / "simulate" / f"robot_{number}") for number in range(1, 4)]
     yield Case("cameras", ("map", *fleet, "--output", "{output}"))
     robots = [str(data / "vision" / name) for name in ("kodak24", "sun_hays80")]
-    yield Case("federated", ("federate", "local", *robots, "--quick", "--rounds", "2", "--output", "{output}"))
+    yield Case("federated", ("learn", "federate", "local", *robots, "--quick", "--rounds", "2", "--output", "{output}"))
 
 
 def run(case: Case, checkout: Path, place: Path) -> None:

@@ -35,7 +35,7 @@ TINY = {
 
 def start(*words, log):
     """A command that an interrupt ends, even where the tests were started in the background, which ignores them."""
-    command = [sys.executable, "-m", "fcslam.cli", "federate", *words]
+    command = [sys.executable, "-m", "fcslam.cli", "learn", "federate", *words]
     with log.open("ab") as file:
         return subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=heed_interrupts)  # noqa: PLW1509
 

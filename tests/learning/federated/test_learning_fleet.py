@@ -109,7 +109,7 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
         "--learn-config", tmp_path / "fleet.yaml",
     )  # fmt: skip
     fleet = [
-        started(log, "robot", tmp_path / "sim" / robot, "--server", f"http://127.0.0.1:{port}", "--state",
+        started(log, "play", tmp_path / "sim" / robot, "--server", f"http://127.0.0.1:{port}", "--state",
                 tmp_path / f"state-{robot}", "--learn")
         for robot, log in zip(robots, logs[1:], strict=True)
     ]  # fmt: skip
