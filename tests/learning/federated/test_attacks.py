@@ -17,6 +17,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
@@ -247,6 +249,12 @@ def flwr(home, *words):
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=RUN_S, check=False)
 
 
+def public_key(path):
+    key = ec.generate_private_key(ec.SECP384R1()).public_key()
+    path.write_bytes(key.public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH))
+    return path
+
+
 def connection(home, address, trust):
     home.mkdir()
     (home / "config.toml").write_text(f'[superlink]\ndefault = "x"\n[superlink.x]\naddress = "{address}"\n{trust}\n')
@@ -264,7 +272,7 @@ def test_a_stranger_starts_no_app_and_registers_no_key(fleet, undisturbed, tmp_p
         connection(home, fleet.address, f'root-certificates = "{fleet.ca}"')
         start_honest(fleet)
         run = flwr(home, "run", app, "x")
-        register = flwr(home, "supernode", "register", fleet.ca.parent / "one.pub", "x")
+        register = flwr(home, "supernode", "register", public_key(tmp_path / "own.pub"), "x")
         state, _ = fleet.run(grid, tmp_path / "run", chosen_settings())
     assert run.returncode != 0, run.stdout
     assert register.returncode != 0, register.stdout
