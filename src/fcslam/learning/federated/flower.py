@@ -11,6 +11,7 @@ credentials; see docs/howto/federated.md.
 import logging
 import os
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version as installed_version
 from typing import Any, Final
@@ -123,9 +124,9 @@ class RobotGrid(Grid):
     def __init__(self) -> None:
         use_own_identity()
 
+    @abstractmethod
     def robot_names(self) -> dict[int, str]:
         """Names of the robots by node number."""
-        raise NotImplementedError
 
     def set_run(self, run: Any) -> None:
         """Do nothing: there is one run."""

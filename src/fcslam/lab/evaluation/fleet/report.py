@@ -96,13 +96,13 @@ class FleetReport:
         return tuple(join for join in self.joins if join.is_false(self.criteria))
 
 
-def evaluate_fleet(run: Path, truth: Path | None = None, criteria: ClosureCriteria | None = None) -> FleetReport:
+def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
     """Evaluate the run folder ``run`` against the ground truth in a folder, by default that of ``truth_folder``.
 
     Raises:
         EvaluationError: the run or a robot's truth is missing or cannot be read, or they are of different recordings.
     """
-    opened, folder, criteria = open_run(run), truth_folder(run, truth), criteria or ClosureCriteria()
+    opened, folder, criteria = open_run(run), truth_folder(run, truth), ClosureCriteria()
     known = known_poses(opened, folder)
     alignments = {k: align(*_poses(known, known.estimate.maps == k)) for k in np.unique(known.estimate.maps).tolist()}
     rng = np.random.default_rng(0)
