@@ -248,8 +248,11 @@ def test_a_keep_out_is_drawn_and_taken_back_and_the_map_is_downloaded(page, mapp
 
 def test_rounds_of_a_federated_training_are_drawn(page, tmp_path):
     head = "round,version,released,robots,left_out,loss_triplet,mma_3px"
-    (tmp_path / "rounds.csv").write_text(f"{head}\n1,a,0,anna | bob,,0.5,0.25\n2,b,1,anna,bob: too late,0.25,0.375\n")
-    with closing(Service(tmp_path / "data", "--learning", str(tmp_path))) as service:
+    (tmp_path / "learning").mkdir()
+    (tmp_path / "learning" / "rounds.csv").write_text(
+        f"{head}\n1,a,0,anna | bob,,0.5,0.25\n2,b,1,anna,bob: too late,0.25,0.375\n"
+    )
+    with closing(Service(tmp_path)) as service:
         page.goto(service.url)
         page.get_by_text("Shared training").click()
         says(page, "#learned", "2 rounds, 1 released")

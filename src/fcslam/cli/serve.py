@@ -114,16 +114,15 @@ def serve(
         with verifying(chosen):  # refused here, not by the worker of each mission
             pass
     plan = learning_plan(learn, learn_config, data / "learning", store)
-    learning = None if plan is None else plan.output
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
         authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
         if store is None:
-            state = _state(data, authenticator, given, learning, chosen)
+            state = _state(data, authenticator, given, chosen)
         else:
             shared = Shared(store, instance, max_missions, max_robots)
-            state = shared_state(shared, data, authenticator, given, learning, chosen)
+            state = shared_state(shared, data, authenticator, given, chosen)
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
@@ -207,9 +206,7 @@ def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
     signal.signal(signal.SIGHUP, reload)
 
 
-def _state(
-    data: Path, authenticator: "Authenticator", config: "CloudConfig", learning: Path | None, workers: "Workers"
-) -> "ServiceState":
+def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", workers: "Workers") -> "ServiceState":
     import sys
     import time
 
@@ -227,7 +224,7 @@ def _state(
         lambda folder: Supervisor(folder.path, time.monotonic, events.publish, command),
     )  # fmt: skip
     audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
-    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
+    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, data / "learning")
 
 
 def _cloud_config(chosen: list[str] | None) -> "CloudConfig":

@@ -41,9 +41,8 @@ class Shared(NamedTuple):
 
 
 def shared_state(
-    shared: Shared, data: Path, authenticator: "Authenticator", config: CloudConfig, learning: Path | None,
-    workers: Workers,
-) -> ServiceState:  # fmt: skip
+    shared: Shared, data: Path, authenticator: "Authenticator", config: CloudConfig, workers: Workers
+) -> ServiceState:
     """The state of an instance; who closes its missions closes all that it holds.
 
     Raises:
@@ -74,7 +73,7 @@ def shared_state(
         )  # fmt: skip
         log = AuditLog(audit, time.time)
         missions.closing = opened.pop_all().close
-        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log, learning)
+        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log)
 
 
 def _name(given: str | None) -> str:

@@ -302,7 +302,7 @@ function shape(tag, attributes) {
 // Curves of losses, each over its largest value, and of measures; a dot is a round whose detector was released.
 export async function showLearning() {
   const rounds = await json("learning").catch(() => []);
-  at("learned").textContent = rounds.length ? `${count(rounds.length, "round")}, ${rounds.filter((r) => r.released).length} released` : "No training is connected: fcslam serve --learning FOLDER";
+  at("learned").textContent = rounds.length ? `${count(rounds.length, "round")}, ${rounds.filter((r) => r.released).length} released` : "The robots do not learn: fcslam serve --learn";
   const names = [...new Set(rounds.flatMap((r) => [...Object.keys(r.losses), ...Object.keys(r.measures)]))], across = (k) => 5 + (290 * k) / Math.max(1, rounds.length - 1), drawn = [];
   names.forEach((name, n) => {
     const values = rounds.map((r) => r.losses[name] ?? r.measures[name]), top = rounds[0].losses[name] === undefined ? 1 : Math.max(...values.filter((v) => v !== undefined)) || 1, stroke = COLOURS[n % COLOURS.length];
