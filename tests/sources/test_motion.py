@@ -44,10 +44,16 @@ def test_without_readings_the_robot_stands():
     assert moving_sweep(Sweep(0.0, 0.14), 1.0, []) == Sweep(0.0, 0.14)
 
 
-def test_readings_that_repeat_are_no_updates():
+@pytest.mark.parametrize("period_s", [0.02, 0.05, 0.1])
+def test_readings_that_repeat_are_no_updates(period_s):
+    """Also those that differ by the rounding of a transform."""
     updates = OdometryUpdates()
-    stamps = np.arange(0.0, 3.0, 0.02)
-    fresh = [t for t in stamps if updates.is_fresh(float(t), (0.1 * (t // 0.2), 0.0, 0.0))]
+    stamps = np.arange(0.0, 3.0, period_s)
+    rounding = 1e-15 * np.sin(np.arange(len(stamps)))
+    fresh = [
+        t for t, e in zip(stamps, rounding, strict=True)
+        if updates.is_fresh(float(t), (0.1 * ((t + 1e-9) // 0.2) + e, 0.0, 0.0))
+    ]  # fmt: skip
     late = [t for t in fresh if t > 1.2]
     assert len(late) == pytest.approx((3.0 - 1.2) / 0.2, abs=2)
 

@@ -18,8 +18,8 @@ LARGEST_ACCELERATION: Final = 50.0
 """Largest acceleration of a robot, m/s^2 and rad/s^2; odometry that jumps shows more."""
 
 
-FEWEST_REPEATS: Final = 2
-"""Repeats between two updates of odometry that is updated too rarely."""
+ROUNDING: Final = 1e-9
+"""A reading that differs by less, in metres and radians, repeats the one before."""
 FEWEST_STEPS: Final = 4
 """Steps of a moving robot that show it."""
 LONGEST_UPDATE_S: Final = 0.35
@@ -61,7 +61,7 @@ class OdometryUpdates:
         self._longest_s = 0.0
         """Longest time between two updates of a moving robot with repeats between them."""
         self._moves = self._steps = 0
-        """Updates of a moving robot, and those after repeats."""
+        """Updates of a moving robot, and those after repeats. Scans that take the newest pose repeat only some of them."""
         self._update: tuple[float, Pose] | None = None
         """Stamp and pose of the newest reading that differs from the one before."""
         self._repeats = 0
@@ -69,7 +69,7 @@ class OdometryUpdates:
     @property
     def period_s(self) -> float:
         """Longest time between two updates of a moving robot; 0 if every reading is an update."""
-        is_rare = self._steps >= FEWEST_STEPS and 2 * self._steps > self._moves
+        is_rare = self._steps >= FEWEST_STEPS and 4 * self._steps > self._moves
         return self._longest_s if is_rare else 0.0
 
     def is_fresh(self, stamp: float, T_odom_base: Pose) -> bool:
@@ -77,13 +77,13 @@ class OdometryUpdates:
         if self._update is not None:
             changed_s, pose = self._update
             held_s = stamp - changed_s
-            if T_odom_base == pose:
+            x, y, theta = relative_pose(pose, T_odom_base)
+            if max(abs(x), abs(y), abs(theta)) < ROUNDING:
                 self._repeats += 1
                 return not 0.0 <= held_s <= self.period_s
-            x, y, theta = relative_pose(pose, T_odom_base)
             if hypot(x, y) > LEAST_STEP_M or abs(theta) > LEAST_STEP_RAD:
                 self._moves += 1
-                if self._repeats >= FEWEST_REPEATS and 0.0 < held_s <= LONGEST_UPDATE_S:
+                if self._repeats and 0.0 < held_s <= LONGEST_UPDATE_S:
                     self._steps += 1
                     self._longest_s = max(self._longest_s, held_s)
         self._update, self._repeats = (stamp, T_odom_base), 0
