@@ -61,7 +61,7 @@ class OdometryUpdates:
         self._longest_s = 0.0
         """Longest time between two updates of a moving robot with repeats between them."""
         self._moves = self._steps = 0
-        """Updates of a moving robot, and those after repeats. Scans that take the newest pose repeat only some of them."""
+        """Updates of a moving robot, and those after repeats."""
         self._update: tuple[float, Pose] | None = None
         """Stamp and pose of the newest reading that differs from the one before."""
         self._repeats = 0
@@ -69,7 +69,7 @@ class OdometryUpdates:
     @property
     def period_s(self) -> float:
         """Longest time between two updates of a moving robot; 0 if every reading is an update."""
-        is_rare = self._steps >= FEWEST_STEPS and 4 * self._steps > self._moves
+        is_rare = self._steps >= FEWEST_STEPS and 2 * self._steps > self._moves
         return self._longest_s if is_rare else 0.0
 
     def is_fresh(self, stamp: float, T_odom_base: Pose) -> bool:
