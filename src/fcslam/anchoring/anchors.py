@@ -20,10 +20,9 @@ from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
 from fcslam.records import FloatArray, GnssFix, frozen
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_stem
+from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
-GEOREFERENCE = "_georeference.json"
 """End of the name of the file that says where a map lies on the earth."""
 ONLY_SCANS, ONLY_PLAN = "only in the scans", "only in the plan"
 

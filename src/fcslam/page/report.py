@@ -7,12 +7,13 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 from urllib.parse import quote, unquote
 
 from fcslam.config import Settings
 from fcslam.errors import EvaluationError
+from fcslam.maps.exports import export_map
 from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
 from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
@@ -90,18 +91,18 @@ def _pictures(mission: ViewedMission, maps: Mapping[int, OccupancyMap], zooms: M
     }
 
 
-def _files(mission: ViewedMission, maps: Iterable[int]) -> dict[str, str]:
+def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
     """What the page downloads, compressed with gzip and in base64, by path."""
     if mission.run_folder is None:
         return {}
     named = {f"maps/{k}.{suffix}": f"{map_stem(k)}.{suffix}" for k in maps for suffix in ("pgm", "yaml", "png")}
     named[POSE_GRAPH] = POSE_GRAPH
     files = {path: mission.run_folder / name for path, name in named.items()}
-    return {
-        path: base64.b64encode(gzip.compress(file.read_bytes(), mtime=0)).decode()
-        for path, file in files.items()
-        if file.is_file()
-    }
+    contents = {path: file.read_bytes() for path, file in files.items() if file.is_file()}
+    for k, suffix in itertools.product(maps, ("svg", "tif")):
+        if (exported := export_map(mission.run_folder, k, suffix)) is not None:
+            contents[f"maps/{k}.{suffix}"] = exported
+    return {path: base64.b64encode(gzip.compress(content, mtime=0)).decode() for path, content in contents.items()}
 
 
 def _json(content: Settings | Iterable[Settings]) -> str:

@@ -23,6 +23,8 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*([1-9]\d{0,6})\s+([1-9]
 """Width, height; other programs write a comment after the first line."""
 
 
+GEOREFERENCE: Final = "_georeference.json"
+"""End of the name of the file, beside a map, that says how the map lies on the earth."""
 FINEST_M: Final = 1e-4
 COARSEST_M: Final = 1e3
 FARTHEST_M: Final = 1e8

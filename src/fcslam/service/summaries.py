@@ -13,6 +13,7 @@ from typing import Any
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
+from fcslam.maps.exports import earth_frame
 from fcslam.maps.palette import robot_colors
 from fcslam.maps.tiles import finest_zoom
 from fcslam.mission.mission_store import MissionStore
@@ -140,7 +141,11 @@ def map_summaries(mission: ViewedMission) -> list[MapSummary]:
     robots, folder = run_of(mission).trajectories.values(), mission.run_folder
     return [
         MapSummary(
-            map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], **_tiling(folder, map_stem(k))
+            map=k,
+            floor=floor,
+            robots=[r.robot for r in robots if r.map_index == k],
+            **_tiling(folder, map_stem(k)),
+            georeferenced=folder is not None and earth_frame(folder, k) is not None,
         )
         for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
     ]

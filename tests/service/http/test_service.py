@@ -168,7 +168,9 @@ def test_viewers_see_the_fleet(mapped):
     assert len(accepted) == 4
     assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
     assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
-    assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5, "extent": ANY}]
+    assert get(mapped, "maps").json() == [
+        {"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5, "extent": ANY, "georeferenced": False}
+    ]
 
 
 def test_the_extent_of_a_map_is_that_of_its_image(mapped):
@@ -412,11 +414,15 @@ def test_a_vetoed_closure_says_so_and_the_maps_come_apart_with_a_reason(mapped):
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     removed = edit(mapped, "removal", {"robot": "b"}).json()
     assert (removed["number"], removed["kind"], removed["author"]) == (1, "removal", "boss")
-    assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a"], "zoom": 5, "extent": ANY}]
+    assert get(mapped, "maps").json() == [
+        {"map": 0, "floor": "", "robots": ["a"], "zoom": 5, "extent": ANY, "georeferenced": False}
+    ]
     assert get(mapped, "closures").json() == []
     undone = mapped.ask("POST", f"{API}/edits/1/undo", "boss").json()
     assert (undone["kind"], undone["content"]) == ("undo", {"number": 1})
-    assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5, "extent": ANY}]
+    assert get(mapped, "maps").json() == [
+        {"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5, "extent": ANY, "georeferenced": False}
+    ]
     edits = mapped.ask("GET", f"{API}/edits", "boss").json()
     assert [(edit["number"], edit["undone_by"]) for edit in edits] == [(1, 2), (2, None)]
     for kind, wrong, status in (

@@ -20,9 +20,9 @@ const stem = (map) => (map ? `map_${map}` : "map");
 
 export function showFiles() {
   const { maps, robots, readOnly, mayEdit, mission } = fleet, card = (title, text, ...buttons) => { const item = element("li", element("h3", title)); item.append(element("p", text), ...buttons); return item; };
-  fill(at("files"), [mission, maps.map((m) => [m.map, m.robots, m.extent]), mayEdit], () => [
+  fill(at("files"), [mission, maps.map((m) => [m.map, m.robots, m.extent, m.georeferenced]), mayEdit], () => [
     ...maps.filter((m) => m.extent).map((m) => card(maps.length > 1 ? `Map of ${listed(m.robots)}` : "Map", "For Nav2 and other programs of ROS: a picture of cells and its description, in one archive.",
-      button("Map for Nav2 (zip)", saver(`${stem(m.map)}.zip`, async () => zip(await Promise.all(["pgm", "yaml"].map(async (end) => [`${stem(m.map)}.${end}`, await bytes(`maps/${m.map}.${end}`)]))))), button("Picture (png)", whole(`maps/${m.map}.png`, `${stem(m.map)}.png`)))),
+      button("Map for Nav2 (zip)", saver(`${stem(m.map)}.zip`, async () => zip(await Promise.all(["pgm", "yaml"].map(async (end) => [`${stem(m.map)}.${end}`, await bytes(`maps/${m.map}.${end}`)]))))), ...[["Picture", "png"], ["Drawing", "svg"], ...(m.georeferenced ? [["On the earth", "tif"]] : [])].map(([name, end]) => button(`${name} (${end})`, whole(`maps/${m.map}.${end}`, `${stem(m.map)}.${end}`))))),
     card("Paths", "Where each robot was, and when, as text in the format of TUM; and all measurements between scans, in the format g2o.",
       button("Paths (zip)", saver("paths.zip", async () => zip(await Promise.all(robots.filter((r) => r.map !== null).map(async (r) => [`${r.session}.tum`, await bytes(`trajectories/${encodeURIComponent(r.session)}.tum`)]))))), button("Pose graph (g2o)", whole("pose_graph.g2o", "pose_graph.g2o"))),
     ...(report ? [] : [card("Report", "This page as one file that needs no service. It opens in any browser.", button("Report (html)", whole("report.html", "report.html")))]),

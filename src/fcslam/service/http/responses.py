@@ -140,6 +140,7 @@ class MapSummary(Settings):
     extent: tuple[float, float, float, float] | None = Field(
         description="lowest x and y, highest x and y that the map covers, in metres; null before there is a map"
     )
+    georeferenced: bool = Field(description="whether its place on the earth is known")
 
 
 class LearningRound(Settings):

@@ -10,6 +10,7 @@ from fastapi.responses import FileResponse, Response
 from pydantic import Field
 
 from fcslam.errors import EvaluationError
+from fcslam.maps.exports import export_map
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
@@ -55,7 +56,13 @@ Stamp = Annotated[float, PathParameter(allow_inf_nan=False, description="of a ke
 KEPT = {"Cache-Control": "private, max-age=60"}
 """Headers of answers that are computed for a request and hardly change."""
 TEXT, JSON = "text/plain", "application/json"
-MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
+MEDIA = {
+    "png": "image/png",
+    "pgm": "image/x-portable-graymap",
+    "yaml": "application/yaml",
+    "svg": "image/svg+xml",
+    "tif": "image/tiff",
+}
 
 _ROWS = {"type": "array", "items": {"type": "object", "required": ["name", "value", "unit"]}}
 _SETTINGS = {"type": "object"}
@@ -158,9 +165,16 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get(
         "/maps/{k}.{suffix}", response_class=Response, responses={**refusals(400, 404), 200: content(*MEDIA.values())}
     )
-    def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml)$")]) -> FileResponse:
-        """A map: picture, occupancy, and what map_server needs to know of it."""
-        return _file(state, f"{map_stem(k)}.{suffix}", MEDIA[suffix])
+    def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif)$")]) -> Response:
+        """A map: picture, occupancy, what map_server needs to know of it, drawing, and GeoTIFF if its place on earth
+        is known.
+        """
+        if suffix not in ("svg", "tif"):
+            return _file(state, f"{map_stem(k)}.{suffix}", MEDIA[suffix])
+        exported = export_map(_folder_of(state), k, suffix)
+        if exported is None:
+            raise HTTPException(404, f"there is no {map_stem(k)}, or its place on earth is not known")
+        return Response(exported, media_type=MEDIA[suffix])
 
     @router.get(
         "/maps/{k}/tiles/{z}/{x}/{y}.png",
