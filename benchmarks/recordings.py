@@ -35,7 +35,7 @@ from tests.sources.bag_messages import odom, quaternion, save, tf
 from tests.sources.test_drivers import START, Scanner, pose_at, times
 
 RIGHT_M = 0.02
-SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still"
+SAID = "contradict", "are bent", "not corrected", "have no times", "was lost", "while the odometry stands still"
 """Parts of the lines that say what is wrong."""
 COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
 COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}
@@ -104,6 +104,12 @@ RANGES = {
     "quality of the returns": lambda k, r: np.clip(np.round(15.0 + noise(k, 3.0, len(r))), 0, 63),
     "noise": lambda k, r: np.random.default_rng(k).uniform(0.2, 8.0, len(r)),
     "squares of ranges": lambda k, r: r**2,
+    "logarithms of ranges": lambda k, r: 2.0 * np.log(r + 0.5),
+    "roots of ranges": lambda k, r: 2.0 * np.sqrt(r),
+    "0.3 m too long": lambda k, r: r + 0.3,
+    "0.3 m too short": lambda k, r: np.maximum(r - 0.3, 0.0),
+    "centimetres in 8 bits": lambda k, r: np.round(100.0 * r) % 256 / 100.0,
+    "millimetres in 12 bits": lambda k, r: np.round(1000.0 * r) % 4096 / 1000.0,
     "two way distances": lambda k, r: 2.0 * r,
     "whole metres": lambda k, r: np.floor(r),
     "beams in another order": lambda k, r: r[np.random.default_rng(0).permutation(len(r))],

@@ -3,6 +3,7 @@
 - Nothing: nearly no beam has a return.
 - Another unit: the values are too large for a 2D LiDAR, and as varied as ranges. A driver that sends a large number for
   no return sends few different ones.
+- A counter that overflows: beside beams near the largest value are beams near 0, and both have many values.
 - Whole numbers: no laser rounds ranges to metres. Intensities are whole numbers.
 - A placeholder: one value repeats exactly in many beams at most places of a drive, and values near it are rare. Along a
   wall they are not, as the beams beside the nearest one are a little longer, however coarse the ranges are.
@@ -33,6 +34,11 @@ _WHOLE, _FEWEST_VALUES = 0.95, 3
 """Share of the different values that are whole where all are, and their least number."""
 _MILLIMETRES = 900.0
 """Values of which half are larger are millimetres and not centimetres."""
+_TOP, _BOTTOM = 0.95, 0.05
+"""Parts of the largest value above and below which a counter may overflow between two beams."""
+_OVERFLOWS, _FEWEST_OVERFLOWS, _FEWEST_ENDS = 0.01, 15, 5
+"""Share of the beams in the upper part that have one in the lower part beside them, their least number, and the least
+number of their values."""
 _REPEATED, _PLACES = 0.1, 0.5
 """Share of the beams that have a placeholder, and of the places at which as many have it."""
 _NEAR, _ABOVE_NEAR = 2, 5
@@ -127,6 +133,11 @@ class RangeSample:
                 f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
                 f"be {unit}{', or intensities,' * is_whole} and give the recording again"
             )
+        if _overflows(self._samples):
+            raise SourceError(
+                f"{path}: the ranges{which} go from {returns.max():.2f} m to 0 from one beam to the next, as a counter "
+                "that overflows; let the driver use numbers with more bits and record again"
+            )
         if is_whole:
             raise SourceError(
                 f"{path}: the ranges{which} are whole numbers, such as {different[len(different) // 2]:g}, and no "
@@ -165,6 +176,26 @@ def _returns(sample: _Sample) -> FloatArray:
     with np.errstate(invalid="ignore"):
         is_return = (values > max(sample.range_min_m, 0.0)) & (values < sample.range_max_m)
     return values[is_return]
+
+
+def _overflows(samples: Sequence[_Sample]) -> bool:
+    """Whether the ranges go on at 0 after the largest one."""
+    largest = max((_returns(one).max(initial=0.0) for one in samples), default=0.0)
+    above, below = [np.empty(0)], [np.empty(0)]
+    beams_above = 0
+    for one in samples:
+        values = one.values.astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            is_above = (values > _TOP * largest) & (values <= largest)
+            is_below = (values > 0.0) & (values < _BOTTOM * largest)
+        beams_above += int(np.count_nonzero(is_above))
+        for a, b in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
+            is_end = is_above[a] & is_below[b]
+            above.append(values[a][is_end])
+            below.append(values[b][is_end])
+    ends = [np.concatenate(each) for each in (above, below)]
+    is_often = len(ends[0]) > max(_OVERFLOWS * beams_above, _FEWEST_OVERFLOWS)
+    return is_often and all(len(np.unique(each)) >= _FEWEST_ENDS for each in ends)
 
 
 def _is_beyond(sample: _Sample) -> np.ndarray:
