@@ -87,6 +87,8 @@ def recordings() -> Iterator[tuple[str, str, Iterable]]:
         name = f"turned by {turned_deg} deg" + ", upside down" * bool(roll_rad)
         yield "mounting", name, mounted(quaternion(math.radians(turned_deg), roll_rad))
         yield "mounting of a 3D LiDAR", name, with_clouds(quaternion(YAW + math.radians(turned_deg), roll_rad))
+    for leans in ({"pitch_deg": 20.0}, {"roll_deg": -35.0}):
+        yield "mounting of a 3D LiDAR", "leaning against tf, " + str(leans), with_clouds(rings=16, **leans)
     yield from (("cloud", name, with_clouds(**change)) for name, change in CLOUDS.items())
 
 
@@ -173,22 +175,26 @@ def mounted(rotation) -> Iterator:
 
 
 def with_clouds(
-    rotation=None, layout=VELODYNE, count=60, change=lambda message: message, holes=0.0, height=1, **fields
+    rotation=None,
+    layout=VELODYNE,
+    count=60,
+    change=lambda message: message,
+    holes=0.0,
+    height=1,
+    pitch_deg=0.0,
+    roll_deg=0.0,
+    rings=4,
+    **fields,
 ) -> Iterator:
     yield tf(START, "base_link", "lidar", MOUNTING, rotation or quaternion(YAW), topic="/tf_static")
     yield from drivers.readings(0.1 * count)
+    R = made.rotation(math.radians(roll_deg), math.radians(pitch_deg), YAW)
     for number in range(count):
         begin = 0.1 * number
-        turn = cloud_at(begin, 4, 360)
+        turn = made.spinning(lambda t, begin=begin: pose_at(begin + t), MOUNTING, R, rings, 360, True, math.pi)
         turn.points[::50] *= holes
         message = made.cloud(START + begin, turn, layout, height=height, **fields)
         yield made.said("/points", START + begin, change(message))
-
-
-def cloud_at(begin: float, count: int, columns: int, clockwise: bool = True) -> made.Measured:
-    return made.spinning(
-        lambda t: pose_at(begin + t), MOUNTING, made.rotation(yaw=YAW), count, columns, clockwise, math.pi
-    )
 
 
 def swapped(message):
