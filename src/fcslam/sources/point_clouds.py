@@ -4,8 +4,8 @@ The points in a band of heights above the floor count. The nearest surface in ea
 is a plane that is fitted to each cloud, so a robot that pitches or a sensor that leans sees no floor in the band.
 
 A scanner that turns measures its directions one after the other. The directions of a scan then begin where the turn
-begins, so that their times are linear; a return that was not measured when its direction was is left out. The points of
-other scanners are moved to where they are seen at the mean time of all.
+begins, so that their times are linear; a return that was not measured when its direction was is left out. Without times,
+the order of the points shows where a turn begins. The points of other scanners are moved to where they are seen at the mean time of all.
 """
 
 from collections.abc import Iterable
@@ -148,15 +148,17 @@ def scan_of_cloud(
     floor = floor or Floor(np.array([0.0, 0.0, 1.0]), 0.0)
     heights_m = in_base @ floor.normal - floor.distance_m
     xy = ((in_base - mounting.position_m) @ _levelling(floor.normal, mounting.heading_rad).T)[:, :2]
-    turn = _turn(xy, cloud.times_s) if motion is None else None
+    is_timed = len(cloud.times_s) > 0
+    turn = _turn(xy, cloud.times_s if is_timed else np.linspace(0.0, 1.0, len(xy))) if motion is None else None
     kept = (heights_m > band.low_m) & (heights_m < band.high_m) & outside
     kept &= np.hypot(xy[:, 0], xy[:, 1]) < FARTHEST_M
     first, sweep = -DIRECTIONS // 2, None
     angles = np.arctan2(xy[kept, 1], xy[kept, 0])
-    if turn is None:
-        index = np.rint(angles / _SPACING_RAD).astype(np.int64) - first
-        index[index == DIRECTIONS] = 0
-        if len(cloud.times_s):
+    if turn is None or not is_timed:
+        if turn is not None:  # the drive may show how long it takes, if the directions are in the order of time
+            first = turn.directions()[0]
+        index = np.remainder(np.rint(angles / _SPACING_RAD).astype(np.int64) - first, DIRECTIONS)
+        if is_timed:
             sweep = Sweep(float(cloud.times_s.min()) - offset_s, float(cloud.times_s.max()) - offset_s)
     else:
         offset_s, (first, sweep) = 0.0, turn.directions()
@@ -167,7 +169,7 @@ def scan_of_cloud(
     ranges_m = _ranges(xy[kept], index, first)
     first = (first + DIRECTIONS // 2) % DIRECTIONS - DIRECTIONS // 2
     beams = Beams(DIRECTIONS, first * _SPACING_RAD, _SPACING_RAD)
-    return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None)
+    return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None and is_timed)
 
 
 def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
