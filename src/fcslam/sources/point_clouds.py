@@ -4,8 +4,9 @@ The points in a band of heights above the floor count. The nearest surface in ea
 is a plane that is fitted to each cloud, so a robot that pitches or a sensor that leans sees no floor in the band.
 
 A scanner that turns measures its directions one after the other. The directions of a scan then begin where the turn
-begins, so that their times are linear; a return that was not measured when its direction was is left out. Without times,
-the order of the points shows where a turn begins. The points of other scanners are moved to where they are seen at the mean time of all.
+begins, so that their times are linear; a return that was not measured when its direction was is left out. Without
+times, the order of the points shows where a turn begins. The points of other scanners are moved to where they are seen
+at the mean time of all.
 """
 
 from collections.abc import Iterable

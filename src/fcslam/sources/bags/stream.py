@@ -84,8 +84,8 @@ class RecordedLaser(NamedTuple):
             )
         if self.topic.type in SCANS and self.topic.type not in LASER_SCANS and self.first.sweep is None:
             yield (
-                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during a "
-                "cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
+                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during "
+                "a cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
             )
 
 
