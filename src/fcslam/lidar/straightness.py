@@ -63,7 +63,7 @@ class Excess(NamedTuple):
 
 def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
     """By how much the ranges of a laser are too long, if most walls show it; None if they are straight, or few."""
-    ranges_m, excess_m = np.concatenate([np.empty((0, 2)), *map(_stretches, islice(_apart(scans), MOST_SCANS))]).T
+    ranges_m, excess_m = np.concatenate([np.empty((0, 2)), *map(_stretches, islice(scans_apart(scans), MOST_SCANS))]).T
     if len(ranges_m) < FEWEST_STRETCHES:
         return None
     if np.percentile(np.copysign(1.0, np.median(excess_m)) * excess_m, OTHERS) < LEAST_EXCESS_M:
@@ -72,8 +72,8 @@ def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
     return Excess(*(float(np.median(each[half])) for half in (short, long) for each in (ranges_m, excess_m)))
 
 
-def _apart(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
-    """Scans between which the robot has moved or turned."""
+def scans_apart(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
+    """Scans between which the robot has moved or turned; without odometry, those a second apart."""
     last: LaserScan | None = None
     for scan in scans:
         if last is not None:

@@ -21,8 +21,9 @@ from fcslam.lidar.facing import (
     turn_remedy,
 )
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
+from fcslam.lidar.own_body import body_sectors
 from fcslam.lidar.straightness import Excess, excess_of
-from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
@@ -120,6 +121,29 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     return tuple(f"{source.name}: {line}" for found in _contradictions(source) for line in filter(None, found))
 
 
+def bodies_of(source: Source) -> tuple[str, ...]:
+    """Lines about the sectors in which lasers see the robot itself.
+
+    Raises:
+        SourceError: the recording cannot be mapped.
+    """
+    sectors = [
+        [round(first_deg), round(last_deg)]
+        for laser in source.survey().lasers
+        for first_deg, last_deg in body_sectors(_scans_of(laser, source))
+    ]
+    if not sectors:
+        return ()
+    return (
+        f"{source.name}: some beams see the robot itself, as they never change; to leave them out, add to the "
+        f"configuration: robot: {{lidar: {{ignore: {sectors}}}}}",
+    )
+
+
+def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
+    return (each for each in source.records() if isinstance(each, LaserScan) and is_same_laser(each.laser, laser))
+
+
 class _Found(NamedTuple):
     """What speaks against the scans of a laser."""
 
@@ -131,8 +155,7 @@ def _contradictions(source: Source) -> list[_Found]:
     """Of each laser."""
     found = []
     for laser in source.survey().lasers:
-        scans = (each for each in source.records() if isinstance(each, LaserScan) and is_same_laser(each.laser, laser))
-        first = list(islice(scans, MOST_COMPARED))
+        first = list(islice(_scans_of(laser, source), MOST_COMPARED))
         found.append(_Found(contradicted_facing(first), excess_of(first)))
     return found
 
@@ -221,7 +244,7 @@ def _tracked(
 ) -> tuple[ScanMotions, OdometryTrack | None]:
     """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
     frontend = LidarFrontend("calibration", config, PREDICTED)
-    prediction, mapped = MotionPrediction(), MappedScans()
+    prediction, mapped = MotionPrediction(), MappedScans(config.ignore)
     unknown = np.full(3, np.nan)
     stamps: list[float] = []
     poses: list[FloatArray] = []

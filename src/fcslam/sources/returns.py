@@ -39,6 +39,8 @@ _TOP, _BOTTOM = 0.95, 0.05
 _OVERFLOWS, _FEWEST_OVERFLOWS, _FEWEST_ENDS = 0.01, 15, 5
 """Share of the beams in the upper part that have one in the lower part beside them, their least number, and the least
 number of their values."""
+_SMOOTH = 0.05
+"""Largest usual difference of ranges side by side, as a share of the largest range."""
 _REPEATED, _PLACES = 0.1, 0.5
 """Share of the beams that have a placeholder, and of the places at which as many have it."""
 _NEAR, _ABOVE_NEAR = 2, 5
@@ -181,21 +183,17 @@ def _returns(sample: _Sample) -> FloatArray:
 def _overflows(samples: Sequence[_Sample]) -> bool:
     """Whether the ranges go on at 0 after the largest one."""
     largest = max((_returns(one).max(initial=0.0) for one in samples), default=0.0)
-    above, below = [np.empty(0)], [np.empty(0)]
-    beams_above = 0
-    for one in samples:
-        values = one.values.astype(np.float64)
-        with np.errstate(invalid="ignore"):
-            is_above = (values > _TOP * largest) & (values <= largest)
-            is_below = (values > 0.0) & (values < _BOTTOM * largest)
-        beams_above += int(np.count_nonzero(is_above))
-        for a, b in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
-            is_end = is_above[a] & is_below[b]
-            above.append(values[a][is_end])
-            below.append(values[b][is_end])
-    ends = [np.concatenate(each) for each in (above, below)]
-    is_often = len(ends[0]) > max(_OVERFLOWS * beams_above, _FEWEST_OVERFLOWS)
-    return is_often and all(len(np.unique(each)) >= _FEWEST_ENDS for each in ends)
+    values = np.concatenate([np.append(one.values, np.nan) for one in samples]).astype(np.float64)
+    one, other = np.concatenate((values[:-1], values[1:])), np.concatenate((values[1:], values[:-1]))
+    with np.errstate(invalid="ignore"):
+        known = (np.minimum(one, other) > 0.0) & (np.maximum(one, other) <= largest)
+    one, other = one[known], other[known]
+    is_top = one > _TOP * largest
+    ends = is_top & (other < _BOTTOM * largest)
+    if np.count_nonzero(ends) <= max(_OVERFLOWS * np.count_nonzero(is_top), _FEWEST_OVERFLOWS):
+        return False
+    is_smooth = np.median(np.abs(one - other)) < _SMOOTH * largest
+    return bool(is_smooth) and all(len(np.unique(each[ends])) >= _FEWEST_ENDS for each in (one, other))
 
 
 def _is_beyond(sample: _Sample) -> np.ndarray:
