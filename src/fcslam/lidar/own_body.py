@@ -41,7 +41,7 @@ def is_in_sectors(laser: LaserModel, sectors: Sectors) -> NDArray[np.bool_]:
 
 def body_sectors(scans: Iterable[LaserScan]) -> Sectors:
     """Sectors in which a laser sees the robot itself: they stay as they are while it drives and turns."""
-    places = [scan for scan in islice(scans_apart(scans), MOST_PLACES) if np.isfinite(scan.T_odom_base[2])]
+    places = list(islice(scans_apart(scans), MOST_PLACES))
     turns = np.array([scan.T_odom_base[2] for scan in places])
     if len(places) < FEWEST_PLACES or np.hypot(np.cos(turns).mean(), np.sin(turns).mean()) > SHARPEST:
         return ()

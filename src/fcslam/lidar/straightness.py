@@ -6,7 +6,7 @@ each stretch of a wall gives an estimate of ``c`` by least squares. The estimate
 
 import math
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,8 +18,10 @@ from fcslam.records import FloatArray, LaserScan
 
 MOST_SCANS: Final = 300
 """Scans that are examined at most."""
-LEAST_MOVE_M, LEAST_TURN_RAD, LEAST_S = 0.3, 0.3, 1.0
-"""The robot has moved or turned by so much between two of them; without odometry, so much time is between them."""
+LEAST_MOVE_M, LEAST_TURN_RAD = 0.3, 0.3
+"""The robot has moved or turned by so much between two of them."""
+LARGEST_TURN_RAD: Final = 0.03
+"""Between a scan and the one before; a scanner that spins sees bent walls while it turns faster."""
 STRETCH_RAD: Final = math.radians(40.0)
 """Angle of the stretches, as the laser sees them; each begins a quarter of it after the one before."""
 FEWEST_BEAMS: Final = 12
@@ -36,7 +38,7 @@ FARTHEST_M: Final = 1000.0
 STEPS: Final = 6
 """Of Gauss-Newton."""
 FEWEST_STRETCHES: Final = 30
-LEAST_EXCESS_M, OTHERS = 0.05, 25.0
+LEAST_EXCESS_M, OTHERS = 0.1, 25.0
 """Excess that is said, and per cent of the stretches that may show less."""
 
 
@@ -63,7 +65,9 @@ class Excess(NamedTuple):
 
 def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
     """By how much the ranges of a laser are too long, if most walls show it; None if they are straight, or few."""
-    ranges_m, excess_m = np.concatenate([np.empty((0, 2)), *map(_stretches, islice(scans_apart(scans), MOST_SCANS))]).T
+    ranges_m, excess_m = np.concatenate(
+        [np.empty((0, 2)), *map(_stretches, islice(scans_apart(_steady(scans)), MOST_SCANS))]
+    ).T
     if len(ranges_m) < FEWEST_STRETCHES:
         return None
     if np.percentile(np.copysign(1.0, np.median(excess_m)) * excess_m, OTHERS) < LEAST_EXCESS_M:
@@ -73,16 +77,22 @@ def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
 
 
 def scans_apart(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
-    """Scans between which the robot has moved or turned; without odometry, those a second apart."""
+    """Scans between which the robot has moved or turned, by odometry."""
     last: LaserScan | None = None
     for scan in scans:
         if last is not None:
             x, y, theta = se2.between(last.T_odom_base, scan.T_odom_base).tolist()
-            has_moved = math.hypot(x, y) > LEAST_MOVE_M or abs(theta) > LEAST_TURN_RAD
-            if not has_moved and not (math.isnan(theta) and scan.stamp - last.stamp > LEAST_S):
+            if not (math.hypot(x, y) > LEAST_MOVE_M or abs(theta) > LEAST_TURN_RAD):  # also without odometry
                 continue
         last = scan
         yield scan
+
+
+def _steady(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
+    """Scans during which the robot turns slowly."""
+    for before, scan in pairwise(scans):
+        if abs(se2.wrap_angle(scan.T_odom_base[2] - before.T_odom_base[2])) < LARGEST_TURN_RAD:
+            yield scan
 
 
 def _stretches(scan: LaserScan) -> FloatArray:
@@ -93,10 +103,11 @@ def _stretches(scan: LaserScan) -> FloatArray:
         return np.empty((0, 2))
     ranges_m = sliding_window_view(scan.ranges_m.astype(np.float64), count)[:: count // 4]
     seen = (ranges_m > 0.0) & (ranges_m < scan.laser.max_range_m)
+    ranges_m = np.where(seen, ranges_m, 1.0)
     steps_m = np.abs(np.diff(ranges_m, axis=1))
     is_step = (steps_m > STEP_M + STEP_SHARE * ranges_m[:, 1:]) & seen[:, 1:] & seen[:, :-1]
     chosen = (seen.mean(axis=1) > LEAST_RETURNS) & ~is_step.any(axis=1)
-    seen, ranges_m = seen[chosen], np.where(seen, ranges_m, 1.0)[chosen]
+    seen, ranges_m = seen[chosen], ranges_m[chosen]
     excess_m = _excess(np.asarray(step_rad * (np.arange(count) - 0.5 * count)), ranges_m, seen)
     return np.column_stack((np.median(ranges_m, axis=1), excess_m))[np.isfinite(excess_m)]
 
