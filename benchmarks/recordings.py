@@ -35,7 +35,7 @@ from tests.sources.bag_messages import odom, quaternion, save, tf
 from tests.sources.test_drivers import START, Scanner, pose_at, times
 
 RIGHT_M = 0.02
-SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still"
+SAID = "contradict", "are bent", "not corrected", "have no times", "was lost", "while the odometry stands still"
 """Parts of the lines that say what is wrong."""
 COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
 COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}
@@ -87,6 +87,8 @@ def recordings() -> Iterator[tuple[str, str, Iterable]]:
         name = f"turned by {turned_deg} deg" + ", upside down" * bool(roll_rad)
         yield "mounting", name, mounted(quaternion(math.radians(turned_deg), roll_rad))
         yield "mounting of a 3D LiDAR", name, with_clouds(quaternion(YAW + math.radians(turned_deg), roll_rad))
+    for leans in ({"pitch_deg": 20.0}, {"roll_deg": -35.0}):
+        yield "mounting of a 3D LiDAR", "leaning against tf, " + str(leans), with_clouds(rings=16, **leans)
     yield from (("cloud", name, with_clouds(**change)) for name, change in CLOUDS.items())
 
 
@@ -104,6 +106,12 @@ RANGES = {
     "quality of the returns": lambda k, r: np.clip(np.round(15.0 + noise(k, 3.0, len(r))), 0, 63),
     "noise": lambda k, r: np.random.default_rng(k).uniform(0.2, 8.0, len(r)),
     "squares of ranges": lambda k, r: r**2,
+    "logarithms of ranges": lambda k, r: 2.0 * np.log(r + 0.5),
+    "roots of ranges": lambda k, r: 2.0 * np.sqrt(r),
+    "0.3 m too long": lambda k, r: r + 0.3,
+    "0.3 m too short": lambda k, r: np.maximum(r - 0.3, 0.0),
+    "centimetres in 8 bits": lambda k, r: np.round(100.0 * r) % 256 / 100.0,
+    "millimetres in 12 bits": lambda k, r: np.round(1000.0 * r) % 4096 / 1000.0,
     "two way distances": lambda k, r: 2.0 * r,
     "whole metres": lambda k, r: np.floor(r),
     "beams in another order": lambda k, r: r[np.random.default_rng(0).permutation(len(r))],
@@ -167,22 +175,26 @@ def mounted(rotation) -> Iterator:
 
 
 def with_clouds(
-    rotation=None, layout=VELODYNE, count=60, change=lambda message: message, holes=0.0, height=1, **fields
+    rotation=None,
+    layout=VELODYNE,
+    count=60,
+    change=lambda message: message,
+    holes=0.0,
+    height=1,
+    pitch_deg=0.0,
+    roll_deg=0.0,
+    rings=4,
+    **fields,
 ) -> Iterator:
     yield tf(START, "base_link", "lidar", MOUNTING, rotation or quaternion(YAW), topic="/tf_static")
     yield from drivers.readings(0.1 * count)
+    R = made.rotation(math.radians(roll_deg), math.radians(pitch_deg), YAW)
     for number in range(count):
         begin = 0.1 * number
-        turn = cloud_at(begin, 4, 360)
+        turn = made.spinning(lambda t, begin=begin: pose_at(begin + t), MOUNTING, R, rings, 360, True, math.pi)
         turn.points[::50] *= holes
         message = made.cloud(START + begin, turn, layout, height=height, **fields)
         yield made.said("/points", START + begin, change(message))
-
-
-def cloud_at(begin: float, count: int, columns: int, clockwise: bool = True) -> made.Measured:
-    return made.spinning(
-        lambda t: pose_at(begin + t), MOUNTING, made.rotation(yaw=YAW), count, columns, clockwise, math.pi
-    )
 
 
 def swapped(message):

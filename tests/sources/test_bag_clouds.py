@@ -269,3 +269,41 @@ def test_each_scan_has_its_own_limits(tmp_path):
     nan = np.nan
     assert np.array_equal(records[0].ranges_m[:6], np.float32([0.3, 1.0, 1.9, nan, nan, nan]), equal_nan=True)
     assert np.array_equal(records[-1].ranges_m[:6], np.float32([nan, 1.0, 1.9, 5.0, 11.0, nan]), equal_nan=True)
+
+
+def leaning_bag(path, rotation_said, **leans):
+    """A bag whose sensor leans; tf says ``rotation_said``."""
+    R = rotation(yaw=YAW, **leans)
+    messages = [tf(START, "base_link", "lidar", LIDAR, rotation_said, topic="/tf_static")]
+    for t in np.arange(0.0, 2.0, 0.1).round(3).tolist():
+        measured = spinning(lambda times, t=t: pose_at(t + times), LIDAR, R, columns=360)
+        messages.append(odom(START + t, pose_at([t])[0], bag_time=START + t))
+        messages.append(said("/points", START + t, cloud(START + t, measured, VELODYNE)))
+    return save(path, messages)
+
+
+@pytest.mark.parametrize("leans", [{"pitch": 0.3}, {"roll": -0.5}], ids=str)
+def test_a_sensor_that_leans_against_tf_is_levelled(tmp_path, leans):
+    right = open_source(leaning_bag(tmp_path / "right.mcap", quaternion(YAW, *leaned(leans)), **leans))
+    wrong = open_source(leaning_bag(tmp_path / "wrong.mcap", quaternion(YAW), **leans))
+    assert "the floor in" not in " ".join(right.survey().notes)
+    degrees = math.degrees(abs(sum(leans.values())))
+    assert f"the floor in /points leans by {degrees:.0f} deg against the mounting of 'lidar'; corrected" in " ".join(
+        wrong.survey().notes
+    )
+    ranges = [
+        np.array([each.ranges_m for each in source.records() if isinstance(each, LaserScan)])
+        for source in (right, wrong)
+    ]
+    both = np.isfinite(ranges[0]) & np.isfinite(ranges[1])
+    assert both.mean() > 0.4
+    assert np.median(np.abs(ranges[0] - ranges[1])[both]) < 0.03
+
+
+def leaned(leans):
+    return leans.get("roll", 0.0), leans.get("pitch", 0.0)
+
+
+def test_a_sensor_that_leans_a_little_is_levelled_without_a_word(tmp_path):
+    source = open_source(leaning_bag(tmp_path / "run.mcap", quaternion(YAW), pitch=0.1))
+    assert "the floor in" not in " ".join(source.survey().notes)

@@ -54,6 +54,29 @@ def test_a_folder_of_parts_with_metadata_is_read_by_it(tmp_path):
     assert len(scans_of(open_source(folder))) == 60
 
 
+def test_a_folder_of_bag_folders_is_one_recording(tmp_path):
+    whole = scans_of(open_source(save(tmp_path / "whole.mcap", drive(60))))
+    messages = sorted(drive(60), key=lambda message: message.bag_time)
+    (tmp_path / "drive").mkdir()
+    for number, cut in enumerate((messages[:100], messages[100:])):
+        assert (save(tmp_path / "drive" / f"part_{number}", cut) / "metadata.yaml").is_file()
+    (tmp_path / "drive" / "notes").mkdir()
+    for is_closed in (True, False):
+        if not is_closed:  # the recorder of the last part was killed
+            (tmp_path / "drive" / "part_1" / "metadata.yaml").unlink()
+        source = open_source(tmp_path / "drive")
+        assert source.name == "drive"
+        assert_same(scans_of(source), whole)
+
+
+def test_a_folder_of_bag_folders_of_several_robots_is_refused(tmp_path):
+    (tmp_path / "fleet").mkdir()
+    for name in ("anna", "ben"):
+        save(tmp_path / "fleet" / name, drive(60))
+    with pytest.raises(SourceError, match=r"has scans in /scan of the same time as .*give each as .*NAME=PATH"):
+        open_source(tmp_path / "fleet").survey()
+
+
 @pytest.mark.parametrize("with_metadata", [True, False])
 def test_the_last_part_may_be_cut_off(tmp_path, with_metadata):
     files = parts(tmp_path / "run", ".mcap")

@@ -91,6 +91,17 @@ def test_a_cloud_without_times_is_measured_at_its_stamp(layout):
     assert_room(scan)
 
 
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("same_time", [False, True])
+def test_without_times_the_order_of_the_points_shows_where_a_turn_begins(clockwise, same_time):
+    measured = spinning(at_rest, clockwise=clockwise, first_rad=0.7)
+    timed = read(cloud(STAMP, measured, VELODYNE))
+    layout = VELODYNE if same_time else REALSENSE
+    scan = read(cloud(STAMP, measured._replace(times=np.full_like(measured.times, 0.02)), layout))
+    assert (scan.beams, scan.sweep) == (timed.beams, None)
+    assert_room(scan)
+
+
 @pytest.mark.parametrize("kind", LIVOX_CLOUDS)
 @pytest.mark.parametrize("ros1", [False, True])
 def test_livox_custom_messages(kind, ros1):

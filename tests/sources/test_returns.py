@@ -73,6 +73,27 @@ def test_other_units_in_a_log_are_refused(tmp_path, factor, unit):
     assert "only 0.0% of the beams measure a range (0 m to 50 m)" in refusal(save_log(tmp_path / "no.log", nothing))
 
 
+@pytest.mark.parametrize(("unit", "bits"), [(100.0, 8), (1000.0, 12)])
+def test_a_counter_that_overflows_is_refused(tmp_path, unit, bits):
+    def counted(_, values):
+        return np.round(unit * values) % 2**bits / unit
+
+    message = refusal(bag(tmp_path / "run.bag", counted))
+    assert float(message.split("go from ")[1].split()[0]) == pytest.approx(2**bits / unit, rel=0.01)
+    assert "as a counter that overflows" in message
+
+
+def test_near_things_before_far_ones_are_no_overflow(tmp_path):
+    """Posts near the laser, and no return or codes for it beside them."""
+
+    def seen(step, values):
+        at = np.arange(BEAMS) + step
+        near = np.where(at % 9 == 0, 0.11 + 0.001 * (at % 40), values)
+        return np.where(at % 9 == 1, 11.9, near)
+
+    assert open_source(bag(tmp_path / "run.bag", seen)).survey().scan_count == 40
+
+
 def test_a_range_max_below_most_ranges_is_refused(tmp_path):
     message = refusal(bag(tmp_path / "run.bag", range_max=1.0))
     assert "beyond the range_max of 1 m" in message

@@ -59,14 +59,15 @@ def info(
 
 
 def _with_contradictions(found: "Inspection", options: "BagOptions | None") -> "Inspection":
-    from fcslam.robot.calibrating import contradictions_of
+    from fcslam.robot.calibrating import bodies_of, contradictions_of
     from fcslam.sources import open_source
 
     if found.robots:
         return replace(found, robots=tuple(_with_contradictions(robot, options) for robot in found.robots))
     if found.problem is not None:
         return found
-    return replace(found, notes=(*found.notes, *contradictions_of(open_source(found.path, options))))
+    source = open_source(found.path, options)
+    return replace(found, notes=(*found.notes, *contradictions_of(source), *bodies_of(source)))
 
 
 def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":

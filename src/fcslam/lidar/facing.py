@@ -15,6 +15,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
+from fcslam.lidar.straightness import Excess, excess_of
 from fcslam.records import Beams, FloatArray, LaserScan
 
 LEAST_MOVE_M: Final = 0.3
@@ -22,7 +23,7 @@ LEAST_TURN_RAD: Final = 0.3
 """Two scans are compared once the robot has moved or turned by so much."""
 LONGEST_S: Final = 4.0
 """Scans farther apart in time are not compared: odometry drifts."""
-MOST_SCANS: Final = 3000
+MOST_COMPARED: Final = 3000
 """Scans that are read at most."""
 MOST_PAIRS: Final = 40
 """Pairs with a move that are compared, and as many with a turn."""
@@ -175,7 +176,7 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     Args:
         scans: of one laser, with odometry; as many are read as are needed.
     """
-    trial = _Trial(*_pairs(islice(scans, MOST_SCANS)))
+    trial = _Trial(*_pairs(islice(scans, MOST_COMPARED)))
     as_stated = trial.agreements(Facing())
     if len(trial.pairs) < FEWEST_PAIRS or trial.mean(as_stated) > ENOUGH_AGREEMENT:
         return None
@@ -227,17 +228,19 @@ def _best(trial: "_Trial") -> tuple[Facing, dict[Facing, FloatArray]]:
 
 
 class FacingWatch:
-    """Decides how a live laser faces, once its robot has moved enough."""
+    """Decides how a live laser faces and whether it measures distances, once its robot has moved enough."""
 
     def __init__(self) -> None:
         self._scans: list[LaserScan] = []
 
-    def add(self, scan: LaserScan) -> Contradiction | None:
-        """Add the next scan of the laser; returns a contradiction once."""
+    def add(self, scan: LaserScan) -> Contradiction | Excess | None:
+        """Add the next scan of the laser; returns once what is wrong."""
         if len(self._scans) == SCANS_WATCHED or (self._scans and not any(_moved(self._scans[-1], scan))):
             return None
         self._scans.append(scan)
-        return contradicted_facing(self._scans) if len(self._scans) == SCANS_WATCHED else None
+        if len(self._scans) < SCANS_WATCHED:
+            return None
+        return excess_of(self._scans) or contradicted_facing(self._scans)
 
 
 class _Trial:

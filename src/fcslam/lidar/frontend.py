@@ -15,6 +15,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
+from fcslam.lidar.own_body import Sectors
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackingResult
@@ -72,6 +73,11 @@ class LidarConfig(Settings):
         le=1.0,
         description="time from the first beam of a scan, which its stamp is that of, to the last; for text logs and "
         "programs, as bags and ROS messages say it; 0: all beams are measured at once [s]",
+    )
+    ignore: Sectors = Field(
+        default=(),
+        description="sectors [from, to] whose beams are left out, as they see the robot itself; headings in base, "
+        "counter-clockwise, which `fcslam info` proposes [deg]",
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")

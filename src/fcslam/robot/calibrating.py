@@ -3,16 +3,27 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final, TypeGuard
+from itertools import islice
+from typing import Final, NamedTuple, TypeGuard
 
 import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
-from fcslam.lidar.facing import WHEELS, Contradiction, Facing, contradicted_facing, distance_remedy, turn_remedy
+from fcslam.lidar.facing import (
+    MOST_COMPARED,
+    WHEELS,
+    Contradiction,
+    Facing,
+    contradicted_facing,
+    distance_remedy,
+    turn_remedy,
+)
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.lidar.own_body import body_sectors
+from fcslam.lidar.straightness import Excess, excess_of
+from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
@@ -69,14 +80,24 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     contradictions = _contradictions(bag)
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
-        lines = (f"{laser.name}: {found}; not corrected" for laser, found in named if found)
+        lines = (f"{laser.name}: {line}; not corrected" for laser, found in named for line in filter(None, found))
         return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
-    found = contradictions[0]
+    facing, excess = contradictions[0]
+    if excess is None:
+        return _calibrate_facing(bag, config, facing)
+    calibrated = _calibrate_facing(bag, config, facing, is_bent=True)
+    return replace(calibrated, lines=(f"{excess}; not corrected", *calibrated.lines))
+
+
+def _calibrate_facing(
+    bag: RosBag, config: LidarConfig, found: Contradiction | None, is_bent: bool = False
+) -> Calibrated:
+    """Calibrate a bag with one laser; ``is_bent``: its ranges are no distances, so they do not tell where it sits."""
     if found is None:
-        return _calibrate_finely(bag, config)
+        return _calibrate_finely(bag, config, is_bent)
     turned_deg, upside_down, distance, turn = found.facing
     if (distance, turn) != (1.0, 1.0) or found.facing == Facing():
-        fine = _calibrate_finely(bag, config)
+        fine = _calibrate_finely(bag, config, is_bent)
         scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
         lines_before = () if _is_wrong(scale) else (f"{found}; not corrected",)
         return replace(fine, lines=(*lines_before, *fine.lines))
@@ -84,7 +105,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
     x, y, theta = se2.compose(turned, se2.inverse(T_base_laser)).tolist()
     coarse = BagCorrection(mounting=(x, y, theta), upside_down=upside_down)
-    fine = _calibrate_finely(bag.corrected(coarse, ()), config)
+    fine = _calibrate_finely(bag.corrected(coarse, ()), config, is_bent)
     x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
     done = "--laser-pose is kept" if bag.has_given_pose else "corrected"
     correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
@@ -97,22 +118,49 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     Raises:
         SourceError: the recording cannot be mapped.
     """
-    return tuple(f"{source.name}: {found}" for found in _contradictions(source) if found)
+    return tuple(f"{source.name}: {line}" for found in _contradictions(source) for line in filter(None, found))
 
 
-def _contradictions(source: Source) -> list[Contradiction | None]:
-    """Of each laser."""
-    return [
-        contradicted_facing(
-            record
-            for record in source.records()
-            if isinstance(record, LaserScan) and is_same_laser(record.laser, laser)
-        )
+def bodies_of(source: Source) -> tuple[str, ...]:
+    """Lines about the sectors in which lasers see the robot itself.
+
+    Raises:
+        SourceError: the recording cannot be mapped.
+    """
+    sectors = [
+        [round(first_deg), round(last_deg)]
         for laser in source.survey().lasers
+        for first_deg, last_deg in body_sectors(_scans_of(laser, source))
     ]
+    if not sectors:
+        return ()
+    return (
+        f"{source.name}: some beams see the robot itself, as they never change; to leave them out, add to the "
+        f"configuration: robot: {{lidar: {{ignore: {sectors}}}}}",
+    )
 
 
-def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
+def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
+    return (each for each in source.records() if isinstance(each, LaserScan) and is_same_laser(each.laser, laser))
+
+
+class _Found(NamedTuple):
+    """What speaks against the scans of a laser."""
+
+    facing: Contradiction | None
+    excess: Excess | None
+
+
+def _contradictions(source: Source) -> list[_Found]:
+    """Of each laser."""
+    found = []
+    for laser in source.survey().lasers:
+        first = list(islice(_scans_of(laser, source), MOST_COMPARED))
+        found.append(_Found(contradicted_facing(first), excess_of(first)))
+    return found
+
+
+def _calibrate_finely(bag: RosBag, config: LidarConfig, is_bent: bool) -> Calibrated:
     survey = bag.survey()
     assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
     if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:
@@ -132,6 +180,8 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
         return Calibrated(calibration, BagCorrection(), lines)
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
+    if is_bent:
+        calibration = replace(calibration, mounting=None)
     if _is_wrong(distance := calibration.distance_scale) and not 1.0 / WHEELS < distance.value < WHEELS:
         calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
@@ -194,7 +244,7 @@ def _tracked(
 ) -> tuple[ScanMotions, OdometryTrack | None]:
     """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
     frontend = LidarFrontend("calibration", config, PREDICTED)
-    prediction, mapped = MotionPrediction(), MappedScans()
+    prediction, mapped = MotionPrediction(), MappedScans(config.ignore)
     unknown = np.full(3, np.nan)
     stamps: list[float] = []
     poses: list[FloatArray] = []

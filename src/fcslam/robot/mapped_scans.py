@@ -7,6 +7,7 @@ import numpy as np
 
 from fcslam.geometry.beams import beam_step
 from fcslam.lidar.lasers import Lasers
+from fcslam.lidar.own_body import Sectors, is_in_sectors
 from fcslam.records import Beams, LaserModel, LaserScan, Ranges, Sweep
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
 from fcslam.wire.quantisation import dequantise, quantise
@@ -19,7 +20,9 @@ class MappedScans:
     remains one laser.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ignore: Sectors = ()) -> None:
+        """Beams in the sectors ``ignore`` are left out."""
+        self._ignore = ignore
         self._lasers = Lasers()
 
     def of(self, scan: LaserScan) -> LaserScan:
@@ -32,6 +35,8 @@ class MappedScans:
         step = beam_step(self._lasers.known[index].beams)
         laser = _mapped_laser(scan.laser, step)
         returns = _returns(scan.ranges_m[::step], laser.max_range_m)
+        if self._ignore:
+            returns = np.where(is_in_sectors(laser, self._ignore), np.float32(0.0), returns)
         sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
         return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser, sweep=sweep)
 

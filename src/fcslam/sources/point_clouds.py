@@ -4,10 +4,12 @@ The points in a band of heights above the floor count. The nearest surface in ea
 is a plane that is fitted to each cloud, so a robot that pitches or a sensor that leans sees no floor in the band.
 
 A scanner that turns measures its directions one after the other. The directions of a scan then begin where the turn
-begins, so that their times are linear; a return that was not measured when its direction was is left out. The points of
-other scanners are moved to where they are seen at the mean time of all.
+begins, so that their times are linear; a return that was not measured when its direction was is left out. Without
+times, the order of the points shows where a turn begins. The points of other scanners are moved to where they are seen
+at the mean time of all.
 """
 
+from collections.abc import Iterable
 from math import cos, pi, radians, tau
 from typing import Final, NamedTuple
 
@@ -35,6 +37,12 @@ FLOOR_ERROR_M: Final = 0.3
 """The floor is at most this far from where the mounting says."""
 FLOOR_TILT_RAD: Final = radians(12.0)
 """The same for its inclination."""
+LEANING_RAD: Final = radians(10.0)
+"""A mounting from which the floor leans by more in most clouds is wrong."""
+LARGEST_LEANING_RAD: Final = radians(40.0)
+"""Beyond, walls and the floor may be confused."""
+_FEWEST_FLOORS, _SAME_FLOOR_RAD = 8, radians(4.0)
+"""Clouds that show it at least, and the largest deviation of their floors from the middle one."""
 FLOOR_REACH_M: Final = 12.0
 """The floor is fitted to points up to this distance."""
 FLOOR_NOISE_M: Final = 0.05
@@ -141,15 +149,17 @@ def scan_of_cloud(
     floor = floor or Floor(np.array([0.0, 0.0, 1.0]), 0.0)
     heights_m = in_base @ floor.normal - floor.distance_m
     xy = ((in_base - mounting.position_m) @ _levelling(floor.normal, mounting.heading_rad).T)[:, :2]
-    turn = _turn(xy, cloud.times_s) if motion is None else None
+    is_timed = len(cloud.times_s) > 0
+    turn = _turn(xy, cloud.times_s if is_timed else np.linspace(0.0, 1.0, len(xy))) if motion is None else None
     kept = (heights_m > band.low_m) & (heights_m < band.high_m) & outside
     kept &= np.hypot(xy[:, 0], xy[:, 1]) < FARTHEST_M
     first, sweep = -DIRECTIONS // 2, None
     angles = np.arctan2(xy[kept, 1], xy[kept, 0])
-    if turn is None:
-        index = np.rint(angles / _SPACING_RAD).astype(np.int64) - first
-        index[index == DIRECTIONS] = 0
-        if len(cloud.times_s):
+    if turn is None or not is_timed:
+        if turn is not None:  # the drive may show how long it takes, if the directions are in the order of time
+            first = turn.directions()[0]
+        index = np.remainder(np.rint(angles / _SPACING_RAD).astype(np.int64) - first, DIRECTIONS)
+        if is_timed:
             sweep = Sweep(float(cloud.times_s.min()) - offset_s, float(cloud.times_s.max()) - offset_s)
     else:
         offset_s, (first, sweep) = 0.0, turn.directions()
@@ -160,7 +170,7 @@ def scan_of_cloud(
     ranges_m = _ranges(xy[kept], index, first)
     first = (first + DIRECTIONS // 2) % DIRECTIONS - DIRECTIONS // 2
     beams = Beams(DIRECTIONS, first * _SPACING_RAD, _SPACING_RAD)
-    return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None)
+    return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None and is_timed)
 
 
 def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
@@ -176,11 +186,26 @@ def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float
     return points
 
 
-def floor_in(points: FloatArray, mounting: CloudMounting) -> Floor | None:
+def leaning(clouds: Iterable[PointCloud], mounting: CloudMounting) -> FloatArray | None:
+    """The rotation of a wrong mounting that makes the floor level in most clouds, shape (3, 3); None if it is right."""
+    in_base = [cloud.points @ mounting.rotation.T + mounting.position_m for cloud in clouds]
+    floors = [floor_in(points, mounting, LARGEST_LEANING_RAD) for points in in_base]
+    normals = np.array([floor.normal for floor in floors if floor is not None]).reshape(-1, 3)
+    if len(normals) < max(_FEWEST_FLOORS, len(in_base) // 2):
+        return None
+    middle = np.median(normals, axis=0)
+    middle /= np.linalg.norm(middle)
+    is_same = normals @ middle > cos(_SAME_FLOOR_RAD)
+    if middle[2] > cos(LEANING_RAD) or np.count_nonzero(is_same) < max(_FEWEST_FLOORS, len(in_base) // 2):
+        return None
+    return _levelling(middle, 0.0)
+
+
+def floor_in(points: FloatArray, mounting: CloudMounting, largest_tilt_rad: float = FLOOR_TILT_RAD) -> Floor | None:
     """The floor among the ``points`` in ``base``; None if none is seen, or if it is where the mounting has it."""
     offset = points - mounting.position_m
     distances_m = np.hypot(offset[:, 0], offset[:, 1])
-    slope = np.tan(FLOOR_TILT_RAD)
+    slope = np.tan(largest_tilt_rad)
     if mounting.is_height_known:
         near = np.abs(points[:, 2]) < FLOOR_ERROR_M + slope * distances_m
     else:
@@ -190,17 +215,17 @@ def floor_in(points: FloatArray, mounting: CloudMounting) -> Floor | None:
     chosen = chosen[:: 1 + len(chosen) // _FLOOR_POINTS]
     lowest_first = np.argsort(offset[chosen, 2] / np.maximum(distances_m[chosen], 1e-3), kind="stable")
     able = points[chosen[lowest_first]]
-    floor = _lowest_plane(able, mounting.is_height_known)
+    floor = _lowest_plane(able, mounting.is_height_known, largest_tilt_rad)
     for _ in range(_FITS):
         floor = floor and _fitted(floor, able)
-    if floor is None or floor.normal[2] < cos(FLOOR_TILT_RAD):
+    if floor is None or floor.normal[2] < cos(largest_tilt_rad):
         return None
     height_m = float(floor.normal @ mounting.position_m) - floor.distance_m
     is_off = mounting.is_height_known and abs(height_m - mounting.position_m[2]) > FLOOR_ERROR_M
     return None if is_off or height_m < 0.0 else floor
 
 
-def _lowest_plane(points: FloatArray, is_height_known: bool) -> Floor | None:
+def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: float) -> Floor | None:
     """The plane with most points, less those below it (RANSAC); None if that of the mounting is nearly as good.
 
     It goes through three of the first ``points``, the lowest as seen from the sensor.
@@ -211,7 +236,7 @@ def _lowest_plane(points: FloatArray, is_height_known: bool) -> Floor | None:
     corners = points[triples]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
-    level = np.abs(normals[:, 2]) > cos(FLOOR_TILT_RAD) * np.maximum(lengths, 1e-6)
+    level = np.abs(normals[:, 2]) > cos(largest_tilt_rad) * np.maximum(lengths, 1e-6)
     normals = np.vstack(([0.0, 0.0, 1.0], normals[level] / normals[level, 2:]))
     distances_m = np.append(0.0, np.sum(normals[1:] * corners[level, 0], axis=1))
     heights_m = normals @ np.ascontiguousarray(points.T) - distances_m[:, None]

@@ -3,6 +3,7 @@
 - Nothing: nearly no beam has a return.
 - Another unit: the values are too large for a 2D LiDAR, and as varied as ranges. A driver that sends a large number for
   no return sends few different ones.
+- A counter that overflows: beside beams near the largest value are beams near 0, and both have many values.
 - Whole numbers: no laser rounds ranges to metres. Intensities are whole numbers.
 - A placeholder: one value repeats exactly in many beams at most places of a drive, and values near it are rare. Along a
   wall they are not, as the beams beside the nearest one are a little longer, however coarse the ranges are.
@@ -33,6 +34,13 @@ _WHOLE, _FEWEST_VALUES = 0.95, 3
 """Share of the different values that are whole where all are, and their least number."""
 _MILLIMETRES = 900.0
 """Values of which half are larger are millimetres and not centimetres."""
+_TOP, _BOTTOM = 0.95, 0.05
+"""Parts of the largest value above and below which a counter may overflow between two beams."""
+_OVERFLOWS, _FEWEST_OVERFLOWS, _FEWEST_ENDS = 0.01, 15, 5
+"""Share of the beams in the upper part that have one in the lower part beside them, their least number, and the least
+number of their values."""
+_SMOOTH = 0.05
+"""Largest usual difference of ranges side by side, as a share of the largest range."""
 _REPEATED, _PLACES = 0.1, 0.5
 """Share of the beams that have a placeholder, and of the places at which as many have it."""
 _NEAR, _ABOVE_NEAR = 2, 5
@@ -127,6 +135,11 @@ class RangeSample:
                 f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
                 f"be {unit}{', or intensities,' * is_whole} and give the recording again"
             )
+        if _overflows(self._samples):
+            raise SourceError(
+                f"{path}: the ranges{which} go from {returns.max():.2f} m to 0 from one beam to the next, as a counter "
+                "that overflows; let the driver use numbers with more bits and record again"
+            )
         if is_whole:
             raise SourceError(
                 f"{path}: the ranges{which} are whole numbers, such as {different[len(different) // 2]:g}, and no "
@@ -165,6 +178,22 @@ def _returns(sample: _Sample) -> FloatArray:
     with np.errstate(invalid="ignore"):
         is_return = (values > max(sample.range_min_m, 0.0)) & (values < sample.range_max_m)
     return values[is_return]
+
+
+def _overflows(samples: Sequence[_Sample]) -> bool:
+    """Whether the ranges go on at 0 after the largest one."""
+    largest = max((_returns(one).max(initial=0.0) for one in samples), default=0.0)
+    values = np.concatenate([np.append(one.values, np.nan) for one in samples]).astype(np.float64)
+    one, other = np.concatenate((values[:-1], values[1:])), np.concatenate((values[1:], values[:-1]))
+    with np.errstate(invalid="ignore"):
+        known = (np.minimum(one, other) > 0.0) & (np.maximum(one, other) <= largest)
+    one, other = one[known], other[known]
+    is_top = one > _TOP * largest
+    ends = is_top & (other < _BOTTOM * largest)
+    if np.count_nonzero(ends) <= max(_OVERFLOWS * np.count_nonzero(is_top), _FEWEST_OVERFLOWS):
+        return False
+    is_smooth = np.median(np.abs(one - other)) < _SMOOTH * largest
+    return bool(is_smooth) and all(len(np.unique(each[ends])) >= _FEWEST_ENDS for each in (one, other))
 
 
 def _is_beyond(sample: _Sample) -> np.ndarray:

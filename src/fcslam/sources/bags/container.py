@@ -75,15 +75,15 @@ class _Reader(Protocol):
 def is_bag(path: Path, head: bytes) -> bool:
     """Whether there is a bag at ``path``, a file that starts with ``head`` or a folder."""
     if path.is_dir():
-        return (path / METADATA).is_file() or any(_storage_files(path))
+        return any(_parts_in(path))
     return head.startswith((_ROS1, _MCAP, _SQLITE))
 
 
 def parts_of(path: Path) -> tuple[Path, ...]:
-    """The files of one recording: of a folder without metadata, or several joined by commas; else the path itself."""
+    """The parts of one recording: those in a folder without metadata, or several joined by commas; else the path."""
     if os.path.isdir(path):
         with translate_errors(path):
-            return (path,) if (path / METADATA).is_file() else tuple(_storage_files(path)) or (path,)
+            return tuple(_parts_in(path)) or (path,)
     names = str(path).split(",")
     return (path,) if os.path.lexists(path) or not all(names) else tuple(map(Path, names))
 
@@ -154,9 +154,10 @@ class BagFile:
     @cached_property
     def _parts(self) -> "tuple[_Part, ...]":
         """The files; those of a folder one by one if a file was not closed, as its metadata is then wrong."""
-        paths = parts_of(self.path)
-        if self.path.is_dir() and any(_is_cut_mcap(file) for file in self.path.glob("*.mcap")):
-            paths = tuple(_storage_files(self.path))
+        paths: list[Path] = []
+        for path in parts_of(self.path):
+            is_cut = path.is_dir() and any(map(_is_cut_mcap, path.glob("*.mcap")))
+            paths += _storage_files(path) if is_cut else [path]
         if len({path.resolve() for path in paths}) < len(paths):
             raise SourceError(f"{self.path}: a file is given twice; give each part of the recording once")
         parts = tuple(map(_Part, paths))
@@ -192,7 +193,7 @@ class PartOrder:
         if time_ns - self._left_ns.get((topic, part), time_ns) > _LONGEST_OVERLAP_NS:
             raise SourceError(
                 f"{part}: has scans in {topic} of the same time as {before}, so they are no parts of one drive; give "
-                "each as a recording of its own"
+                "each as a recording of its own, NAME=PATH"
             )
 
 
@@ -421,6 +422,16 @@ def _check_database(database: Path) -> None:
     if changes == counted_at and database.stat().st_size < page_bytes * pages:
         raise ValueError("the file is truncated")
     check_tables(database)
+
+
+def _parts_in(folder: Path) -> list[Path]:
+    """The folder itself if it has metadata, else the files of bags in it, else those in its folders."""
+    if (folder / METADATA).is_file():
+        return [folder]
+    if files := _storage_files(folder):
+        return files
+    inner = sorted(path for path in folder.iterdir() if path.is_dir())
+    return [part for path in inner for part in ([path] if (path / METADATA).is_file() else _storage_files(path))]
 
 
 def _storage_files(folder: Path) -> list[Path]:

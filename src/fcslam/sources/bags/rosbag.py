@@ -185,6 +185,7 @@ class RosBag:
             *chain.from_iterable(
                 laser.notes(self.stream.path, self._options.cloud_band) for laser in self.stream.lasers
             ),
+            *self.stream.mounting_notes,
             *body_notes,
             *chain.from_iterable(
                 placeholder_note(self.stream.path, values, its) for values, its in zip(placeholders, which, strict=True)

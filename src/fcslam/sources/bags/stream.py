@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from itertools import islice
-from math import degrees, tau
+from math import acos, degrees, tau
 from pathlib import Path
 from statistics import quantiles
 from typing import NamedTuple
@@ -43,13 +43,15 @@ from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
-from fcslam.sources.point_clouds import CloudBand, CloudMounting
+from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, leaning
 from fcslam.sources.pose import Pose
 
 _IMAGES_TRIED = 5
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
 _READINGS_TRIED = 20
+_CLOUDS_FOR_FLOOR, _CLOUDS_TRIED = 20, 200
+"""Clouds in which the floor is sought, spread over the first ones."""
 _FEWEST_LAGS = 4
 _LARGEST_DELAY_S = 2.0
 """Messages of one clock are recorded within this time of each other's delay."""
@@ -82,8 +84,8 @@ class RecordedLaser(NamedTuple):
             )
         if self.topic.type in SCANS and self.topic.type not in LASER_SCANS and self.first.sweep is None:
             yield (
-                f"{path}: the points of {self.name} have no times, so the motion of the robot during a cloud is not "
-                "corrected; let the driver publish them if the sensor turns"
+                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during "
+                "a cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
             )
 
 
@@ -123,6 +125,8 @@ class BagStream:
         """Of depth images."""
         self._cloud_mountings: dict[tuple[Topic, str], CloudMounting] = {}
         """By topic and frame."""
+        self.mounting_notes: list[str] = []
+        """What is wrong with them."""
         self.first_errors: dict[str, str] = {}
         """The fault of the first invalid message of each topic, by its name."""
 
@@ -442,7 +446,8 @@ class BagStream:
             self._depth_calibrations[topic] = self._calibration_in(info)
         cloud = cloud_of(content, topic.type, message.bag_time_ns, self._depth_calibrations[topic])
         if (topic, cloud.frame) not in self._cloud_mountings:
-            self._cloud_mountings[topic, cloud.frame] = self._cloud_mounting(topic, cloud.frame)
+            mounting = self._cloud_mounting(topic, cloud.frame)
+            self._cloud_mountings[topic, cloud.frame] = self._levelled(topic, cloud.frame, mounting)
         return cloud.scan(self._cloud_mountings[topic, cloud.frame], self.cloud_band)
 
     def _cloud_mounting(self, topic: Topic, frame: str) -> CloudMounting:
@@ -460,6 +465,26 @@ class BagStream:
                 f"{self.path}: tf has {error}, so it does not say where the sensor of {topic.name} sits; say it by "
                 "--laser-pose X,Y,THETA (metres, radians)"
             ) from error
+
+    def _levelled(self, topic: Topic, frame: str, mounting: CloudMounting) -> CloudMounting:
+        """The mounting, corrected with a note if the floor leans in most clouds."""
+        found = leaning(self._some_clouds(topic, frame), mounting)
+        if found is None:
+            return mounting
+        self.mounting_notes.append(
+            f"{self.path}: the floor in {topic.name} leans by {degrees(acos(found[2, 2])):.0f} deg against the "
+            f"mounting of '{frame}'; corrected: correct it in tf"
+        )
+        return mounting._replace(rotation=found @ mounting.rotation)
+
+    def _some_clouds(self, topic: Topic, frame: str) -> Iterator[PointCloud]:
+        step = max(1, min(topic.message_count, _CLOUDS_TRIED) // _CLOUDS_FOR_FLOOR)
+        for message in islice(self.bag.messages([topic]), 0, _CLOUDS_TRIED, step):
+            with suppress(ValueError):
+                calibration = self._depth_calibrations[topic]
+                cloud = cloud_of(self.bag.decode(message), topic.type, message.bag_time_ns, calibration)
+                if cloud.frame == frame:
+                    yield cloud.cloud
 
     def _base_frame_of(self, frame: str) -> str:
         """The base of the robot with ``frame``, before its lasers are known."""

@@ -1,0 +1,71 @@
+"""The parts of a robot that its own laser sees: beams that never change, and sectors that are left out.
+
+Sectors are headings in ``base``, in degrees, counter-clockwise from the first to the second.
+"""
+
+from collections.abc import Iterable
+from functools import lru_cache
+from itertools import islice
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fcslam.lidar.straightness import scans_apart
+from fcslam.records import FloatArray, LaserModel, LaserScan
+
+Heading = Annotated[float, Field(ge=-360.0, le=360.0)]
+Sectors = tuple[tuple[Heading, Heading], ...]
+
+FEWEST_PLACES, MOST_PLACES = 20, 200
+LARGEST_BODY_M: Final = 1.5
+"""Farther returns are not of the robot."""
+SAME_M, STEADY = 0.05, 0.95
+"""Largest deviation of a return of the robot from its usual range, and share of the places at which it has it."""
+MARGIN_DEG, LARGEST_GAP_DEG = 1, 3
+"""By how much sectors are wider than what was seen; sectors with a smaller gap are one."""
+SHARPEST: Final = 0.8
+"""Length of the mean heading above which a drive does not turn enough: along a corridor, walls stay as they are."""
+
+
+@lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
+def is_in_sectors(laser: LaserModel, sectors: Sectors) -> NDArray[np.bool_]:
+    """Which beams of a laser look into the sectors, shape (beam_count,)."""
+    headings, found = _headings_deg(laser), np.zeros(laser.beam_count, np.bool_)
+    for first_deg, last_deg in sectors:
+        found |= np.remainder(headings - first_deg, 360.0) <= np.remainder(last_deg - first_deg, 360.0)
+    found.setflags(write=False)
+    return found
+
+
+def body_sectors(scans: Iterable[LaserScan]) -> Sectors:
+    """Sectors in which a laser sees the robot itself: they stay as they are while it drives and turns."""
+    places = list(islice(scans_apart(scans), MOST_PLACES))
+    turns = np.array([scan.T_odom_base[2] for scan in places])
+    if len(places) < FEWEST_PLACES or np.hypot(np.cos(turns).mean(), np.sin(turns).mean()) > SHARPEST:
+        return ()
+    ranges_m = np.stack([_by_degree(scan) for scan in places])
+    middle_m = np.median(ranges_m, axis=0)
+    steady = np.mean(np.abs(ranges_m - middle_m) < SAME_M, axis=0) > STEADY
+    own = np.flatnonzero(steady & (middle_m < LARGEST_BODY_M))
+    if not len(own):
+        return ()
+    parts = np.split(own, np.flatnonzero(np.diff(own) > LARGEST_GAP_DEG) + 1)
+    if len(parts) > 1 and parts[0][0] + 360 - parts[-1][-1] <= LARGEST_GAP_DEG:
+        parts[0] = np.concatenate((parts.pop() - 360, parts[0]))
+    return tuple((float(part[0] - MARGIN_DEG), float(part[-1] + 1 + MARGIN_DEG)) for part in parts)
+
+
+def _by_degree(scan: LaserScan) -> FloatArray:
+    """The least range in each degree of the headings in ``base``, shape (360,); 1e3 without one."""
+    is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
+    degree = np.floor(np.remainder(_headings_deg(scan.laser), 360.0)).astype(np.intp) % 360
+    found = np.full(360, 1e3)
+    np.minimum.at(found, degree[is_return], scan.ranges_m[is_return].astype(np.float64))
+    return found
+
+
+def _headings_deg(laser: LaserModel) -> FloatArray:
+    headings_rad = laser.T_base_laser[2] + laser.angle_min_rad + laser.angle_increment_rad * np.arange(laser.beam_count)
+    return np.asarray(np.degrees(headings_rad))
