@@ -87,6 +87,7 @@ export function showAge() {
   if (!counts) return;
   const missing = counts.packets - counts.applied, age = counts.map_age_s === null ? null : counts.map_age_s + (Date.now() - fleet.readAt) / 1000;
   at("age").textContent = readOnly || age === null ? "" : `Map drawn ${duration(age)} ago${missing > 0 ? `; ${count(missing, "message")} not in it yet` : ""}. `;
+  if (!link.connected) return; // the status says why
   at("status").textContent = readOnly ? "Finished run" : counts.worker_ready ? "Live" : "The map catches up after a start";
   at("status").dataset.kind = readOnly || counts.worker_ready ? "ok" : "wait";
 }
