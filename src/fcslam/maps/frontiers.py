@@ -1,0 +1,133 @@
+"""Frontiers of a map, where its free cells end at unknown ones, and which robot explores which of them."""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from fcslam.records import FloatArray
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+
+RADIUS_M: Final = 0.3
+"""Of a robot, if nobody says another one."""
+CELL_M: Final = 0.1
+"""Least side of a cell of the search grid."""
+LARGEST_GRID: Final = 1_000_000
+"""Cells of the search grid; in a larger map they are wider."""
+STRAY_M: Final = 1.0
+"""A robot that stands farther from a passable cell reaches nothing."""
+NEIGHBOURS: Final = np.ones((3, 3), bool)
+
+Cells = NDArray[np.bool_]
+
+
+class Frontier(NamedTuple):
+    """A connected boundary between free and unknown cells."""
+
+    point: tuple[float, float]
+    """A place on it that a robot can reach, metres in the frame of the map."""
+    length_m: float
+    distances_m: tuple[float, ...]
+    """Length of the shortest path from each robot; infinite if there is none."""
+
+
+def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float = RADIUS_M) -> list[Frontier]:
+    """The frontiers that one of the robots can reach, the longest first.
+
+    Args:
+        occupancy: the map.
+        robots_xy: where the robots are, shape (R, 2), metres in the frame of the map.
+        radius_m: of a robot; its centre stays this far from occupied cells, and it passes no unknown cell.
+    """
+    free, occupied, side_m, origin = _search_grid(occupancy)
+    if not free.any():
+        return []
+    passable = free & (side_m * distance_transform_edt(~occupied) > radius_m)
+    unknown = binary_opening(~free & ~occupied, NEIGHBOURS)
+    parts, _ = label(free & _beside(unknown), NEIGHBOURS)
+    distances_m = _distances(passable, robots_xy, side_m, origin)
+    reached = np.isfinite(distances_m).any(axis=0)
+    found = []
+    for number, part in enumerate(find_objects(parts), 1):
+        cells = np.argwhere(parts[part] == number) + [edge.start for edge in part]
+        near = cells[reached[tuple(cells.T)]]
+        if len(cells) * side_m < 2.0 * radius_m or not len(near):
+            continue
+        at = near[np.argmin(((near - cells.mean(axis=0)) ** 2).sum(axis=1))]
+        x, y = (np.array(origin) + side_m * (at[::-1] + 0.5)).tolist()
+        ways = distances_m[:, at[0], at[1]].tolist()
+        found.append(Frontier((x, y), len(cells) * side_m, tuple(ways)))
+    return sorted(found, key=lambda one: (-one.length_m, one.point))
+
+
+def assigned(found: Sequence[Frontier], robots: int) -> list[int | None]:
+    """The frontier of each robot."""
+    return [None] * robots
+
+
+def _search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[float, float]]:
+    """Free and occupied cells of the known part of the map in wider cells, their side, and where cell (0, 0) begins."""
+    rows, columns = np.nonzero(occupancy.cells)
+    if not len(rows):
+        return *np.zeros((2, 0, 0), bool), CELL_M, occupancy.origin_xy
+    low, high = (np.array((of(rows), of(columns))) for of in (np.min, np.max))
+    known = occupancy.cells[low[0] : high[0] + 1, low[1] : high[1] + 1]
+    wide = max(1, round(CELL_M / occupancy.resolution_m), int(np.ceil(np.sqrt(known.size / LARGEST_GRID))))
+    # A margin of unknown cells on every side, so that the map's edge is a frontier, too.
+    height, width = (-(-size // wide) + 2 for size in known.shape)
+    whole = np.zeros((height * wide, width * wide), np.uint8)
+    whole[wide : wide + known.shape[0], wide : wide + known.shape[1]] = known
+    blocks = whole.reshape(height, wide, width, wide)
+    occupied = (blocks == Occupancy.OCCUPIED).any(axis=(1, 3))
+    free = (blocks == Occupancy.FREE).any(axis=(1, 3)) & ~occupied
+    y, x = (float(start) * occupancy.resolution_m for start in low - wide)
+    side_m = wide * occupancy.resolution_m
+    return free, occupied, side_m, (occupancy.origin_xy[0] + x, occupancy.origin_xy[1] + y)
+
+
+def _beside(cells: Cells) -> Cells:
+    """Cells that share a side with one of these."""
+    near = np.zeros_like(cells)
+    near[1:] |= cells[:-1]
+    near[:-1] |= cells[1:]
+    near[:, 1:] |= cells[:, :-1]
+    near[:, :-1] |= cells[:, 1:]
+    return near
+
+
+def _distances(passable: Cells, robots_xy: FloatArray, side_m: float, origin: tuple[float, float]) -> FloatArray:
+    """Length of the shortest path from each robot to each cell, shape (R, H, W); infinite if there is none."""
+    fields = np.full((len(robots_xy), *passable.shape), np.inf)
+    away, nearest = distance_transform_edt(~passable, return_indices=True)
+    at = np.floor((robots_xy - origin) / side_m).astype(np.int64)[:, ::-1]
+    inside = np.clip(at, 0, np.array(passable.shape) - 1)
+    strayed_m = side_m * (away[tuple(inside.T)] + np.abs(at - inside).sum(axis=1))
+    starts = nearest[:, inside[:, 0], inside[:, 1]]
+    numbers = np.cumsum(passable).reshape(passable.shape) - 1
+    reaching = np.flatnonzero(strayed_m <= STRAY_M) if passable.any() else np.zeros(0, np.int64)
+    if len(reaching):
+        begins = numbers[tuple(starts[:, reaching])]
+        lengths = dijkstra(_graph(passable, numbers, side_m), indices=begins)
+        for robot, length in zip(reaching.tolist(), lengths, strict=True):
+            fields[robot][passable] = length + strayed_m[robot]
+    return fields
+
+
+def _graph(passable: Cells, numbers: NDArray[np.int64], side_m: float) -> csr_array:
+    """Lengths of the steps between neighbouring passable cells."""
+    starts, ends, lengths = [], [], []
+    height, width = passable.shape
+    for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = slice(0, height - row), slice(max(0, -column), width - max(0, column))
+        there = slice(row, None), slice(max(0, column), width + min(0, column))
+        both = passable[here] & passable[there]
+        starts.append(numbers[here][both])
+        ends.append(numbers[there][both])
+        lengths.append(np.full(len(starts[-1]), side_m * float(np.hypot(row, column))))
+    ways = np.concatenate(starts + ends), np.concatenate(ends + starts)
+    return csr_array((np.concatenate(lengths + lengths), ways), shape=(numbers.max() + 1,) * 2)
