@@ -1,11 +1,12 @@
 """Frontiers of a map, where its free cells end at unknown ones, and which robot explores which of them."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label
+from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label, uniform_filter
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -21,6 +22,20 @@ LARGEST_GRID: Final = 1_000_000
 """Cells of the search grid; in a larger map they are wider."""
 STRAY_M: Final = 1.0
 """A robot that stands farther from a passable cell reaches nothing."""
+VIEW_M: Final = 5.0
+"""Side of the square around a frontier whose unknown area counts as its gain."""
+GAIN_M_PER_M2: Final = 0.5
+"""Metres of path that one square metre of unknown area is worth."""
+KEEPING_M: Final = 3.0
+"""Metres of path that another frontier must save before a robot turns to it."""
+SAME_M: Final = 1.0
+"""Frontiers this near to each other in two moments are the same one."""
+REACHED_M: Final = 0.5
+"""A robot this near to a frontier sees what can be seen from there."""
+SHARING_M: Final = 20.0
+"""Metres of path that a frontier costs more for each robot that goes there already."""
+UNREACHABLE: Final = 1e9
+"""Cost of a frontier without a path, metres; more than any path."""
 NEIGHBOURS: Final = np.ones((3, 3), bool)
 
 Cells = NDArray[np.bool_]
@@ -32,6 +47,8 @@ class Frontier(NamedTuple):
     point: tuple[float, float]
     """A place on it that a robot can reach, metres in the frame of the map."""
     length_m: float
+    gain_m2: float
+    """Unknown area around it."""
     distances_m: tuple[float, ...]
     """Length of the shortest path from each robot; infinite if there is none."""
 
@@ -44,13 +61,15 @@ def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float = 
         robots_xy: where the robots are, shape (R, 2), metres in the frame of the map.
         radius_m: of a robot; its centre stays this far from occupied cells, and it passes no unknown cell.
     """
-    free, occupied, side_m, origin = _search_grid(occupancy)
+    free, occupied, side_m, origin = search_grid(occupancy)
     if not free.any():
         return []
     passable = free & (side_m * distance_transform_edt(~occupied) > radius_m)
     unknown = binary_opening(~free & ~occupied, NEIGHBOURS)
     parts, _ = label(free & _beside(unknown), NEIGHBOURS)
-    distances_m = _distances(passable, robots_xy, side_m, origin)
+    distances_m = path_lengths(passable, robots_xy, side_m, origin)
+    window = round(VIEW_M / side_m)
+    gains_m2 = (window * side_m) ** 2 * uniform_filter(unknown.astype(np.float32), window, mode="nearest")
     reached = np.isfinite(distances_m).any(axis=0)
     found = []
     for number, part in enumerate(find_objects(parts), 1):
@@ -61,16 +80,51 @@ def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float = 
         at = near[np.argmin(((near - cells.mean(axis=0)) ** 2).sum(axis=1))]
         x, y = (np.array(origin) + side_m * (at[::-1] + 0.5)).tolist()
         ways = distances_m[:, at[0], at[1]].tolist()
-        found.append(Frontier((x, y), len(cells) * side_m, tuple(ways)))
+        found.append(Frontier((x, y), len(cells) * side_m, float(gains_m2[at[0], at[1]]), tuple(ways)))
     return sorted(found, key=lambda one: (-one.length_m, one.point))
 
 
-def assigned(found: Sequence[Frontier], robots: int) -> list[int | None]:
-    """The frontier of each robot."""
-    return [None] * robots
+class Explorer:
+    """Sends the robots of one map to its frontiers: one frontier a robot, at the least total cost.
+
+    A frontier costs the path, less what the unknown area there is worth. A robot keeps its frontier unless another one
+    saves much. A frontier at which a robot was, and which did not vanish, is no goal again: nothing more is seen there.
+    """
+
+    def __init__(self) -> None:
+        self._goals: dict[str, tuple[float, float]] = {}
+        self._visited: list[tuple[float, float]] = []
+
+    def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
+        """The frontier of each robot that can reach one.
+
+        Args:
+            found: of the map as it is now, with a distance for each of the robots, in their order.
+            robots: where each robot is, metres in the frame of the map.
+        """
+        for robot, at in robots.items():
+            goal = self._goals.get(robot)
+            if goal is not None and math.dist(goal, at) <= REACHED_M:
+                self._visited.append(goal)
+        left = [one for one in found if not any(math.dist(one.point, seen) <= REACHED_M for seen in self._visited)]
+        cost = np.array([one.distances_m for one in left]).reshape(len(left), len(robots)).T
+        for row, robot in zip(cost, robots, strict=True):
+            row -= [
+                GAIN_M_PER_M2 * one.gain_m2
+                + KEEPING_M * (robot in self._goals and math.dist(one.point, self._goals[robot]) <= SAME_M)
+                for one in left
+            ]
+        # If there are more robots than frontiers, some go to the same one.
+        shared = np.hstack([cost + SHARING_M * others for others in range(len(robots))]) if robots else cost
+        reachable = np.isfinite(shared)
+        pairs = zip(*linear_sum_assignment(np.where(reachable, shared, UNREACHABLE)), strict=True)
+        names = list(robots)
+        chosen = {names[k]: left[number % len(left)] for k, number in pairs if reachable[k, number]}
+        self._goals = {robot: one.point for robot, one in chosen.items()}
+        return chosen
 
 
-def _search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[float, float]]:
+def search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[float, float]]:
     """Free and occupied cells of the known part of the map in wider cells, their side, and where cell (0, 0) begins."""
     rows, columns = np.nonzero(occupancy.cells)
     if not len(rows):
@@ -100,7 +154,7 @@ def _beside(cells: Cells) -> Cells:
     return near
 
 
-def _distances(passable: Cells, robots_xy: FloatArray, side_m: float, origin: tuple[float, float]) -> FloatArray:
+def path_lengths(passable: Cells, robots_xy: FloatArray, side_m: float, origin: tuple[float, float]) -> FloatArray:
     """Length of the shortest path from each robot to each cell, shape (R, H, W); infinite if there is none."""
     fields = np.full((len(robots_xy), *passable.shape), np.inf)
     away, nearest = distance_transform_edt(~passable, return_indices=True)
