@@ -3,8 +3,8 @@
     python benchmarks/exploration.py [--seeds 10] [--offices 3] [--robots 3]
 
 The robots start side by side in a building of the simulator. They move at 0.5 m/s along shortest paths, and see 12 m
-far in all directions. The joint map has cells of 0.1 m; motion, map and communication have no errors. Time: until
-95 % of the area that a robot can reach is seen.
+far in all directions. The radius of a robot is 0.35 m. The joint map has cells of 0.1 m; motion, map and communication
+have no errors. Time: until 95 % of the area that a robot can reach is seen, at most an hour.
 
 Nearest: each robot drives to the frontier that is nearest to it, until it is there or the frontier is gone. Own: the
 same, but no robot takes a frontier that another one has. Assigned: `fcslam.maps.frontiers.Explorer`, asked every 5 s
@@ -14,16 +14,27 @@ default kind.
 
 import common
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import label
 
 from fcslam.compiled import njit
 from fcslam.lab.simulation.drivable_space import _obstacles
 from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.options import Building
-from fcslam.maps.frontiers import NEIGHBOURS, RADIUS_M, REACHED_M, Explorer, frontiers, path_lengths, search_grid
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.maps.frontiers import (
+    NEIGHBOURS,
+    REACHED_M,
+    Explorer,
+    frontiers,
+    passable_cells,
+    path_lengths,
+    search_grid,
+    start_cells,
+)
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 FREE, OCCUPIED = int(Occupancy.FREE), int(Occupancy.OCCUPIED)
+RADIUS_M = OccupancyConfig().robot_radius_m
 SIDE_M, RANGE_M, SPEED_MPS, SHARE, EVERY_S, LONGEST_S = 0.1, 12.0, 0.5, 0.95, 5, 3600
 
 
@@ -35,7 +46,8 @@ def main() -> None:
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
     for kind, count in ((Building.DEFAULT, chosen.seeds), (Building.OFFICE, chosen.offices)):
-        _compare(report, kind, count, chosen.robots)
+        if count:
+            _compare(report, kind, count, chosen.robots)
     report.write()
 
 
@@ -107,10 +119,11 @@ def _explore(walls, starts, policy):
 
 def _ways(occupancy, robots, policy):
     """The path of each robot to its frontier, points (N, 2); empty without one."""
-    found = frontiers(occupancy, robots)
+    found = frontiers(occupancy, robots, RADIUS_M)
     goals = policy.assign(found, {k: tuple(at) for k, at in enumerate(robots.tolist())})
     free, occupied, side_m, origin = search_grid(occupancy)
-    lengths = path_lengths(free & (side_m * distance_transform_edt(~occupied) > RADIUS_M), robots, side_m, origin)
+    passable = passable_cells(free, occupied, side_m, RADIUS_M)
+    lengths = path_lengths(passable, start_cells(passable, robots, side_m, origin), side_m)
     ways = []
     for k, field in enumerate(lengths):
         way = []
@@ -152,7 +165,7 @@ def _walls(kind, seed):
 
 
 def _passable(walls):
-    return ~walls & (SIDE_M * distance_transform_edt(~walls) > RADIUS_M)
+    return passable_cells(~walls, walls, SIDE_M, RADIUS_M)
 
 
 def _reachable(walls, start):

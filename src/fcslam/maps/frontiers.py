@@ -1,7 +1,7 @@
 """Frontiers of a map, where its free cells end at unknown ones, and which robot explores which of them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,8 +14,6 @@ from scipy.sparse.csgraph import dijkstra
 from fcslam.records import FloatArray
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
-RADIUS_M: Final = 0.3
-"""Of a robot, if nobody says another one."""
 CELL_M: Final = 0.1
 """Least side of a cell of the search grid."""
 LARGEST_GRID: Final = 1_000_000
@@ -53,8 +51,8 @@ class Frontier(NamedTuple):
     """Length of the shortest path from each robot; infinite if there is none."""
 
 
-def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float = RADIUS_M) -> list[Frontier]:
-    """The frontiers that one of the robots can reach, the longest first.
+def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -> list[Frontier]:
+    """The frontiers that one of the robots can reach, that with the largest gain first.
 
     Args:
         occupancy: the map.
@@ -64,24 +62,31 @@ def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float = 
     free, occupied, side_m, origin = search_grid(occupancy)
     if not free.any():
         return []
-    passable = free & (side_m * distance_transform_edt(~occupied) > radius_m)
+    passable = passable_cells(free, occupied, side_m, radius_m)
     unknown = binary_opening(~free & ~occupied, NEIGHBOURS)
     parts, _ = label(free & _beside(unknown), NEIGHBOURS)
-    distances_m = path_lengths(passable, robots_xy, side_m, origin)
     window = round(VIEW_M / side_m)
     gains_m2 = (window * side_m) ** 2 * uniform_filter(unknown.astype(np.float32), window, mode="nearest")
-    reached = np.isfinite(distances_m).any(axis=0)
-    found = []
+    starts = start_cells(passable, robots_xy, side_m, origin)
+    areas, _ = label(passable, NEIGHBOURS)
+    reached = np.isin(areas, [areas[start] for start in starts if start is not None])
+    points, sizes = [], []
     for number, part in enumerate(find_objects(parts), 1):
         cells = np.argwhere(parts[part] == number) + [edge.start for edge in part]
         near = cells[reached[tuple(cells.T)]]
-        if len(cells) * side_m < 2.0 * radius_m or not len(near):
-            continue
-        at = near[np.argmin(((near - cells.mean(axis=0)) ** 2).sum(axis=1))]
-        x, y = (np.array(origin) + side_m * (at[::-1] + 0.5)).tolist()
-        ways = distances_m[:, at[0], at[1]].tolist()
-        found.append(Frontier((x, y), len(cells) * side_m, float(gains_m2[at[0], at[1]]), tuple(ways)))
-    return sorted(found, key=lambda one: (-one.length_m, one.point))
+        if len(cells) * side_m >= 2.0 * radius_m and len(near):
+            points.append(near[np.argmin(((near - cells.mean(axis=0)) ** 2).sum(axis=1))])
+            sizes.append(len(cells) * side_m)
+    at = tuple(np.array(points, np.int64).reshape(-1, 2).T)
+    ways = np.array([field[at] for field in path_lengths(passable, starts, side_m)]).reshape(len(starts), len(points))
+    places = np.array(origin) + side_m * (np.stack(at[::-1], axis=-1) + 0.5)
+    found = [
+        Frontier((x, y), length_m, gain_m2, tuple(lengths))
+        for (x, y), length_m, gain_m2, lengths in zip(
+            places.tolist(), sizes, gains_m2[at].tolist(), ways.T.tolist(), strict=True
+        )
+    ]
+    return sorted(found, key=lambda one: (-one.gain_m2, one.point))
 
 
 class Explorer:
@@ -154,22 +159,37 @@ def _beside(cells: Cells) -> Cells:
     return near
 
 
-def path_lengths(passable: Cells, robots_xy: FloatArray, side_m: float, origin: tuple[float, float]) -> FloatArray:
-    """Length of the shortest path from each robot to each cell, shape (R, H, W); infinite if there is none."""
-    fields = np.full((len(robots_xy), *passable.shape), np.inf)
-    away, nearest = distance_transform_edt(~passable, return_indices=True)
-    at = np.floor((robots_xy - origin) / side_m).astype(np.int64)[:, ::-1]
-    inside = np.clip(at, 0, np.array(passable.shape) - 1)
-    strayed_m = side_m * (away[tuple(inside.T)] + np.abs(at - inside).sum(axis=1))
-    starts = nearest[:, inside[:, 0], inside[:, 1]]
+def passable_cells(free: Cells, occupied: Cells, side_m: float, radius_m: float) -> Cells:
+    """Where the centre of a robot may be."""
+    clear_m = side_m * np.asarray(distance_transform_edt(~occupied))
+    return free & (clear_m > radius_m)
+
+
+def start_cells(
+    passable: Cells, robots_xy: FloatArray, side_m: float, origin: tuple[float, float]
+) -> list[tuple[int, int] | None]:
+    """The passable cell nearest to each robot; None if that is too far away."""
+    if not passable.any():
+        return [None] * len(robots_xy)
+    nearest = np.asarray(distance_transform_edt(~passable, return_distances=False, return_indices=True))
+    found: list[tuple[int, int] | None] = []
+    for at in np.floor((robots_xy - origin) / side_m).astype(np.int64)[:, ::-1]:
+        row, column = np.clip(at, 0, np.array(passable.shape) - 1)
+        start = nearest[:, row, column]
+        is_near = side_m * float(np.hypot(*(start - at))) <= STRAY_M
+        found.append((int(start[0]), int(start[1])) if is_near else None)
+    return found
+
+
+def path_lengths(passable: Cells, starts: Sequence[tuple[int, int] | None], side_m: float) -> Iterator[FloatArray]:
+    """Length of the shortest path from each cell ``starts`` to all cells, shape (H, W) each; infinite without one."""
     numbers = np.cumsum(passable).reshape(passable.shape) - 1
-    reaching = np.flatnonzero(strayed_m <= STRAY_M) if passable.any() else np.zeros(0, np.int64)
-    if len(reaching):
-        begins = numbers[tuple(starts[:, reaching])]
-        lengths = dijkstra(_graph(passable, numbers, side_m), indices=begins)
-        for robot, length in zip(reaching.tolist(), lengths, strict=True):
-            fields[robot][passable] = length + strayed_m[robot]
-    return fields
+    graph = _graph(passable, numbers, side_m)
+    for start in starts:
+        field = np.full(passable.shape, np.inf)
+        if start is not None:
+            field[passable] = dijkstra(graph, indices=numbers[start])
+        yield field
 
 
 def _graph(passable: Cells, numbers: NDArray[np.int64], side_m: float) -> csr_array:
@@ -184,4 +204,4 @@ def _graph(passable: Cells, numbers: NDArray[np.int64], side_m: float) -> csr_ar
         ends.append(numbers[there][both])
         lengths.append(np.full(len(starts[-1]), side_m * float(np.hypot(row, column))))
     ways = np.concatenate(starts + ends), np.concatenate(ends + starts)
-    return csr_array((np.concatenate(lengths + lengths), ways), shape=(numbers.max() + 1,) * 2)
+    return csr_array((np.concatenate(lengths + lengths), ways), shape=(int(numbers.max(initial=-1)) + 1,) * 2)
