@@ -34,6 +34,8 @@ SHARING_M: Final = 20.0
 """Metres of path that a frontier costs more for each robot that goes there already."""
 UNREACHABLE: Final = 1e9
 """Cost of a frontier without a path, metres; more than any path."""
+MARGIN: Final = 3
+"""Unknown cells of the search grid on each side of the map."""
 NEIGHBOURS: Final = np.ones((3, 3), bool)
 
 Cells = NDArray[np.bool_]
@@ -65,7 +67,7 @@ def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -
     passable = passable_cells(free, occupied, side_m, radius_m)
     unknown = binary_opening(~free & ~occupied, NEIGHBOURS)
     parts, _ = label(free & _beside(unknown), NEIGHBOURS)
-    window = round(VIEW_M / side_m)
+    window = max(1, round(VIEW_M / side_m))
     gains_m2 = (window * side_m) ** 2 * uniform_filter(unknown.astype(np.float32), window, mode="nearest")
     starts = start_cells(passable, robots_xy, side_m, origin)
     areas, _ = label(passable, NEIGHBOURS)
@@ -137,14 +139,15 @@ def search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[flo
     low, high = (np.array((of(rows), of(columns))) for of in (np.min, np.max))
     known = occupancy.cells[low[0] : high[0] + 1, low[1] : high[1] + 1]
     wide = max(1, round(CELL_M / occupancy.resolution_m), int(np.ceil(np.sqrt(known.size / LARGEST_GRID))))
-    # A margin of unknown cells on every side, so that the map's edge is a frontier, too.
-    height, width = (-(-size // wide) + 2 for size in known.shape)
+    # Beyond the map's edge all is unknown, so the edge is a frontier, too.
+    height, width = (-(-size // wide) + 2 * MARGIN for size in known.shape)
+    edge = MARGIN * wide
     whole = np.zeros((height * wide, width * wide), np.uint8)
-    whole[wide : wide + known.shape[0], wide : wide + known.shape[1]] = known
+    whole[edge : edge + known.shape[0], edge : edge + known.shape[1]] = known
     blocks = whole.reshape(height, wide, width, wide)
     occupied = (blocks == Occupancy.OCCUPIED).any(axis=(1, 3))
     free = (blocks == Occupancy.FREE).any(axis=(1, 3)) & ~occupied
-    y, x = (float(start) * occupancy.resolution_m for start in low - wide)
+    y, x = (float(start) * occupancy.resolution_m for start in low - edge)
     side_m = wide * occupancy.resolution_m
     return free, occupied, side_m, (occupancy.origin_xy[0] + x, occupancy.origin_xy[1] + y)
 
