@@ -16,7 +16,7 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 CELL_M: Final = 0.1
 """Least side of a cell of the search grid."""
-LARGEST_GRID: Final = 1_000_000
+LARGEST_GRID: Final = 400_000
 """Cells of the search grid; in a larger map they are wider."""
 STRAY_M: Final = 1.0
 """A robot that stands farther from a passable cell reaches nothing."""

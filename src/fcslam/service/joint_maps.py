@@ -7,6 +7,7 @@ import io
 import json
 import math
 import threading
+import time
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -29,10 +30,12 @@ from fcslam.storage.files import write_file
 LONGEST_SPEED_MPS = 3.0
 """A robot that says it is farther from its newest keyscan than it can drive at this speed is where the keyscan was."""
 ASSIGN_EVERY_S = 5.0
-"""Time between two assignments of frontiers."""
+"""Least time between two assignments of frontiers."""
+ASSIGN_SHARE = 0.1
+"""Share of the time that assignments take of one core, at most."""
 ACTIVE_S = 60.0
 """A robot that was not heard for longer explores nothing, if another one was."""
-MOST_EXPLORERS = 64
+MOST_EXPLORERS = 32
 """Robots of one map that get frontiers; the others get none."""
 MOST_FRONTIERS = 50
 """Frontiers of one map; those with the least gain are left out."""
@@ -171,8 +174,8 @@ class ServedJointMaps:
         self._exploring = threading.Lock()
         self._explorers: dict[str, Explorer] = {}
         """By frame."""
-        self._explorations: tuple[float, dict[int, Exploration]] = -math.inf, {}
-        """When they were made, and by number of the map."""
+        self._explorations: tuple[float, float, dict[int, Exploration]] = -math.inf, -math.inf, {}
+        """When they were made, until when they count, and by number of the map."""
 
     def follow(self, path: Path) -> JointMaps:
         """The joint maps in a file as they are now; those without content before there is one.
@@ -219,18 +222,20 @@ class ServedJointMaps:
         return (live.pose, live.said_s) if is_credible else (session.pose, session.heard_s)
 
     def explorations(self, maps: JointMaps, now_s: float) -> dict[int, Exploration]:
-        """The frontiers of each map, at most ``ASSIGN_EVERY_S`` old.
+        """The frontiers of each map, about ``ASSIGN_EVERY_S`` old at most; of large maps older.
 
         Args:
             maps: as ``follow`` returns them.
             now_s: seconds since 1970.
         """
         with self._exploring:
-            made_s, found = self._explorations
-            if not (0.0 <= now_s - made_s < ASSIGN_EVERY_S and found.keys() == maps.grids.keys()):
+            made_s, until_s, found = self._explorations
+            if not (made_s <= now_s < until_s and found.keys() == maps.grids.keys()):
+                began_s = time.perf_counter()
                 self._explorers = {frame: self._explorers.get(frame, Explorer()) for frame in maps.frames.values()}
                 found = {number: self._explored(maps, number, now_s) for number in maps.grids}
-                self._explorations = now_s, found
+                spent_s = time.perf_counter() - began_s
+                self._explorations = now_s, now_s + max(ASSIGN_EVERY_S, spent_s / ASSIGN_SHARE), found
             return found
 
     def _explored(self, maps: JointMaps, number: int, now_s: float) -> Exploration:
