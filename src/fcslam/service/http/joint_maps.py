@@ -143,7 +143,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
 
     @router.get("/frontiers", dependencies=as_reader)
     def get_frontiers(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapFrontiers]:
-        """Where each map can be explored further, and which robot shall go where; made anew every five seconds, of large maps less often.
+        """Where each map can be explored further, and which robot shall go where; made anew about every five seconds.
 
         With ``robot``, only the map that this robot is in, and only its distances.
         """
