@@ -18,6 +18,8 @@ CELL_M: Final = 0.1
 """Least side of a cell of the search grid."""
 LARGEST_GRID: Final = 400_000
 """Cells of the search grid; in a larger map they are wider."""
+POCKET_M2: Final = 1.0
+"""Smaller areas are no place for a robot."""
 STRAY_M: Final = 1.0
 """A robot that stands farther from a passable cell reaches nothing."""
 VIEW_M: Final = 5.0
@@ -163,9 +165,12 @@ def _beside(cells: Cells) -> Cells:
 
 
 def passable_cells(free: Cells, occupied: Cells, side_m: float, radius_m: float) -> Cells:
-    """Where the centre of a robot may be."""
+    """Where the centre of a robot may be, without pockets between obstacles."""
     clear_m = side_m * np.asarray(distance_transform_edt(~occupied))
-    return free & (clear_m > radius_m)
+    areas, _ = label(free & (clear_m > radius_m), NEIGHBOURS)
+    is_wide = np.bincount(areas.ravel()) * side_m**2 >= POCKET_M2
+    is_wide[0] = False
+    return np.asarray(is_wide[areas])
 
 
 def start_cells(
