@@ -43,6 +43,26 @@ def known(occupancy):
     return {(row + y, column + x): occupancy.cells[y, x] for y, x in zip(*np.nonzero(occupancy.cells), strict=True)}
 
 
+def test_each_robot_of_a_map_gets_its_frontiers_and_the_page_those_of_all_maps(desk):
+    desk.send("a", A)
+    desk.send("b", B)
+    with closing(view(desk, "a")) as fleet:
+        follow(fleet)
+    (of_all,) = desk.ask("GET", "/api/v1/frontiers", "eye").json()
+    (of_a,) = desk.ask("GET", "/api/v1/frontiers?robot=a", "a").json()
+    assert of_all["map"] == of_a["map"] == 0
+    assert of_all["frontiers"]
+    assert [(one.point, one.robots) for one in fleet.frontiers] == [
+        (tuple(one["point"]), tuple(one["robots"])) for one in of_a["frontiers"]
+    ]
+    for whole, part in zip(of_all["frontiers"], of_a["frontiers"], strict=True):
+        assert set(part["distances"]) == set(whole["distances"]) & {"a"}
+    assert {robot for one in of_all["frontiers"] for robot in one["robots"]} <= {"a", "b"}
+    assert desk.ask("GET", "/api/v1/frontiers?robot=nobody", "eye").json() == []
+    assert desk.ask("GET", "/api/v1/frontiers?robot=no/body", "eye").status_code == 400
+    assert desk.ask("GET", "/api/v1/frontiers").status_code == 401
+
+
 def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service(desk):
     desk.send("a", A)
     with closing(view(desk, "a")) as first:

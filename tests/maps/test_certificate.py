@@ -11,6 +11,7 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.maps.certificate import (
     AGAIN_M,
     AGAIN_PER_M,
+    CONTRADICTED,
     FLOOR_M,
     SCALE,
     MappedPath,
@@ -69,6 +70,19 @@ def test_covariances_are_those_of_sampled_errors():
     measured = np.sqrt((seen**2).mean(axis=0))
     predicted = np.sqrt(relative_error(places.poses, places.covariance, 10.0) ** 2 - FLOOR_M**2) / SCALE
     assert np.allclose(measured, predicted, rtol=0.35)
+
+
+@pytest.mark.parametrize("closures", [[(i, i + 5) for i in range(30)], []])
+def test_errors_are_larger_where_measurements_contradict_each_other(closures):
+    exact, poses = chain(closures=closures)
+    assert covariances(exact, [path(poses)]).scale == SCALE
+    noisy, _ = chain(closures=closures, rng=np.random.default_rng(1))  # errors as large as the graph expects
+    solved = optimize(noisy).poses
+    edges = noisy.arrays()
+    rows = zip(edges.i.tolist(), edges.j.tolist(), edges.T_i_j, edges.information, edges.robust.tolist(), strict=True)
+    graph = PoseGraph(solved, [Edge(*row) for row in rows])
+    scale = covariances(graph, [path(solved)]).scale
+    assert scale == (pytest.approx(CONTRADICTED, rel=0.25) if closures else SCALE)
 
 
 def relative_of(poses, truth, within_m):

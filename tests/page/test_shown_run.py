@@ -32,7 +32,7 @@ from fcslam.wire.packets import decode, measure
 from tests.service.http.desk import A
 
 ASKED = (
-    *("fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "config.yaml"),
+    *("fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "quality.json", "config.yaml"),
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
 )
 """Paths that the page requests, besides events, trajectories and tiles."""
@@ -62,6 +62,7 @@ def run():
         closures=(closure,),
         metrics={"error": Metric("error", float("nan"), "m")},
         map_files=files("map", 160) | files("map_1", 40),
+        quality={"quality.json": b'{"0":{"bar":0.05,"cell":1.0,"cells":[],"drives":[]}}'},
         mission=mission_bytes(
             CloudConfig(),
             [Edit(1, "anna", 1e9, Veto("a", "b"))],

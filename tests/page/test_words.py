@@ -49,6 +49,13 @@ def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):
     assert "Drive b through an area that a has mapped" in advice
     assert told["vetoed"] == [{"view": "edits"}]
     assert told["disk"] == ["The disk of the service has 0.4 GB left."]
+    assert told["certificate"] == [
+        [
+            "2 square metres of the map may be off by more than 0.05 m.",
+            "Drive from (1, 2) to (3, 4) again: about 2 m2 more are good then.",
+            {"quality": 0, "marks": [[1, 2], [3, 4]]},
+        ]
+    ]
     assert told["late"] == ["The map is 2 min old, and 3 messages of robots are not in it yet."]
     assert told["contradiction"] == [
         ["What a measured contradicts the other paths.", {"view": "evidence", "robot": "a"}]

@@ -3,7 +3,7 @@ const robot = (more) => ({ session: "a", robot: "a", epoch: 0, map: 0, removed: 
 const a = robot({}), b = robot({ session: "b", robot: "b" }), alone = { ...b, map: 1 };
 const state = (one, all, readOnly = false) => stateOf(one, all, readOnly);
 const counts = { packets: 5, applied: 5, map_age_s: 1, free_bytes: 9e10 };
-const need = (more) => attention({ robots: [a], maps: [{ map: 0, robots: ["a"] }], separations: [], counts, contradicted: [], readOnly: false, ...more });
+const need = (more) => attention({ robots: [a], maps: [{ map: 0, robots: ["a"] }], separations: [], quality: {}, counts, contradicted: [], readOnly: false, ...more });
 const apart = { maps: [0, 1], candidates: 2, verified: 0, explanation: "few points" };
 const closure = { robot_i: "a", stamp_i: 5, robot_j: "b", stamp_j: 8, reason: "found_by_robot" };
 console.log(JSON.stringify({
@@ -18,6 +18,7 @@ console.log(JSON.stringify({
   apart: need({ robots: [a, alone], maps: [{ map: 0, robots: ["a"] }, { map: 1, robots: ["b"] }], separations: [apart] }).map((n) => [n.text, n.help, n.why, n.do]),
   vetoed: need({ robots: [a, alone], maps: [{ map: 0, robots: ["a"] }, { map: 1, robots: ["b"] }], separations: [{ ...apart, reason: "vetoed" }] }).map((n) => n.do),
   disk: need({ counts: { ...counts, free_bytes: 4e8 } }).map((n) => n.text),
+  certificate: need({ quality: { 0: { bar: 0.05, cells: [{ good: true }, { good: false }, { good: false }], drives: [{ text: "drive from (1, 2) to (3, 4) again: about 2 m2 more are good then", from: [1, 2], to: [3, 4] }] }, 1: { bar: 0.05, cells: [{ good: false }], drives: [] } } }).map((n) => [n.text, n.help, n.do]),
   late: need({ counts: { ...counts, applied: 2, map_age_s: 100 } }).map((n) => n.text),
   contradiction: need({ contradicted: [{ ...closure, reason: "robot_contradicted", explanation: "why" }] }).map((n) => [n.text, n.do]),
   times: [duration(8), duration(59.6), duration(119), duration(7200), duration(90000), duration(260000), moment(1077.5, 1000), moment(1077.5, 1000, true)],

@@ -23,6 +23,7 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap, parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
+from fcslam.wire.fleet_client import FrontierReply
 from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
@@ -368,6 +369,11 @@ class FollowedFleet:
 
     def __init__(self):
         self.map_index, self.news = 0, ["map 0 holds robot1, r-2; joined: r-2"]
+        self.frontiers = (
+            FrontierReply(0, (3.0, 4.0), 2.0, 9.0, ("robot1",)),
+            FrontierReply(0, (5.0, 6.0), 1.0, 8.0, ()),
+            FrontierReply(1, (7.0, 8.0), 1.0, 7.0, ()),
+        )
 
     def robots(self):
         return [
@@ -435,3 +441,21 @@ def test_poses_and_state_of_the_fleet_are_published_and_each_change_once(network
     assert status["maps 0 and 1"].message == "no two of their places look alike"
     events = [one.status[0] for one in network.sent["/diagnostics"] if one.status[0].name.endswith("fleet")]
     assert [event.message for event in events] == followed.fleet.news
+
+
+def test_the_frontiers_of_the_own_map_and_the_own_goal_are_published_when_they_change(network, robot):
+    followed = FleetRobot(robot, None)
+    node = start(network, followed)
+    with running(node):
+        wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 3)
+        followed.fleet.frontiers = followed.fleet.frontiers[:1]
+        wait_for(lambda: len(network.sent["/robot1/fleet/frontiers"]) == 2)
+    free, taken = network.sent["/robot1/fleet/frontiers"][0].markers
+    assert [(point.x, point.y) for point in free.points] == [(5.0, 6.0)]
+    assert [(point.x, point.y) for point in taken.points] == [(3.0, 4.0)]
+    assert free.scale.x == free.scale.z > 0.0
+    (goal,) = network.sent["/robot1/fleet/goal"]
+    assert goal.header.frame_id == "map"
+    assert (goal.pose.position.x, goal.pose.position.y) == (3.0, 4.0)
+    turn_rad = 2.0 * np.arctan2(goal.pose.orientation.z, goal.pose.orientation.w)
+    assert turn_rad == pytest.approx(np.arctan2(4.0, 3.0))

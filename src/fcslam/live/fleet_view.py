@@ -1,4 +1,5 @@
-"""What a live robot knows of its fleet: the joint map, where the others are, and why maps are apart.
+"""What a live robot knows of its fleet: the joint map, where the others are, why maps are apart, and where to
+explore.
 
 A thread follows the cloud. No scan waits for it, and while the cloud is away everything stays as it was last.
 """
@@ -17,10 +18,12 @@ from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
 from fcslam.runs.map_files import OccupancyMap
-from fcslam.wire.fleet_client import FleetClient, FleetReply
+from fcslam.wire.fleet_client import FleetClient, FleetReply, FrontierReply
 
 POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
+FRONTIERS_S: Final = 5.0
+"""Time between two looks at the frontiers."""
 DOWNLINK_KBPS: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
 STOP_TIMEOUT_S: Final = 2.0
@@ -73,6 +76,9 @@ class FleetView:
         """What changed in the robot's map, one line each, the oldest first."""
         self.version = 0
         """Grows with every change of the joint map."""
+        self.frontiers: tuple[FrontierReply, ...] = ()
+        """Where the robot's map can be explored further, and who shall go where."""
+        self._frontiers_s = -np.inf
         self.trouble: str | None = None
         """Why the cloud cannot be followed; None if it can."""
         self._current = self._failures = 0
@@ -153,6 +159,8 @@ class FleetView:
         self._tell(before, self._members())
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
+        if self._clock() - self._frontiers_s >= FRONTIERS_S:
+            self.frontiers, self._frontiers_s = client.frontiers(self._robot), self._clock()
 
     def _run(self) -> None:
         wait_s = 0.0

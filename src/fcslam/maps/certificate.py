@@ -3,7 +3,8 @@
 Two errors count for a cell: that of its position in the frame of the map's first robot, and that of its position
 relative to its surroundings. The covariances of the graph are larger than the errors, because no measurement counts as
 more precise than scan matching at its worst. ``SCALE`` is calibrated on simulated buildings
-(``benchmarks/certificate.py``).
+(``benchmarks/certificate.py``). Where measurements contradict each other more than those of a good scanner do, the
+errors are larger: ``CONTRADICTED``.
 """
 
 import json
@@ -26,6 +27,9 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap, pixels_of
 
 SCALE: Final = 0.25
 """Ratio of true errors to the standard deviations of the graph."""
+CONTRADICTED: Final = 2.5
+"""Ratio of true errors to the standard deviations of the graph, by the root mean square of what the edges of the graph
+leave as residuals: 1 if the measurements scatter as the graph expects."""
 FLOOR_M: Final = 0.008
 """Error that every cell has: noise of the ranges and of matching, metres."""
 QUANTILE: Final = 2.0
@@ -73,6 +77,8 @@ class Places(NamedTuple):
     """Shape (P, 3)."""
     covariance: FloatArray
     """Of their errors (x, y, theta) along the axes of ``map``, shape (3 P, 3 P), calibrated, without the floor."""
+    scale: float
+    """Ratio of errors to the standard deviations of the graph."""
 
     def absolute_m(self) -> FloatArray:
         """Expected error of each place in the frame of the map, root mean square, shape (P,)."""
@@ -119,7 +125,7 @@ def certify(
     ]  # fmt: skip
     good = [cell for cell in cells if cell["good"]]
     return {
-        "bar": bar_m, "within": within_m, "cell": CELL_M, "scale": SCALE, "floor": FLOOR_M,
+        "bar": bar_m, "within": within_m, "cell": CELL_M, "scale": round(places.scale, 4), "floor": FLOOR_M,
         "error_95": round(float(np.percentile(bound[nearest], 95)), 4) if cells else None,
         "good_share": round(len(good) / len(cells), 4) if cells else None,
         "verdict": f"{len(good)} of {len(cells)} m2 are good to {bar_m:g} m within {within_m:g} m",
@@ -147,8 +153,16 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     if len(chosen) > 1:
         wanted = (3 * chosen[1:, None] + np.arange(3)).ravel() - 3
         covariance[3:, 3:] = _marginal(csc_array(information[3:, 3:]), wanted)
-    covariance *= SCALE**2
-    return Places(variables[chosen], poses[chosen], covariance)
+    scale = max(SCALE, CONTRADICTED * _contradiction(graph, rows, len(variables)))
+    return Places(variables[chosen], poses[chosen], covariance * scale**2, scale)
+
+
+def _contradiction(graph: PoseGraph, rows: NDArray[np.int64], variables: int) -> float:
+    """Root mean square residual of the edges of one map, in standard deviations, for each redundant measurement."""
+    edges = graph.arrays()
+    inside = np.flatnonzero((rows[edges.i] >= 0) & (rows[edges.j] >= 0))
+    redundant = len(inside) - (variables - 1)
+    return math.sqrt(float(graph.chi2(rows=inside).sum()) / (3.0 * redundant)) if redundant > 0 else 0.0
 
 
 def _marginal(information: csc_array, wanted: NDArray[np.int64]) -> FloatArray:

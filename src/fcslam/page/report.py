@@ -17,7 +17,7 @@ from fcslam.maps.exports import export_map
 from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
 from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, OccupancyMap, open_run
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, OccupancyMap, open_run
 from fcslam.runs.map_files import map_stem
 from fcslam.service.summaries import (
     all_edits,
@@ -75,6 +75,9 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
     if mission.run_folder is not None:
         for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):
             texts[path] = read_text(mission.run_folder / unquote(path), mission.run_folder)
+        certificate = mission.run_folder / f"{QUALITY}.json"
+        if certificate.is_file():
+            texts[certificate.name] = read_text(certificate, mission.run_folder)
     return texts
 
 

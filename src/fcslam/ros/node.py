@@ -244,17 +244,34 @@ class RobotNode:
         return True
 
     def _publish_fleet(self) -> None:
-        """Publish where the robots of the fleet are, at a fixed rate, and what changed in the robot's map, once."""
-        news = 0
+        """Publish where the robots of the fleet are, at a fixed rate; frontiers and changes of the robot's map once."""
+        news, frontiers = 0, None
         while not self._stop.wait(_FLEET_PERIOD_S):
             fleet = self._robot.fleet
             if fleet is None:
                 return
             now_ns = self._clock.now_ns()
             self._outputs.fleet(now_ns, fleet.robots(), fleet.separations(), fleet.map_index)
+            if fleet.frontiers is not frontiers:
+                frontiers = fleet.frontiers
+                self._publish_frontiers(now_ns, fleet)
             for line in fleet.news[news:]:
                 news += 1
                 self._outputs.event(now_ns, self._robot.name, line)
+
+    def _publish_frontiers(self, now_ns: int, fleet: "FleetView") -> None:
+        found = [one for one in fleet.frontiers if one.map_index == fleet.map_index]
+        free, taken = (
+            np.array([one.point for one in found if bool(one.robots) is has_robot]).reshape(-1, 2)
+            for has_robot in (False, True)
+        )
+        name = self._robot.name
+        point = next((np.array(one.point) for one in found if name in one.robots), None)
+        own = next((mate.T_map_base for mate in fleet.robots() if mate.robot == name), None)
+        goal = None
+        if point is not None and own is not None:  # the robot arrives as it looks when it drives straight there
+            goal = np.array((*point, np.arctan2(*(point - own[:2])[::-1])))
+        self._outputs.frontiers(now_ns, free, taken, goal)
 
     def _next(self) -> _Message | None:
         try:

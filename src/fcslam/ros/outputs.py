@@ -32,6 +32,7 @@ MAP: Final = "map"
 OWN_MAP: Final = "own_map"
 """Topic of what a robot of a fleet saw itself."""
 FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
+FLEET_FRONTIERS, FLEET_GOAL = "fleet/frontiers", "fleet/goal"
 MOST_TEAMMATES: Final = 64
 """Robots with a topic of their own; the others are in ``fleet/poses`` only."""
 LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
@@ -47,7 +48,8 @@ LONGEST_PATH: Final = 5000
 """Most poses of the published path, about; a longer path has longer steps."""
 LINE_WIDTH_M: Final = 0.05
 _OK, _WARN = 0, 1
-_LINE_LIST, _ADD = 5, 0
+SPHERE_M: Final = 0.3
+_LINE_LIST, _SPHERE_LIST, _ADD = 5, 7, 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,8 @@ class Outputs:
         self._grids: dict[str, _GridTopic] = {}
         self._teammates: dict[str, Publish] = {}
         self._fleet: tuple[Publish, Publish] | None = None
+        self._exploration: tuple[Publish, Publish] | None = None
+        self._goal_xy: FloatArray = np.full(2, np.nan)
         self._grid_topic(MAP)
         self._pose = publisher("pose", POSE, STREAMED)
         self._path = publisher("path", PATH, LATCHED)
@@ -143,29 +147,32 @@ class Outputs:
 
     def closures(self, stamp_ns: int, ends_xy: FloatArray) -> None:
         """Publish the accepted closures as lines between two places (N, 2, 2), metres in ``map``."""
-        make, vector = self._codec.make, self._codec.vector
-        duration = make("builtin_interfaces/Duration", sec=0, nanosec=0)
-        mesh = {} if self._codec.ros1 else self._new_fields(make)
-        marker = make(
-            "visualization_msgs/Marker",
-            header=self._codec.header(stamp_ns, self._names.map_frame),
-            ns="closures",
-            id=0,
-            type=_LINE_LIST,
-            action=_ADD,
-            pose=self._codec.pose(in_space(np.zeros(3))),
-            scale=vector("Vector3", LINE_WIDTH_M),
-            color=make("std_msgs/ColorRGBA", r=0.1, g=0.6, b=0.2, a=0.8),
-            lifetime=duration,
-            frame_locked=False,
-            points=[vector("Point", x, y) for x, y in ends_xy.reshape(-1, 2).tolist()],
-            colors=[],
-            text="",
-            mesh_resource="",
-            mesh_use_embedded_materials=False,
-            **mesh,
-        )
-        self._send(self._closures, MARKERS, make(MARKERS, markers=[marker]))
+        lines = self._marker(stamp_ns, "closures", _LINE_LIST, LINE_WIDTH_M, (0.1, 0.6, 0.2), ends_xy)
+        self._send(self._closures, MARKERS, self._codec.make(MARKERS, markers=[lines]))
+
+    def frontiers(self, now_ns: int, free_xy: FloatArray, taken_xy: FloatArray, T_map_goal: FloatArray | None) -> None:
+        """Publish where the map can be explored further, and where this robot shall go.
+
+        Args:
+            now_ns: the time now.
+            free_xy: frontiers that no robot has, shape (N, 2), metres in ``map``.
+            taken_xy: those that robots have, shape (M, 2).
+            T_map_goal: that of this robot; None: it has none. It is published when it changes.
+        """
+        with self._lock:
+            if self._exploration is None:
+                goals = self._publisher(FLEET_GOAL, POSE_STAMPED, LATCHED)
+                self._exploration = self._publisher(FLEET_FRONTIERS, MARKERS, LATCHED), goals
+            markers = [
+                self._marker(now_ns, name, _SPHERE_LIST, SPHERE_M, colour, points)
+                for name, colour, points in (("free", (0.9, 0.6, 0.1), free_xy), ("taken", (0.1, 0.4, 0.9), taken_xy))
+            ]
+            self._send(self._exploration[0], MARKERS, self._codec.make(MARKERS, markers=markers))
+            if T_map_goal is not None and not np.array_equal(T_map_goal[:2], self._goal_xy):
+                self._goal_xy = T_map_goal[:2]
+                header = self._codec.header(now_ns, self._names.map_frame)
+                goal = self._codec.make(POSE_STAMPED, header=header, pose=self._codec.pose(in_space(T_map_goal)))
+                self._send(self._exploration[1], POSE_STAMPED, goal)
 
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
         """Publish a map if it changed; returns whether it did.
@@ -264,6 +271,34 @@ class Outputs:
 
     def _send(self, publish: Publish, kind: str, message: Any) -> None:
         publish(self._codec.encode(message, kind))
+
+    def _marker(
+        self, stamp_ns: int, name: str, kind: int, scale_m: float, colour: tuple[float, float, float],
+        points: FloatArray,
+    ) -> Any:  # fmt: skip
+        """A marker of points (..., 2), metres in ``map``."""
+        make, vector = self._codec.make, self._codec.vector
+        mesh = {} if self._codec.ros1 else self._new_fields(make)
+        r, g, b = colour
+        return make(
+            "visualization_msgs/Marker",
+            header=self._codec.header(stamp_ns, self._names.map_frame),
+            ns=name,
+            id=0,
+            type=kind,
+            action=_ADD,
+            pose=self._codec.pose(in_space(np.zeros(3))),
+            scale=vector("Vector3", scale_m, scale_m * (kind != _LINE_LIST), scale_m * (kind != _LINE_LIST)),
+            color=make("std_msgs/ColorRGBA", r=r, g=g, b=b, a=0.8),
+            lifetime=make("builtin_interfaces/Duration", sec=0, nanosec=0),
+            frame_locked=False,
+            points=[vector("Point", x, y) for x, y in points.reshape(-1, 2).tolist()],
+            colors=[],
+            text="",
+            mesh_resource="",
+            mesh_use_embedded_materials=False,
+            **mesh,
+        )
 
     def _new_fields(self, make: Any) -> dict[str, Any]:
         """Fields of a marker that ROS 1 does not have."""

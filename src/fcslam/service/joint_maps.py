@@ -7,10 +7,12 @@ import io
 import json
 import math
 import threading
+import time
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import StoreError
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.maps.frontiers import Explorer, Frontier, frontiers
 from fcslam.maps.joint_tiles import TileBatch, TileHistory, frame_of
 from fcslam.runs.folder import identity
 from fcslam.runs.map_files import OccupancyMap
@@ -26,6 +29,16 @@ from fcslam.storage.files import write_file
 
 LONGEST_SPEED_MPS = 3.0
 """A robot that says it is farther from its newest keyscan than it can drive at this speed is where the keyscan was."""
+ASSIGN_EVERY_S = 5.0
+"""Least time between two assignments of frontiers."""
+ASSIGN_SHARE = 0.1
+"""Share of the time that assignments take of one core, at most."""
+ACTIVE_S = 60.0
+"""A robot that was not heard for longer explores nothing, if another one was."""
+MOST_EXPLORERS = 32
+"""Robots of one map that get frontiers; the others get none."""
+MOST_FRONTIERS = 50
+"""Frontiers of one map; those with the least gain are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +61,14 @@ class JointMaps:
     """The joint maps of one moment."""
 
     def __init__(
-        self, sessions: Sequence[JointSession], grids: Mapping[int, OccupancyMap], frames: Mapping[int, str]
-    ) -> None:
+        self, sessions: Sequence[JointSession], grids: Mapping[int, OccupancyMap], frames: Mapping[int, str],
+        robot_radius_m: float = 0.0,
+    ) -> None:  # fmt: skip
         self.sessions = tuple(sessions)
         """One for each robot: its newest session."""
         self.grids, self.frames = grids, frames
         """By number of the map."""
+        self.robot_radius_m = robot_radius_m
 
 
 def joint_maps_of(
@@ -74,7 +89,7 @@ def joint_maps_of(
                 robot, epoch, mapped.map_index, mapped.floor, (x, y, theta), float(mapped.stamps[-1]),
                 heard_s.get((robot, epoch), 0.0),
             )  # fmt: skip
-    return JointMaps(list(newest.values()), grids, anchors)
+    return JointMaps(list(newest.values()), grids, anchors, config.robot_radius_m)
 
 
 def write_joint_maps(path: Path, maps: JointMaps) -> None:
@@ -88,7 +103,11 @@ def write_joint_maps(path: Path, maps: JointMaps) -> None:
         k: {"resolution": grid.resolution_m, "origin": grid.origin_xy, "frame": maps.frames[k]}
         for k, grid in maps.grids.items()
     }
-    head = {"sessions": [asdict(session) for session in maps.sessions], "maps": described}
+    head = {
+        "sessions": [asdict(session) for session in maps.sessions],
+        "maps": described,
+        "radius": maps.robot_radius_m,
+    }
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("joint.json", json.dumps(head))
         for k, grid in maps.grids.items():
@@ -115,10 +134,11 @@ def read_joint_maps(path: Path) -> JointMaps:
                 for k, about in head["maps"].items()
             }  # fmt: skip
         frames = {int(k): about["frame"] for k, about in head["maps"].items()}
+        radius_m = float(head["radius"])
         sessions = [JointSession(**{**one, "pose": tuple(one["pose"])}) for one in head["sessions"]]
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise StoreError(f"{path}: no joint maps can be read ({error})") from error
-    return JointMaps(sessions, grids, frames)
+    return JointMaps(sessions, grids, frames, radius_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +151,16 @@ class LivePose:
     """When, seconds since 1970."""
 
 
+class Exploration(NamedTuple):
+    """The frontiers of one map and who explores which of them."""
+
+    robots: tuple[str, ...]
+    """Those whose distances the frontiers have."""
+    frontiers: Sequence[Frontier]
+    goals: Mapping[str, Frontier]
+    """By robot; robots that can reach none are not in it."""
+
+
 class ServedJointMaps:
     """The joint maps of the open mission for robots: tiles that changed, and live poses. Any thread may call."""
 
@@ -141,6 +171,11 @@ class ServedJointMaps:
         self._histories: dict[str, TileHistory] = {}
         """By frame."""
         self._live: dict[str, LivePose] = {}
+        self._exploring = threading.Lock()
+        self._explorers: dict[str, Explorer] = {}
+        """By frame."""
+        self._explorations: tuple[float, float, dict[int, Exploration]] = -math.inf, -math.inf, {}
+        """When they were made, until when they count, and by number of the map."""
 
     def follow(self, path: Path) -> JointMaps:
         """The joint maps in a file as they are now; those without content before there is one.
@@ -185,3 +220,28 @@ class ServedJointMaps:
         apart_m = math.dist(live.pose[:2], session.pose[:2])
         is_credible = apart_m <= 1.0 + LONGEST_SPEED_MPS * (live.said_s - session.heard_s)
         return (live.pose, live.said_s) if is_credible else (session.pose, session.heard_s)
+
+    def explorations(self, maps: JointMaps, now_s: float) -> dict[int, Exploration]:
+        """The frontiers of each map, about ``ASSIGN_EVERY_S`` old at most; of large maps older.
+
+        Args:
+            maps: as ``follow`` returns them.
+            now_s: seconds since 1970.
+        """
+        with self._exploring:
+            made_s, until_s, found = self._explorations
+            if not (made_s <= now_s < until_s and found.keys() == maps.grids.keys()):
+                began_s = time.perf_counter()
+                self._explorers = {frame: self._explorers.get(frame, Explorer()) for frame in maps.frames.values()}
+                found = {number: self._explored(maps, number, now_s) for number in maps.grids}
+                spent_s = time.perf_counter() - began_s
+                self._explorations = now_s, now_s + max(ASSIGN_EVERY_S, spent_s / ASSIGN_SHARE), found
+            return found
+
+    def _explored(self, maps: JointMaps, number: int, now_s: float) -> Exploration:
+        poses = {one.robot: self.pose(one) for one in maps.sessions if one.map == number}
+        active = {robot: pose for robot, pose in poses.items() if now_s - pose[1] <= ACTIVE_S} or poses
+        at = {robot: (pose[0][0], pose[0][1]) for robot, pose in sorted(active.items())[:MOST_EXPLORERS]}
+        found = frontiers(maps.grids[number], np.array(list(at.values())).reshape(-1, 2), maps.robot_radius_m)
+        found = found[:MOST_FRONTIERS]
+        return Exploration(tuple(at), found, self._explorers[maps.frames[number]].assign(found, at))

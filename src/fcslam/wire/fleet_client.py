@@ -29,6 +29,19 @@ class FleetReply(NamedTuple):
     """Two maps and the reason."""
 
 
+class FrontierReply(NamedTuple):
+    """A boundary between free and unknown cells of a map."""
+
+    map_index: int
+    point: tuple[float, float]
+    """Metres in its map."""
+    length_m: float
+    gain_m2: float
+    """Unknown area around it."""
+    robots: tuple[str, ...]
+    """Those that shall explore it."""
+
+
 class FleetClient(HttpClient):
     """Follows the fleet of one robot. Each method raises as ``BatchTransport.state``."""
 
@@ -56,6 +69,21 @@ class FleetClient(HttpClient):
         except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
             raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
         return FleetReply(robots, apart)
+
+    def frontiers(self, robot: str) -> tuple[FrontierReply, ...]:
+        """The frontiers of the map that a robot is in, that with the largest gain first."""
+        response = self._ask("GET", f"frontiers?robot={robot}", accept="application/json")
+        self._require(response, 200)
+        self.received_bytes += len(response.content)
+        try:
+            return tuple(
+                FrontierReply(int(one["map"]), (float(each["point"][0]), float(each["point"][1])),
+                              float(each["length"]), float(each["gain"]), tuple(map(str, each["robots"])))
+                for one in response.json()
+                for each in one["frontiers"]
+            )  # fmt: skip
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 
     def tiles(self, robot: str, known: str, limit_bytes: int) -> tuple[bytes, str] | None:
         """The changed tiles of the map that a robot is in (``fcslam.maps.joint_tiles``) and their ETag.

@@ -5,7 +5,7 @@ import { Outdated, ask, at, json, report } from "./service.js";
 const MOST_CLOSURES = 5000; // that the page asks for
 
 export const fleet = {
-  counts: null, mission: null, robots: [], maps: [], separations: [], edits: [], regions: [], accepted: [], contradicted: [],
+  counts: null, mission: null, robots: [], maps: [], separations: [], quality: {}, edits: [], regions: [], accepted: [], contradicted: [],
   trails: new Map(), until: Infinity, // the moment that the map shows: paths and evidence until then
   selected: null, scan: null, readOnly: false, mayEdit: false, readAt: 0,
 };
@@ -53,11 +53,12 @@ export async function update(forget) {
   const counts = await json("fleet");
   release ??= counts.version;
   if (counts.version !== release) { at("reload").hidden = false; throw new Outdated("The service has another version: reload the page."); }
-  const [maps, separations, robots, closed, edits] = await Promise.all(
-    [json("maps"), json("separations"), json("robots"), json(`closures?status=accepted&limit=${MOST_CLOSURES}`), json("edits")]);
+  const certificate = counts.read_only ? json("quality.json").catch(() => ({})) : {}; // of finished runs
+  const [quality, maps, separations, robots, closed, edits] = await Promise.all(
+    [certificate, json("maps"), json("separations"), json("robots"), json(`closures?status=accepted&limit=${MOST_CLOSURES}`), json("edits")]);
   if (fleet.mission !== null && counts.mission !== fleet.mission) { received.clear(); forget(); }
   const seen = robots.filter((r) => r.map !== null), paths = await Promise.all(seen.map((r) => trail(r.session)));
-  Object.assign(fleet, { counts, mission: counts.mission, maps, separations, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
+  Object.assign(fleet, { counts, mission: counts.mission, maps, separations, quality, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
   fleet.trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   fleet.accepted = closed.map(placed);
   fleet.regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);

@@ -82,7 +82,7 @@ export function openMap(index) {
   chart.index = index;
   chart.opened = fleet.maps.find((m) => m.map === index)?.robots[0] ?? null;
 }
-export function choose(index) { openMap(index); chart.beside = null; fitAll(); }
+export function choose(index) { openMap(index); chart.beside = null; chart.marks = []; fitAll(); }
 // The map in which the same robot is stays open.
 export function stayOpen() {
   const now = fleet.maps.find((m) => m.robots.includes(chart.opened)) ?? fleet.maps[0];
@@ -264,6 +264,12 @@ function drawGrid() {
   strokeWay(path, theme.grid, 1, 0.5);
 }
 
+// The certificate: a square for each cell, in one colour if it is good and in another one if not.
+function drawQuality() {
+  const { cell, cells } = fleet.quality[chart.index] ?? { cells: [] }, half = cell / 2;
+  for (const { x, y, good } of cells) outline([[-half, -half], [half, -half], [half, half], [-half, half]].map(([dx, dy]) => [x + dx, y + dy]), { colour: theme[good ? "free" : "keepout"], fill: 0.35, width: 0.5 });
+}
+
 function draw() {
   queued = false;
   const w = canvas.clientWidth, h = canvas.clientHeight, ratio = devicePixelRatio, { view } = chart;
@@ -279,6 +285,7 @@ function draw() {
   }
   // A tile in view stays, or each drawing would ask for it again.
   for (const [key, { picture }] of tiles) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; picture?.close(); tiles.delete(key); }
+  if (isShown("quality")) drawQuality();
   if (isShown("grid")) drawGrid();
   if (isShown("closures")) for (const channel of ["lidar", "camera"]) strokeWay(linksOf(channel), theme[channel === "lidar" ? "laser" : "camera"], 1, 0.5);
   if (isShown("areas")) for (const region of fleet.regions) drawRegion(region);
@@ -290,6 +297,7 @@ function draw() {
     if (chart.closure.map === chart.index) outline(ends, { colour: theme.laser, width: 4, closed: false });
     for (const end of ends) dot(end, theme.laser, 7);
   }
+  for (const mark of chart.marks) dot(mark, theme.alert, 7);
   chart.tool?.draw();
   showScale();
   chart.onView();

@@ -72,6 +72,7 @@ export function showControls() {
 // ---- Maps and their state ----
 
 export function showMaps() {
+  at("has-quality").hidden = !Object.keys(fleet.quality).length;
   const title = (m) => `${listed(m.robots)}${m.floor && `, floor ${m.floor}`}`;
   at("tabs").hidden = fleet.maps.length < 2;
   fill(at("tabs"), [chart.index, fleet.maps.map(title)], () => fleet.maps.map((m) => {
@@ -138,11 +139,19 @@ export function showAttention() {
     card.append(element("p", one.help), button(one.action, () => {
       if (act.robot && !act.view) showRobot(act.robot);
       if (act.map !== undefined) besideEachOther(act);
+      if (act.quality !== undefined) showQuality(act);
       if (act.view) { if (act.robot) at("of-robot").value = act.robot; if (act.view === "evidence") { at("decision").value = "rejected"; at("two-robots").checked = false; } show(act.view); }
     }));
     if (one.why) { const why = element("details", element("summary", "Why")); why.append(element("p", one.why)); card.append(why); }
     return card;
   }) : [element("li", "All well. Nothing needs you.", { className: "well" })]);
+}
+// The certificate of a map, and the places between which to drive again.
+function showQuality({ quality, marks }) {
+  at("layer-quality").checked = true;
+  choose(quality); showMaps();
+  chart.marks = marks;
+  redraw();
 }
 // Two maps that are apart, side by side: the distance between them means nothing.
 function besideEachOther({ map, beside }) {

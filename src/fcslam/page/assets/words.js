@@ -71,7 +71,7 @@ function separation(s, maps) {
 }
 
 // What needs a person, most urgent first; nothing in the normal case.
-export function attention({ robots, maps, separations, counts, contradicted, readOnly }) {
+export function attention({ robots, maps, separations, quality, counts, contradicted, readOnly }) {
   const found = [];
   if (!readOnly && counts.free_bytes !== null && counts.free_bytes < LOW_DISK_BYTES)
     found.push({ kind: "alert", text: `The disk of the service has ${(counts.free_bytes / 1e9).toFixed(1)} GB left.`, help: "Download what you need and free some space, or the service will refuse what robots send.", why: "", action: "Open downloads", do: { view: "files" } });
@@ -89,6 +89,9 @@ export function attention({ robots, maps, separations, counts, contradicted, rea
     told.add(s.maps[1]);
     found.push(separation(s, maps));
   }
+  for (const [map, { bar, cells, drives }] of Object.entries(quality))
+    if (drives.length)
+      found.push({ kind: "wait", text: `${count(cells.filter((c) => !c.good).length, "square metre")} of the map may be off by more than ${metres(bar)}.`, help: drives.map((d) => `${d.text[0].toUpperCase()}${d.text.slice(1)}.`).join(" "), why: "", action: "Show where", do: { quality: Number(map), marks: drives.flatMap((d) => [d.from, d.to]) } });
   if (!readOnly && counts.map_age_s > LATE_S && counts.packets > counts.applied)
     found.push({ kind: "wait", text: `The map is ${duration(counts.map_age_s)} old, and ${count(counts.packets - counts.applied, "message")} of robots are not in it yet.`, help: "Robots send faster than this machine can map. It will catch up when they pause; the robots' positions stay current.", why: "", action: "Show the robots", do: { view: "fleet" } });
   return found;

@@ -1,6 +1,8 @@
-"""Routes for the fleet's map on every robot: tiles that changed, and the poses of all robots."""
+"""Routes for the fleet's map on every robot: tiles that changed, the poses of all robots, and where to explore."""
 
+import math
 import time
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Annotated
 
@@ -12,13 +14,14 @@ from starlette.concurrency import run_in_threadpool
 from fcslam.config import Settings
 from fcslam.lidar.occupancy import FARTHEST_M
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
+from fcslam.records import NAME
 from fcslam.runs import Run, separations
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import Pose, content, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
-from fcslam.service.joint_maps import LivePose, ServedJointMaps
+from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
 from fcslam.service.summaries import run_of
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
@@ -65,6 +68,23 @@ class FleetPoses(Settings):
 
     robots: list[FleetRobot]
     separations: list[Apart]
+
+
+class FrontierSummary(Settings):
+    """A boundary between free and unknown cells."""
+
+    point: tuple[float, float] = Field(description="a place on it that a robot can reach, metres")
+    length: float = Field(description="metres")
+    gain: float = Field(description="unknown area around it, square metres")
+    distances: dict[str, float] = Field(description="length of each robot's path to it, metres; none: no path")
+    robots: list[str] = Field(description="who shall explore it")
+
+
+class MapFrontiers(Settings):
+    """The frontiers of a map, that with the largest gain first."""
+
+    map: int
+    frontiers: list[FrontierSummary]
 
 
 def joint_map_router(state: ServiceState) -> APIRouter:
@@ -121,7 +141,37 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         state.measures.answer_map(robot, len(body))
         return Response(body, media_type=NETWORK, headers=headers)
 
+    @router.get("/frontiers", dependencies=as_reader)
+    def get_frontiers(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapFrontiers]:
+        """Where each map can be explored further, and which robot shall go where; made anew about every five seconds.
+
+        With ``robot``, only the map that this robot is in, and only its distances.
+        """
+        maps = joint.follow(state.mission.joint_maps)
+        explored = joint.explorations(maps, time.time())
+        of_robot = {one.map for one in maps.sessions if robot in (None, one.robot)}
+        return [
+            MapFrontiers(map=number, frontiers=list(_summaries(explored[number], robot)))
+            for number in sorted(of_robot & explored.keys())
+        ]
+
     return router
+
+
+def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierSummary]:
+    for one in explored.frontiers:
+        lengths = zip(explored.robots, one.distances_m, strict=True)
+        yield FrontierSummary(
+            point=(round(one.point[0], 3), round(one.point[1], 3)),
+            length=round(one.length_m, 2),
+            gain=round(one.gain_m2, 1),
+            distances={
+                name: round(length_m, 2)
+                for name, length_m in lengths
+                if robot in (None, name) and math.isfinite(length_m)
+            },
+            robots=sorted(name for name, goal in explored.goals.items() if goal is one),
+        )
 
 
 @lru_cache(maxsize=2)

@@ -13,7 +13,7 @@ from fcslam.errors import EvaluationError
 from fcslam.maps.exports import export_map
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
 from fcslam.records import Channel, ClosureStatus
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, ClosureRow, Run
 from fcslam.runs.map_files import map_stem
 from fcslam.service.closure_submaps import overlay_png
 from fcslam.service.http.authentication import Role
@@ -199,6 +199,13 @@ def map_router(state: ViewerState) -> APIRouter:
     def get_metrics() -> FileResponse:
         """All metrics with their units."""
         return _file(state, METRICS, JSON)
+
+    @router.get(
+        "/quality.json", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_SETTINGS)}
+    )
+    def get_quality() -> FileResponse:
+        """The certificate of each map, by its number; only of a finished run."""
+        return _file(state, f"{QUALITY}.json", JSON)
 
     @router.get(
         f"/{CONFIG}", response_class=Response, responses={**refusals(404), 200: content(MEDIA["yaml"], model=_SETTINGS)}

@@ -1,0 +1,215 @@
+"""Frontiers of a map, where its free cells end at unknown ones, and which robot explores which of them."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label, uniform_filter
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from fcslam.records import FloatArray
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+
+CELL_M: Final = 0.1
+"""Least side of a cell of the search grid."""
+LARGEST_GRID: Final = 400_000
+"""Cells of the search grid; in a larger map they are wider."""
+POCKET_M2: Final = 1.0
+"""Smaller areas are no place for a robot."""
+STRAY_M: Final = 1.0
+"""A robot that stands farther from a passable cell reaches nothing."""
+VIEW_M: Final = 5.0
+"""Side of the square around a frontier whose unknown area counts as its gain."""
+GAIN_M_PER_M2: Final = 0.5
+"""Metres of path that one square metre of unknown area is worth."""
+KEEPING_M: Final = 3.0
+"""Metres of path that another frontier must save before a robot turns to it."""
+SAME_M: Final = 1.0
+"""Frontiers this near to each other in two moments are the same one."""
+REACHED_M: Final = 0.5
+"""A robot this near to a frontier sees what can be seen from there."""
+SHARING_M: Final = 20.0
+"""Metres of path that a frontier costs more for each robot that goes there already."""
+UNREACHABLE: Final = 1e9
+"""Cost of a frontier without a path, metres; more than any path."""
+MARGIN: Final = 3
+"""Unknown cells of the search grid on each side of the map."""
+NEIGHBOURS: Final = np.ones((3, 3), bool)
+
+Cells = NDArray[np.bool_]
+
+
+class Frontier(NamedTuple):
+    """A connected boundary between free and unknown cells."""
+
+    point: tuple[float, float]
+    """A place on it that a robot can reach, metres in the frame of the map."""
+    length_m: float
+    gain_m2: float
+    """Unknown area around it."""
+    distances_m: tuple[float, ...]
+    """Length of the shortest path from each robot; infinite if there is none."""
+
+
+def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -> list[Frontier]:
+    """The frontiers that one of the robots can reach, that with the largest gain first.
+
+    Args:
+        occupancy: the map.
+        robots_xy: where the robots are, shape (R, 2), metres in the frame of the map.
+        radius_m: of a robot; its centre stays this far from occupied cells, and it passes no unknown cell.
+    """
+    free, occupied, side_m, origin = search_grid(occupancy)
+    if not free.any():
+        return []
+    passable = passable_cells(free, occupied, side_m, radius_m)
+    unknown = binary_opening(~free & ~occupied, NEIGHBOURS)
+    parts, _ = label(free & _beside(unknown), NEIGHBOURS)
+    window = max(1, round(VIEW_M / side_m))
+    gains_m2 = (window * side_m) ** 2 * uniform_filter(unknown.astype(np.float32), window, mode="nearest")
+    starts = start_cells(passable, robots_xy, side_m, origin)
+    areas, _ = label(passable, NEIGHBOURS)
+    reached = np.isin(areas, [areas[start] for start in starts if start is not None])
+    points, sizes = [], []
+    for number, part in enumerate(find_objects(parts), 1):
+        cells = np.argwhere(parts[part] == number) + [edge.start for edge in part]
+        near = cells[reached[tuple(cells.T)]]
+        if len(cells) * side_m >= 2.0 * radius_m and len(near):
+            points.append(near[np.argmin(((near - cells.mean(axis=0)) ** 2).sum(axis=1))])
+            sizes.append(len(cells) * side_m)
+    at = tuple(np.array(points, np.int64).reshape(-1, 2).T)
+    ways = np.array([field[at] for field in path_lengths(passable, starts, side_m)]).reshape(len(starts), len(points))
+    places = np.array(origin) + side_m * (np.stack(at[::-1], axis=-1) + 0.5)
+    found = [
+        Frontier((x, y), length_m, gain_m2, tuple(lengths))
+        for (x, y), length_m, gain_m2, lengths in zip(
+            places.tolist(), sizes, gains_m2[at].tolist(), ways.T.tolist(), strict=True
+        )
+    ]
+    return sorted(found, key=lambda one: (-one.gain_m2, one.point))
+
+
+class Explorer:
+    """Sends the robots of one map to its frontiers: one frontier a robot, at the least total cost.
+
+    A frontier costs the path, less what the unknown area there is worth. A robot keeps its frontier unless another one
+    saves much. A frontier at which a robot was, and which did not vanish, is no goal again: nothing more is seen there.
+    """
+
+    def __init__(self) -> None:
+        self._goals: dict[str, tuple[float, float]] = {}
+        self._visited: list[tuple[float, float]] = []
+
+    def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
+        """The frontier of each robot that can reach one.
+
+        Args:
+            found: of the map as it is now, with a distance for each of the robots, in their order.
+            robots: where each robot is, metres in the frame of the map.
+        """
+        for robot, at in robots.items():
+            goal = self._goals.get(robot)
+            if goal is not None and math.dist(goal, at) <= REACHED_M:
+                self._visited.append(goal)
+        left = [one for one in found if not any(math.dist(one.point, seen) <= REACHED_M for seen in self._visited)]
+        cost = np.array([one.distances_m for one in left]).reshape(len(left), len(robots)).T
+        for row, robot in zip(cost, robots, strict=True):
+            row -= [
+                GAIN_M_PER_M2 * one.gain_m2
+                + KEEPING_M * (robot in self._goals and math.dist(one.point, self._goals[robot]) <= SAME_M)
+                for one in left
+            ]
+        # If there are more robots than frontiers, some go to the same one.
+        shared = np.hstack([cost + SHARING_M * others for others in range(len(robots))]) if robots else cost
+        reachable = np.isfinite(shared)
+        pairs = zip(*linear_sum_assignment(np.where(reachable, shared, UNREACHABLE)), strict=True)
+        names = list(robots)
+        chosen = {names[k]: left[number % len(left)] for k, number in pairs if reachable[k, number]}
+        self._goals = {robot: one.point for robot, one in chosen.items()}
+        return chosen
+
+
+def search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[float, float]]:
+    """Free and occupied cells of the known part of the map in wider cells, their side, and where cell (0, 0) begins."""
+    rows, columns = np.nonzero(occupancy.cells)
+    if not len(rows):
+        return *np.zeros((2, 0, 0), bool), CELL_M, occupancy.origin_xy
+    low, high = (np.array((of(rows), of(columns))) for of in (np.min, np.max))
+    known = occupancy.cells[low[0] : high[0] + 1, low[1] : high[1] + 1]
+    wide = max(1, round(CELL_M / occupancy.resolution_m), int(np.ceil(np.sqrt(known.size / LARGEST_GRID))))
+    # Beyond the map's edge all is unknown, so the edge is a frontier, too.
+    height, width = (-(-size // wide) + 2 * MARGIN for size in known.shape)
+    edge = MARGIN * wide
+    whole = np.zeros((height * wide, width * wide), np.uint8)
+    whole[edge : edge + known.shape[0], edge : edge + known.shape[1]] = known
+    blocks = whole.reshape(height, wide, width, wide)
+    occupied = (blocks == Occupancy.OCCUPIED).any(axis=(1, 3))
+    free = (blocks == Occupancy.FREE).any(axis=(1, 3)) & ~occupied
+    y, x = (float(start) * occupancy.resolution_m for start in low - edge)
+    side_m = wide * occupancy.resolution_m
+    return free, occupied, side_m, (occupancy.origin_xy[0] + x, occupancy.origin_xy[1] + y)
+
+
+def _beside(cells: Cells) -> Cells:
+    """Cells that share a side with one of these."""
+    near = np.zeros_like(cells)
+    near[1:] |= cells[:-1]
+    near[:-1] |= cells[1:]
+    near[:, 1:] |= cells[:, :-1]
+    near[:, :-1] |= cells[:, 1:]
+    return near
+
+
+def passable_cells(free: Cells, occupied: Cells, side_m: float, radius_m: float) -> Cells:
+    """Where the centre of a robot may be, without pockets between obstacles."""
+    clear_m = side_m * np.asarray(distance_transform_edt(~occupied))
+    areas, _ = label(free & (clear_m > radius_m), NEIGHBOURS)
+    is_wide = np.bincount(areas.ravel()) * side_m**2 >= POCKET_M2
+    is_wide[0] = False
+    return np.asarray(is_wide[areas])
+
+
+def start_cells(
+    passable: Cells, robots_xy: FloatArray, side_m: float, origin: tuple[float, float]
+) -> list[tuple[int, int] | None]:
+    """The passable cell nearest to each robot; None if that is too far away."""
+    if not passable.any():
+        return [None] * len(robots_xy)
+    nearest = np.asarray(distance_transform_edt(~passable, return_distances=False, return_indices=True))
+    found: list[tuple[int, int] | None] = []
+    for at in np.floor((robots_xy - origin) / side_m).astype(np.int64)[:, ::-1]:
+        row, column = np.clip(at, 0, np.array(passable.shape) - 1)
+        start = nearest[:, row, column]
+        is_near = side_m * float(np.hypot(*(start - at))) <= STRAY_M
+        found.append((int(start[0]), int(start[1])) if is_near else None)
+    return found
+
+
+def path_lengths(passable: Cells, starts: Sequence[tuple[int, int] | None], side_m: float) -> Iterator[FloatArray]:
+    """Length of the shortest path from each cell ``starts`` to all cells, shape (H, W) each; infinite without one."""
+    numbers = np.cumsum(passable).reshape(passable.shape) - 1
+    graph = _graph(passable, numbers, side_m)
+    for start in starts:
+        field = np.full(passable.shape, np.inf)
+        if start is not None:
+            field[passable] = dijkstra(graph, indices=numbers[start])
+        yield field
+
+
+def _graph(passable: Cells, numbers: NDArray[np.int64], side_m: float) -> csr_array:
+    """Lengths of the steps between neighbouring passable cells."""
+    starts, ends, lengths = [], [], []
+    height, width = passable.shape
+    for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = slice(0, height - row), slice(max(0, -column), width - max(0, column))
+        there = slice(row, None), slice(max(0, column), width + min(0, column))
+        both = passable[here] & passable[there]
+        starts.append(numbers[here][both])
+        ends.append(numbers[there][both])
+        lengths.append(np.full(len(starts[-1]), side_m * float(np.hypot(row, column))))
+    ways = np.concatenate(starts + ends), np.concatenate(ends + starts)
+    return csr_array((np.concatenate(lengths + lengths), ways), shape=(int(numbers.max(initial=-1)) + 1,) * 2)
