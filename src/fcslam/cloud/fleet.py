@@ -322,7 +322,7 @@ class Fleet:
     def _add_sighting(self, sighting: TagSighting) -> None:
         """Match a sighting with those of the same tag, decide about the closures, join maps, optimise."""
         session = sighting.id.robot
-        matches = list(self._tags.add(sighting))
+        matches = self._tags.add(sighting)
         for match in matches:
             if match.i.robot == session:
                 constraint = Constraint(

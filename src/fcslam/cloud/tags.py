@@ -5,7 +5,7 @@ is a closure within its map. In both cases the joint graph may contradict it: th
 camera is calibrated wrongly.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from itertools import islice
 
 import numpy as np
@@ -31,8 +31,8 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 
-PAIRS = 4
-"""Sightings of another session, the most precise ones, that a new sighting is paired with."""
+SHARED_VARIANCE = 4.0
+"""Factor of the variance of a closure: sightings of one tag share the errors of calibration and time."""
 MOST_SESSIONS = 10
 """Other sessions, the newest ones, that a new sighting is paired with."""
 REVISIT_M = 10.0
@@ -47,8 +47,11 @@ class SeenTags:
         self._graph = graph
         self._seen: dict[Tag, dict[str, dict[int, TagSighting]]] = {}
         """By tag, session and keyscan."""
+        self._paired: dict[Tag, set[tuple[KeyscanId, str]]] = {}
+        """By tag, each keyscan and the session with which it has a closure: one at most, so that the errors of a
+        sighting are in one closure."""
 
-    def add(self, sighting: TagSighting) -> Iterator[PlaceMatch]:
+    def add(self, sighting: TagSighting) -> list[PlaceMatch]:
         """Note a sighting; returns its closures with earlier ones.
 
         Raises:
@@ -62,16 +65,19 @@ class SeenTags:
         if number in own:
             raise PacketError(f"{session}: keyscan {number} saw tag {sighting.tag} before")
         others = (name for name in reversed(seen) if name != session and self._share_floor(name, session))
-        chosen = [seen[name].values() for name in islice(others, MOST_SESSIONS)]
+        chosen = [(name, seen[name].values()) for name in islice(others, MOST_SESSIONS)]
         back_m = self._graph.travel_since(session)
         earlier = [one for k, one in own.items() if k < number and back_m[k] - back_m[number] >= REVISIT_M]
-        matches = [
-            _match(other, sighting)
-            for sightings in (*chosen, earlier)
-            for other in sorted(sightings, key=lambda one: -float(np.linalg.det(one.information)))[:PAIRS]
-        ]
+        paired = self._paired.setdefault(sighting.tag, set())
+        matches = []
+        for name, sightings in (*chosen, (session, earlier)):
+            free = [one for one in sightings if (one.id, session) not in paired]
+            if free:
+                partner = max(free, key=lambda one: float(np.linalg.det(one.information)))
+                paired |= {(partner.id, session), (sighting.id, name)}
+                matches.append(_match(partner, sighting))
         own[number] = sighting
-        return iter(matches)
+        return matches
 
     def of(self, sessions: Collection[str]) -> tuple[TagSighting, ...]:
         """All sightings of these sessions, by tag."""
@@ -91,6 +97,7 @@ class SeenTags:
             "tags": [(*one.id, *one.tag) for one in rows],
             "T_base_tag": np.array([one.T_base_tag for one in rows]),
             "tag_information": np.array([one.information for one in rows]),
+            "tag_pairs": [(*tag, *one, name) for tag, pairs in self._paired.items() for one, name in sorted(pairs)],
         }
 
     def restore(self, state: State) -> None:
@@ -102,16 +109,19 @@ class SeenTags:
             tag = Tag(TagFamily(family), number)
             sighting = TagSighting(KeyscanId(session, keyscan), tag, T_base_tag, information)
             self._seen.setdefault(tag, {}).setdefault(session, {})[keyscan] = sighting
+        for family, number, session, keyscan, name in state["tag_pairs"]:
+            pair = KeyscanId(session, keyscan), name
+            self._paired.setdefault(Tag(TagFamily(family), number), set()).add(pair)
 
     def _share_floor(self, a: str, b: str) -> bool:
         return self._sessions.floor(a) == self._sessions.floor(b)
 
 
 def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:
-    """The closure of two sightings. Each is in several closures, so these are less precise than if they were alone."""
+    """The closure of two sightings."""
     T_i_j: FloatArray = frozen(se2.compose(i.T_base_tag, se2.inverse(j.T_base_tag)))
     moved = se2.adjoint(j.T_base_tag)
-    covariance = PAIRS * moved @ (np.linalg.inv(i.information) + np.linalg.inv(j.information)) @ moved.T
+    covariance = SHARED_VARIANCE * moved @ (np.linalg.inv(i.information) + np.linalg.inv(j.information)) @ moved.T
     information = np.linalg.inv(0.5 * (covariance + covariance.T))
     robot, kind = j.id.robot, ConstraintKind.CLOSURE
     measured = Constraint(robot, 0, 1, kind, T_i_j, frozen(0.5 * (information + information.T)))

@@ -24,7 +24,7 @@ PROBABILITY = 0.99
 SUPPORT_M = 10.0
 """Largest path length between the ends of two closures, on both trajectories, at which consistent closures support
 each other, metres."""
-TAG_VIEWS = 3
+TAG_VIEWS = 2
 """Keyscans of each trajectory from which a tag must be seen to be evidence: a tag misread once is none."""
 
 

@@ -13,7 +13,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraImage, CameraModel, FloatArray, KeyscanId, Tag, TagFamily, TagSighting, frozen
 
-EDGE_SIGMA_PX, CORNER_SIGMA_PX = 0.3, 0.6
+EDGE_SIGMA_PX, CORNER_SIGMA_PX = 0.3, 1.5
 """Standard deviation of a corner where fitted edges meet, and of one refined by itself."""
 MARGIN_PX: Final = 30
 """The part of an image around its tags in which edges are fitted extends farther by this."""

@@ -13,7 +13,7 @@ from fcslam.lab.simulation.floorplan import WALL_M, FloorPlan, Room
 from fcslam.records import CameraModel, FloatArray, TagFamily
 
 FAMILY: Final = TagFamily.APRILTAG_36H11
-SIZE_M: Final = 0.2
+SIZE_M: Final = 0.3
 """Side of the black square."""
 HEIGHT_M: Final = 1.0
 """Height of the middle above the floor."""
