@@ -37,10 +37,10 @@ class Anchors:
     """What is known about the building."""
 
     plan: BuildingPlan | None = None
-    survey: Survey | None = None
-    """Positions of tags."""
     to_walls: bool = False
     """Turn maps that nothing else places, so that their walls run along x and y."""
+    survey: Survey | None = None
+    """Positions of tags."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

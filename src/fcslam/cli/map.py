@@ -219,7 +219,7 @@ def _anchors(plan: Path | None, scale: float | None, tags: Path | None, align: A
     building = None if plan is None else BuildingPlan(read_plan(plan, scale))
     if building is not None and building.submap.field.is_full:
         raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
-    return Anchors(building, None if tags is None else read_survey(tags), align is AlignTo.WALLS)
+    return Anchors(building, align is AlignTo.WALLS, None if tags is None else read_survey(tags))
 
 
 @contextmanager
