@@ -131,7 +131,7 @@ def map_recordings(
         earlier = None if onto is None else read_mission(onto)
         settings = mission.settings(continued_config(earlier))
         vetoes = read_vetoes(veto) if veto else ()
-        anchors = _anchors(plan, plan_scale, tags, align)
+        anchors = _anchors(plan, plan_scale, align, tags)
         options = bags.options()
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
@@ -206,7 +206,7 @@ def map_sources(
     return run
 
 
-def _anchors(plan: Path | None, scale: float | None, tags: Path | None, align: AlignTo | None) -> "Anchors":
+def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None, tags: Path | None = None) -> "Anchors":
     from fcslam.anchoring.anchors import Anchors
     from fcslam.anchoring.plan import BuildingPlan
     from fcslam.anchoring.plan_files import read_plan
