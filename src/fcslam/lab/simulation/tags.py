@@ -53,7 +53,11 @@ def _places(room: Room) -> tuple[tuple[float, float, float], tuple[float, float,
 
 
 def draw_tags(
-    pixels: FloatArray, camera: CameraModel, T_building_base: FloatArray, tags: Sequence[WallTag], walls: FloatArray
+    pixels: NDArray[np.floating],
+    camera: CameraModel,
+    T_building_base: FloatArray,
+    tags: Sequence[WallTag],
+    walls: FloatArray,
 ) -> None:
     """Draw the tags that a camera sees into its image.
 
