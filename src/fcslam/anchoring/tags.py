@@ -125,8 +125,8 @@ class MapTags:
         """Places at which visits saw one tag; those that lie within ``ELSEWHERE_M`` are one."""
         groups: list[list[TagSighting]] = []
         for one in sorted(seen, key=lambda one: one.id):
-            last = groups[-1][-1].id if groups else None
-            if last is None or last.robot != one.id.robot or one.id.number - last.number > ONE_VISIT:
+            last = groups[-1][-1] if groups else None
+            if last is None or not self._is_one_visit(last, one):
                 groups.append([])
             groups[-1].append(one)
         places: list[_Place] = []
@@ -137,6 +137,11 @@ class MapTags:
             else:
                 places[near] = self._mean([*places[near].sightings, *visit.sightings])
         return sorted(places, key=lambda place: -len(place.sightings))
+
+    def _is_one_visit(self, before: TagSighting, after: TagSighting) -> bool:
+        gap_m = float(np.hypot(*(self._pose(before) - self._pose(after))[:2]))
+        is_soon = before.id.robot == after.id.robot and after.id.number - before.id.number <= ONE_VISIT
+        return is_soon and gap_m <= 2.0 * ELSEWHERE_M
 
     def _mean(self, sightings: Sequence[TagSighting]) -> _Place:
         poses = np.array([self._pose(one) for one in sightings])
