@@ -29,6 +29,9 @@ POSITION_SIGMA: Final = (0.01, 0.01)
 """Standard deviation of a position besides that of the corners: metres, and metres for each metre of distance."""
 HEADING_SIGMA_RAD: Final = 0.02
 """Standard deviation of a heading besides that of the corners."""
+LARGEST_SIGMAS: Final = np.array((0.5, 0.5, 0.25))
+"""A pose with a larger standard deviation, in metres and radians, is not sent."""
+WORST_CONDITION: Final = 1e12
 _ROUNDS: Final = 4
 _STEP: Final = 1e-6
 
@@ -141,10 +144,15 @@ def tag_in_base(
     if best[5] <= 0.0 or MOST_TILT <= abs(normal(best)[2]) <= np.sqrt(1.0 - MOST_TILT**2):
         return None
     jacobian, projection = _jacobian(residuals, best), _jacobian(in_plane, best)
-    covariance = projection @ np.linalg.inv(jacobian.T @ jacobian) @ projection.T
+    hessian = jacobian.T @ jacobian
+    if not np.linalg.cond(hessian) < WORST_CONDITION:
+        return None
+    covariance = projection @ np.linalg.inv(hessian) @ projection.T
     fixed, relative = POSITION_SIGMA
     sigma_m = np.hypot(fixed, relative * np.linalg.norm(best[3:]))
     covariance += np.diag((sigma_m**2, sigma_m**2, HEADING_SIGMA_RAD**2))
+    if not (covariance.diagonal() < LARGEST_SIGMAS**2).all():  # so that NaN fails, too
+        return None
     cos, sin = np.cos(T_base_tag[2]), np.sin(T_base_tag[2])
     turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
     information = turn.T @ np.linalg.inv(covariance) @ turn
