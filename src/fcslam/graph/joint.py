@@ -176,7 +176,9 @@ def solve_jointly(
         # 7. Robots that contradict others get maps of their own.
         _, bound = _merge_frames(len(own), known, ())
         owner = np.array(bound)[_owners(evidence)[0]]
-        left = contradicting_robots(factors, owner, solution.poses, solution.weights > INLIER_WEIGHT, contradiction)
+        # Sightings of one tag share their errors, which are no strain of the paths.
+        counting = (solution.weights > INLIER_WEIGHT) & (True if evidence.tags is None else evidence.tags == 0)
+        left = contradicting_robots(factors, owner, solution.poses, counting, contradiction)
         apart |= _separations(left, joining, bound, contradiction)
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         # 8. Robots that alone join maps that contradict each other leave them.
