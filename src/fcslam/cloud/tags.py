@@ -31,8 +31,6 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 
-SHARED_VARIANCE = 4.0
-"""Factor of the variance of a closure: sightings of one tag share the errors of calibration and time."""
 MOST_SESSIONS = 10
 """Other sessions, the newest ones, that a new sighting is paired with."""
 REVISIT_M = 10.0
@@ -121,7 +119,7 @@ def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:
     """The closure of two sightings."""
     T_i_j: FloatArray = frozen(se2.compose(i.T_base_tag, se2.inverse(j.T_base_tag)))
     moved = se2.adjoint(j.T_base_tag)
-    covariance = SHARED_VARIANCE * moved @ (np.linalg.inv(i.information) + np.linalg.inv(j.information)) @ moved.T
+    covariance = moved @ (np.linalg.inv(i.information) + np.linalg.inv(j.information)) @ moved.T
     information = np.linalg.inv(0.5 * (covariance + covariance.T))
     robot, kind = j.id.robot, ConstraintKind.CLOSURE
     measured = Constraint(robot, 0, 1, kind, T_i_j, frozen(0.5 * (information + information.T)))
