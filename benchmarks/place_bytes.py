@@ -21,7 +21,7 @@ import common
 import numpy as np
 
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import Channel, Keyscan, Place
+from fcslam.records import PLACE_CHANNELS, Keyscan, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split
 from fcslam.wire import fcslam_pb2 as pb
@@ -129,7 +129,7 @@ def plain_fields(packet: Packet) -> dict[str, bytes]:
 
 def part_rows(name: str, packets: Sequence[Packet]) -> Iterator[tuple]:
     """What a keypoint, a descriptor and a place with as many as stated cost, by channel."""
-    for channel in Channel:
+    for channel in PLACE_CHANNELS:
         some = [p for p in packets if isinstance(p.body, Place) and p.body.channel is channel and len(p.body.keypoints)]
         if not some:
             continue

@@ -277,10 +277,66 @@ class Constraint:
 
 
 class Channel(StrEnum):
-    """Sensor of a place's descriptors; places of different channels are never compared."""
+    """What a closure rests on; places of different channels are never compared."""
 
     LIDAR = "lidar"
     CAMERA = "camera"
+    TAG = "tag"
+    """Both keyscans saw the same tag; no place has this channel."""
+
+
+PLACE_CHANNELS = (Channel.LIDAR, Channel.CAMERA)
+"""Sensors of the descriptors of places."""
+
+
+class TagFamily(StrEnum):
+    """Families of square tags, by the names of OpenCV's dictionaries without ``DICT_``."""
+
+    APRILTAG_16H5 = "apriltag_16h5"
+    APRILTAG_25H9 = "apriltag_25h9"
+    APRILTAG_36H10 = "apriltag_36h10"
+    APRILTAG_36H11 = "apriltag_36h11"
+    ARUCO_ORIGINAL = "aruco_original"
+    ARUCO_4X4_50 = "4x4_50"
+    ARUCO_4X4_100 = "4x4_100"
+    ARUCO_4X4_250 = "4x4_250"
+    ARUCO_4X4_1000 = "4x4_1000"
+    ARUCO_5X5_50 = "5x5_50"
+    ARUCO_5X5_100 = "5x5_100"
+    ARUCO_5X5_250 = "5x5_250"
+    ARUCO_5X5_1000 = "5x5_1000"
+    ARUCO_6X6_50 = "6x6_50"
+    ARUCO_6X6_100 = "6x6_100"
+    ARUCO_6X6_250 = "6x6_250"
+    ARUCO_6X6_1000 = "6x6_1000"
+    ARUCO_7X7_50 = "7x7_50"
+    ARUCO_7X7_100 = "7x7_100"
+    ARUCO_7X7_250 = "7x7_250"
+    ARUCO_7X7_1000 = "7x7_1000"
+
+
+class Tag(NamedTuple):
+    """A tag; the same one for all robots of a mission, on all days."""
+
+    family: TagFamily
+    number: int
+    """Its number (id) in the family."""
+
+    def __str__(self) -> str:
+        return f"{self.family} {self.number}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagSighting:
+    """A tag as a camera saw it near a keyscan."""
+
+    id: KeyscanId
+    tag: Tag
+    T_base_tag: FloatArray
+    """Pose of the tag in the keyscan's base, shape (3,), metres and radians. The heading of a tag on a wall is the
+    direction that it faces; that of a tag on a floor or a ceiling is the direction of its x axis."""
+    information: FloatArray
+    """Inverse covariance of T_base_tag in the tangent space at T_base_tag, shape (3, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,6 +421,7 @@ class ReasonCode(StrEnum):
     FITS_JOINT_MAP = "fits_joint_map"
     IN_CLUSTER = "in_dominant_cluster"
     FITS_JOINT_GRAPH = "fits_joint_graph"
+    SAME_TAG = "same_tag"
     SIMILAR = "similar"
     MATCHED_POINT = "matched_point"
     NOT_ENOUGH_EXPLAINED = "not_enough_explained"
@@ -397,6 +454,7 @@ _REASON_TEXT = {
     ReasonCode.FITS_JOINT_MAP: "fits the joint map: {value} m off, less than {limit}",
     ReasonCode.IN_CLUSTER: "in the dominant cluster of {value} closures",
     ReasonCode.FITS_JOINT_GRAPH: "fits the joint graph",
+    ReasonCode.SAME_TAG: "both saw the same tag, number {value}",
     ReasonCode.SIMILAR: "the similarity of the words is {value}, {limit} needed",
     ReasonCode.MATCHED_POINT: "one of {value} matched points of the rigid fusion",
     ReasonCode.NOT_ENOUGH_EXPLAINED: "a share of {value} of the points lies on a surface, {limit} needed",
@@ -463,6 +521,8 @@ class LoopClosure:
     reason: Reason
     informative: bool = True
     """Whether the match constrains the pose in every direction (a bare corridor does not)."""
+    tag: Tag | None = None
+    """The tag that both keyscans saw, of channel ``tag``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from fcslam.records import (
+    PLACE_CHANNELS,
     Beams,
     Channel,
     Constraint,
@@ -19,6 +20,9 @@ from fcslam.records import (
     KeyscanId,
     LaserModel,
     Place,
+    Tag,
+    TagFamily,
+    TagSighting,
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
@@ -55,12 +59,14 @@ def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
     information = spread @ spread.T + np.eye(3)
     motion = rng.uniform(-3.0, 3.0, 3)
     yield Constraint("alice", size, size + 1, ConstraintKind.ODOMETRY, motion, (information + information.T) / 2.0)
-    for channel in Channel:
+    for channel in PLACE_CHANNELS:
         shape = (size, KEYPOINT_AXES[channel])
         keypoints = rng.uniform(-12.0, 12.0, shape).astype(np.float32)
         common_bits = rng.integers(0, 256, 32, np.uint8)
         codes = common_bits ^ (rng.integers(0, 256, (size, 32), np.uint8) & rng.integers(0, 256, (size, 32), np.uint8))
         yield Place(KeyscanId("alice", size), channel, "light-1", size, size + 9, keypoints, codes)
+    tag = Tag(TagFamily.APRILTAG_36H11, size % 587)
+    yield TagSighting(KeyscanId("alice", size), tag, motion, (information + information.T) / 2.0)
     yield Correction("alice", size, 0, motion)
     yield Acknowledgement("alice", 7, size)
     yield DetectorUpdate("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))

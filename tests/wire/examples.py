@@ -19,6 +19,9 @@ from fcslam.records import (
     MapTile,
     Place,
     Sweep,
+    Tag,
+    TagFamily,
+    TagSighting,
     WordPlace,
     frozen,
 )
@@ -89,6 +92,12 @@ _cells = np.zeros((256, 256), np.uint8)
 _cells[20:180, 30:200] = 1
 _cells[[20, 179], 30:200] = 2
 MAP_TILE = MapTile("alice", 0.05, -1, 2, frozen(_cells, np.uint8))
+TAG_SIGHTING = TagSighting(
+    KeyscanId("alice", 12),
+    Tag(TagFamily.APRILTAG_36H11, 586),
+    frozen([1.5, -0.25, 3.0]),
+    frozen([[400.0, 16.0, -8.0], [16.0, 900.0, 4.0], [-8.0, 4.0, 100.0]]),
+)
 CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]), 0.75)
 ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
 DETECTOR_UPDATE = DetectorUpdate(
@@ -114,6 +123,7 @@ EXAMPLES = {
     "camera_place": packet(CAMERA_PLACE),
     "word_place": packet(WORD_PLACE),
     "map_tile": packet(MAP_TILE),
+    "tag_sighting": packet(TAG_SIGHTING),
     "correction": packet(CORRECTION),
     "acknowledgement": packet(ACKNOWLEDGEMENT),
     "detector_update": packet(DETECTOR_UPDATE),

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fcslam.records import (
-    Channel,
+    PLACE_CHANNELS,
     Constraint,
     ConstraintKind,
     Correction,
@@ -16,6 +16,9 @@ from fcslam.records import (
     MapTile,
     Place,
     Sweep,
+    Tag,
+    TagFamily,
+    TagSighting,
     WordPlace,
 )
 from fcslam.wire.limits import KEYPOINT_AXES
@@ -73,7 +76,7 @@ def places(draw, robot):
     count = draw(st.integers(0, 20))
     first = draw(NUMBERS)
     last = draw(st.integers(first, 2**31 - 1))
-    channel = draw(st.sampled_from(Channel))
+    channel = draw(st.sampled_from(PLACE_CHANNELS))
     shape = (count, KEYPOINT_AXES[channel])
     keypoints = draw(hnp.arrays(np.float32, shape, elements=st.floats(-327.0, 327.0, width=32)))
     return Place(
@@ -114,9 +117,13 @@ def constraints(draw, robot):
     return Constraint(robot, i, j, draw(st.sampled_from(ConstraintKind)), draw(poses()), draw(informations()))
 
 
+def tags():
+    return st.builds(Tag, st.sampled_from(TagFamily), st.integers(0, 4095))
+
+
 def detector_files():
     digests = st.binary(min_size=32, max_size=32)
-    return st.builds(DetectorFile, st.sampled_from(Channel), NAMES, NUMBERS, st.integers(1, 2**26), digests)
+    return st.builds(DetectorFile, st.sampled_from(PLACE_CHANNELS), NAMES, NUMBERS, st.integers(1, 2**26), digests)
 
 
 @st.composite
@@ -140,7 +147,7 @@ def sweeps():
 
 @st.composite
 def hellos(draw, robot, epoch):
-    versions = draw(st.dictionaries(st.sampled_from(Channel), NAMES))
+    versions = draw(st.dictionaries(st.sampled_from(PLACE_CHANNELS), NAMES))
     digests = st.binary(min_size=32, max_size=32)
     return Hello(
         robot,
@@ -162,6 +169,7 @@ def bodies(robot, epoch, time):
         places(robot),
         word_places(robot),
         map_tiles(robot),
+        st.builds(TagSighting, identity, tags(), poses(), informations()),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), EPOCHS, SEQUENCES),
         st.builds(DetectorUpdate, st.just(robot), detector_files()),

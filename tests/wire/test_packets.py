@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel, Constraint, Keyscan, MapTile, Place, WordPlace
+from fcslam.records import Channel, Constraint, Keyscan, MapTile, Place, TagSighting, WordPlace
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.messages import Packet, PacketKind
 from fcslam.wire.packets import Label, decode, encode, read_label, unpacked_size
@@ -24,7 +24,7 @@ def test_a_packet_comes_back(sent):
     if isinstance(body, Place | WordPlace):
         assert np.abs(body.keypoints - sent.body.keypoints).max(initial=0.0) <= 0.00502
         body = replace(body, keypoints=sent.body.keypoints)
-    if isinstance(body, Constraint):
+    if isinstance(body, Constraint | TagSighting):
         np.testing.assert_allclose(body.information, sent.body.information, rtol=1e-6, atol=1e-30)
         body = replace(body, information=sent.body.information)
     assert same(replace(received, body=body), sent)

@@ -11,7 +11,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel, ConstraintKind
+from fcslam.records import PLACE_CHANNELS, ConstraintKind
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
 from fcslam.wire.packets import decode, encode
@@ -48,6 +48,8 @@ LONGEST = {
     "Hello.floor": 16,
     "Constraint.information": 6,
     "Keyscan.sweep": 8,
+    "TagSighting.family": 16,
+    "TagSighting.information": 6,
 }
 """Every field that holds more than one number, and how much of it, in bytes, characters or elements."""
 
@@ -136,7 +138,7 @@ def test_no_image_hides_in_an_unknown_field():
 
 
 def test_every_enumeration_is_in_the_schema():
-    assert [f"CHANNEL_{each.name}" for each in Channel] == pb.Channel.keys()[1:]
+    assert [f"CHANNEL_{each.name}" for each in PLACE_CHANNELS] == pb.Channel.keys()[1:]
     assert [f"CONSTRAINT_KIND_{each.name}" for each in ConstraintKind] == pb.ConstraintKind.keys()[1:]
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel
+from fcslam.records import PLACE_CHANNELS, Channel
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.prediction import PROBABILITIES, WEIGHT_UNIT, nearest_before, predictor_of
 from fcslam.wire.streams import (
@@ -21,7 +21,7 @@ from fcslam.wire.streams import (
 )
 from tests.wire.strategies import codes
 
-CHANNELS = pytest.mark.parametrize("channel", Channel)
+CHANNELS = pytest.mark.parametrize("channel", PLACE_CHANNELS)
 POSITIONS = st.integers(-32767, 32767) | st.integers(-20, 20)
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from fcslam.anchoring.deviations import Comparison, compare_with_plan
 from fcslam.anchoring.gnss import Georeference, georeferenced
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
+from fcslam.anchoring.tags import MapTags, Survey, placed_by_tags, tag_lines
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import Track
 from fcslam.cloud.result import FleetResult, MappedRobot
@@ -23,7 +25,7 @@ from fcslam.records import FloatArray, GnssFix, frozen
 from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
-"""End of the name of the file that says where a map lies on the earth."""
+TAGS_JSON = "tags.json"
 ONLY_SCANS, ONLY_PLAN = "only in the scans", "only in the plan"
 
 FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
@@ -37,6 +39,8 @@ class Anchors:
     plan: BuildingPlan | None = None
     to_walls: bool = False
     """Turn maps that nothing else places, so that their walls run along x and y."""
+    survey: Survey | None = None
+    """Positions of tags."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +69,7 @@ def anchored(
     placed: Collection[int],
     fuse: FuseMembers,
 ) -> Anchored:
-    """Place each map by the floor plan, else by fixes, else by its walls.
+    """Place each map by the floor plan, else by surveyed tags, else by fixes, else by its walls.
 
     Args:
         result: the maps, each in a frame of its own.
@@ -77,6 +81,9 @@ def anchored(
     """
     files: dict[str, bytes] = {}
     reports, pictures = [], []
+    tags: list[dict[str, Any]] = []
+    distances: dict[str, float] = {}
+    surveyed: list[dict[str, Any]] = []
     for k in sorted({robot.map_index for robot in result.robots}):
         part, is_placed = _part(result, k), k in placed
         alignment = None
@@ -96,15 +103,29 @@ def anchored(
                     {"map": k, "aligned": False, "reason": f"it {TOO_MANY_WALLS}" if is_full else _why(alignment)}
                 )
         in_plan = alignment is not None and not alignment.refusal
+        by_tags = False
+        if anchors.survey is not None:
+            if in_plan or is_placed:
+                reason = "it keeps the frame of its plan" if in_plan else "it was placed by hand"
+                surveyed.append({"map": k, "reason": reason, "used": [], "ignored": {}})
+            else:
+                found_tags = placed_by_tags(part.robots, part.graph, result.sightings, anchors.survey)
+                part, by_tags = _Part(found_tags.robots, found_tags.graph), not found_tags.refusal
+                surveyed.append({"map": k, **found_tags.report()})
         own = {robot.robot: fixes[robot.robot] for robot in part.robots if fixes.get(robot.robot)}
-        found = georeferenced(part.robots, part.graph, own, tracks, is_fixed=in_plan or is_placed)
+        found = georeferenced(part.robots, part.graph, own, tracks, is_fixed=in_plan or is_placed or by_tags)
         if found is not None:
             part = _Part(found.robots, found.graph)
             files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))
-        if anchors.to_walls and not in_plan and not is_placed and (found is None or found.refusal):
+        if anchors.to_walls and not in_plan and not is_placed and not by_tags and (found is None or found.refusal):
             turn = np.array((0.0, 0.0, -wall_direction(fuse(part.robots))))
             part = _moved(part, turn)
         result = _with_part(result, k, part)
+        seen = MapTags(part.robots, result.sightings)
+        tags += seen.report(k)
+        distances |= {robot: round(scale, 3) for robot, scale in seen.scales().items()}
+    if result.sightings or anchors.survey is not None:
+        files[TAGS_JSON] = _json({"tags": tags, "distances": distances, "surveyed": surveyed})
     if anchors.plan is not None:
         files[PLAN_JSON] = _json({"maps": reports})
         files[PLAN_PNG] = _picture(anchors.plan.drawing, pictures)
@@ -238,7 +259,7 @@ def _corners(one: OccupancyMap) -> tuple[FloatArray, FloatArray]:
 
 
 def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
-    """What the files of a run folder say about plan and fixes, one sentence a map."""
+    """What the files of a run folder say about plan, tags and fixes, a sentence each."""
     for report in json.loads(files[PLAN_JSON])["maps"] if PLAN_JSON in files else ():
         if not report["aligned"]:
             yield f"map {report['map']} is not aligned with the plan: {report['reason']}"
@@ -249,6 +270,8 @@ def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
             f"map {report['map']} is aligned with the plan: {report['confirmed_m']:.0f} m of walls confirmed, "
             f"{', '.join([*scales, f'{count} walls differ ({PLAN_JSON})'])}"
         )
+    if TAGS_JSON in files:
+        yield from tag_lines(json.loads(files[TAGS_JSON]))
     for name, content in files.items():
         if name.endswith(GEOREFERENCE):
             report = json.loads(content)

@@ -99,6 +99,10 @@ def map_recordings(
     plan_scale: Annotated[
         float | None, typer.Option(metavar="M", help="Metres per pixel of the plan, or per unit of a DXF drawing.")
     ] = None,
+    tags: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="YAML file of surveyed tags. The map is given in their coordinates."),
+    ] = None,
     align: Annotated[
         AlignTo | None,
         typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y."),
@@ -127,7 +131,7 @@ def map_recordings(
         earlier = None if onto is None else read_mission(onto)
         settings = mission.settings(continued_config(earlier))
         vetoes = read_vetoes(veto) if veto else ()
-        anchors = _anchors(plan, plan_scale, align)
+        anchors = _anchors(plan, plan_scale, align, tags)
         options = bags.options()
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
@@ -202,10 +206,11 @@ def map_sources(
     return run
 
 
-def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None) -> "Anchors":
+def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None, tags: Path | None = None) -> "Anchors":
     from fcslam.anchoring.anchors import Anchors
     from fcslam.anchoring.plan import BuildingPlan
     from fcslam.anchoring.plan_files import read_plan
+    from fcslam.anchoring.tags import read_survey
     from fcslam.errors import InputError, SourceError
     from fcslam.lidar.field import TOO_MANY_WALLS
 
@@ -214,7 +219,7 @@ def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None) -> "
     building = None if plan is None else BuildingPlan(read_plan(plan, scale))
     if building is not None and building.submap.field.is_full:
         raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
-    return Anchors(building, align is AlignTo.WALLS)
+    return Anchors(building, align is AlignTo.WALLS, None if tags is None else read_survey(tags))
 
 
 @contextmanager

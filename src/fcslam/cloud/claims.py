@@ -12,7 +12,7 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import least_sigmas
 from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
-from fcslam.records import Constraint, ConstraintKind, FloatArray, MapTile, Place, frozen
+from fcslam.records import Constraint, ConstraintKind, FloatArray, MapTile, Place, TagSighting, frozen
 from fcslam.wire.limits import TILE_CELLS
 
 _ROUNDING = 1.01
@@ -27,6 +27,8 @@ MOST_SUBMAP_KEYSCANS = 2000
 """Largest number of keyscans in a submap."""
 MOST_MAP_TILES = 1200
 """Largest number of tiles, 256 by 256 cells each, of the box around a session's own map."""
+FARTHEST_TAG_M = 50.0
+"""Largest distance at which a camera reads a tag, metres."""
 LEAST_SIGMA_M = 0.001
 """Least standard deviation of a position that a robot measures, metres."""
 LEAST_SIGMA_RAD = 0.0002
@@ -125,6 +127,18 @@ def check_tile(tile: MapTile, earlier: Mapping[tuple[int, int], MapTile], limits
     distance_m = math.hypot(tile.column, tile.row) * TILE_CELLS * tile.resolution_m
     if not distance_m <= limits.distance_m:
         raise PacketError(f"{name} is {distance_m:.4g} m off, at most {limits.distance_m:g} m (fleet.claims)")
+
+
+def check_sighting(sighting: TagSighting) -> None:
+    """Check a sighting of a tag.
+
+    Raises:
+        PacketError: the tag is farther than a camera reads one.
+    """
+    distance_m = math.hypot(sighting.T_base_tag[0], sighting.T_base_tag[1])
+    if not distance_m <= FARTHEST_TAG_M:
+        name = f"{sighting.id.robot}: tag {sighting.tag}"
+        raise PacketError(f"{name} is {distance_m:.4g} m away, at most {FARTHEST_TAG_M:g} m")
 
 
 def check_submap(place: Place, poses: FloatArray) -> None:

@@ -17,6 +17,8 @@ from fcslam.records import (
     ManualClosure,
     Reason,
     ReasonCode,
+    Tag,
+    TagFamily,
     frozen,
 )
 from fcslam.storage.state_file import State
@@ -83,6 +85,8 @@ class ClosureLog:
         The same places seen by another detector are not independent evidence.
         """
         places = {match.i, match.j}
+        if match.channel is Channel.TAG:  # each is a measurement of its own
+            return False
         found = (entry.closure for entry in self._at.get(match.j, ()))
         return any({closure.i, closure.j} == places and closure.channel is match.channel for closure in found)
 
@@ -91,16 +95,18 @@ class ClosureLog:
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
         closure = LoopClosure(
             match.i, match.j, match.channel, match.similarity, frozen(match.T_i_j), frozen(match.information), status,
-            match.reason.under(MATCHER), match.informative,
+            match.reason.under(MATCHER), match.informative, match.tag,
         )  # fmt: skip
         return self._add(ClosureEntry(closure, independent=not match.predicted))
 
-    def add_local(self, constraint: Constraint, edge: int) -> ClosureEntry:
-        """Add a closure that a robot found within its own map; it is accepted until the joint graph contradicts it."""
+    def add_local(self, constraint: Constraint, edge: int, tag: Tag | None = None) -> ClosureEntry:
+        """Add a closure that a robot found within its own map, or that a ``tag`` gives there; it is accepted until the
+        joint graph contradicts it."""
+        found = Reason(ReasonCode.FOUND_BY_ROBOT) if tag is None else Reason(ReasonCode.SAME_TAG, tag.number)
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
         closure = LoopClosure(
-            i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
-            Reason(ReasonCode.FOUND_BY_ROBOT),
+            i, j, Channel.LIDAR if tag is None else Channel.TAG, 0.0, constraint.T_i_j, constraint.information,
+            ClosureStatus.ACCEPTED, found, tag=tag,
         )  # fmt: skip
         return self._add(ClosureEntry(closure, independent=False, edge=edge))
 
@@ -130,7 +136,9 @@ class ClosureLog:
     def state(self) -> State:
         """The state that ``restore`` needs."""
         closures = [entry.closure for entry in self._entries]
+        tags = [(row, *closure.tag) for row, closure in enumerate(closures) if closure.tag is not None]
         return {
+            **({"tags": tags} if tags else {}),
             "T_i_j": np.array([closure.T_i_j for closure in closures]).reshape(-1, 3),
             "information": np.array([closure.information for closure in closures]).reshape(-1, 3, 3),
             "facts": [
@@ -144,11 +152,13 @@ class ClosureLog:
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         rows = zip(state["facts"], frozen(state["T_i_j"]), frozen(state["information"]), strict=True)
-        for (i, j, channel, similarity, status, reason, informative, *entry, by_hand), T_i_j, information in rows:
+        tags = {row: Tag(TagFamily(family), number) for row, family, number in state.get("tags", ())}
+        for row, (fact, T_i_j, information) in enumerate(rows):
+            i, j, channel, similarity, status, reason, informative, *entry, by_hand = fact
             code, *details = reason
             closure = LoopClosure(
                 KeyscanId(*i), KeyscanId(*j), Channel(channel), similarity, T_i_j, information, ClosureStatus(status),
-                Reason(ReasonCode(code), *details), informative,
+                Reason(ReasonCode(code), *details), informative, tags.get(row),
             )  # fmt: skip
             restored = self._add(ClosureEntry(closure, *entry))
             if by_hand is not None and isinstance(edit := read_edit("closure", by_hand), ManualClosure):

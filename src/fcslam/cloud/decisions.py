@@ -31,6 +31,7 @@ from fcslam.records import (
     Pin,
     Reason,
     ReasonCode,
+    Tag,
     Undo,
     Veto,
 )
@@ -95,11 +96,11 @@ class ClosureDecisions:
         """A new session begins in a map of its own."""
         self.maps.append([session])
 
-    def add_local(self, closure: Constraint) -> None:
-        """Accept a closure that a robot found within its own map, unless it is vetoed."""
+    def add_local(self, closure: Constraint, tag: Tag | None = None) -> None:
+        """Accept a closure within a robot's own map, which it found or a ``tag`` gives, unless it is vetoed."""
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
         edge = self._graph.close(i, j, closure.T_i_j, closure.information)
-        entry = self.closures.add_local(closure, edge)
+        entry = self.closures.add_local(closure, edge, tag)
         self._mark(entry)
         if entry.vetoed:
             self._graph.count(edge, holds=False)

@@ -5,6 +5,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
@@ -24,6 +25,7 @@ from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.shared_words import SharedWords
 from fcslam.cloud.stage_times import StageTimes
+from fcslam.cloud.tags import SeenTags
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
@@ -40,6 +42,7 @@ from fcslam.records import (
     ManualClosure,
     MapTile,
     Place,
+    TagSighting,
     WordPlace,
     frozen,
 )
@@ -82,6 +85,7 @@ class Fleet:
         self._recognition = PlaceRecognition(
             config, seed, self._sessions, self._graph, self._decisions.closures, self._timed(verify_pairs)
         )
+        self._tags = SeenTags(self._sessions, self._graph)
         self._quality = CorrectionQuality(self._graph)
         self._needs_replay = False
         """Whether something besides the packets changed the graph: an edit."""
@@ -117,6 +121,8 @@ class Fleet:
                 self._place(place)
             case WordPlace() as place:
                 self._place(self._words.place(place, self._sessions.vocabularies(place.id.robot)))
+            case TagSighting() as sighting:
+                self._add_sighting(sighting)
             case MapTile() as tile:
                 self._sessions.add_tile(tile, packet.sequence)
             case Correction() | Acknowledgement() | DetectorUpdate():
@@ -140,6 +146,7 @@ class Fleet:
             "recognition": self._recognition.state(),
             "quality": self._quality.state(),
             "needs_replay": self._needs_replay,
+            **self._tags.state(),
         }
 
     @classmethod
@@ -157,6 +164,7 @@ class Fleet:
         fleet._decisions.restore(state["decisions"])
         fleet._sessions.name_floors(floors(fleet._decisions.changes))
         fleet._recognition.restore(state["recognition"])
+        fleet._tags.restore(state)
         fleet._quality.restore(state["quality"])
         fleet._needs_replay = state["needs_replay"]
         return fleet
@@ -211,7 +219,8 @@ class Fleet:
         fusion = decisions.reevaluate(final=True)
         if self._config.fusion is not FusionStrategy.JOINT:
             fusion = fuse_rigidly(decisions.closures, fusion.T_local_base, self._config.fusion)
-        return conclude(self._sessions, graph, decisions.closures, fusion, decisions.version, decisions.changes)
+        result = conclude(self._sessions, graph, decisions.closures, fusion, decisions.version, decisions.changes)
+        return replace(result, sightings=self._tags.of(self._present()))
 
     def finalize(
         self, log: PacketLog, arrived: Iterable[tuple[float, PacketNumber]], read: Callable[[PacketNumber], Packet]
@@ -309,6 +318,20 @@ class Fleet:
         self._check_submap(place)
         self._sessions.add_place(place)
         self._add_place(place)  # place recognition and map fusion
+
+    def _add_sighting(self, sighting: TagSighting) -> None:
+        """Match a sighting with those of the same tag, decide about the closures, join maps, optimise."""
+        session = sighting.id.robot
+        matches = self._tags.add(sighting)
+        for match in matches:
+            if match.i.robot == session:
+                constraint = Constraint(
+                    session, match.i.number, match.j.number, ConstraintKind.CLOSURE, match.T_i_j, match.information
+                )
+                self._decisions.add_local(constraint, match.tag)
+        if self._config.join_maps:
+            self._decisions.add_matches((match for match in matches if match.i.robot != session), session)
+        self._decisions.optimize_if_due()
 
     def _check_submap(self, place: Place) -> None:
         robot = place.id.robot

@@ -46,10 +46,13 @@ def first_estimate(
 def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:
     """The closures as measurements from robot a to the other."""
     found = [entry.closure for entry in entries]
+    tags = [closure.tag for closure in found]
+    numbers = {tag: number for number, tag in enumerate(dict.fromkeys([None, *tags]))}
     closures = Closures(
         np.array([closure.i.number for closure in found], dtype=np.int64),
         np.array([closure.j.number for closure in found], dtype=np.int64),
         np.array([closure.T_i_j for closure in found]).reshape(-1, 3),
         np.array([closure.information for closure in found]).reshape(-1, 3, 3),
+        np.array([numbers[tag] for tag in tags], dtype=np.int64),
     )
     return closures.reversed(np.array([closure.i.robot != robot_a for closure in found], dtype=bool))

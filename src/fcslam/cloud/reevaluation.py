@@ -86,12 +86,16 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
         informative[entry.edge] = entry.closure.informative
         independent[entry.edge] = entry.independent
         vetoed[entry.edge] = entry.vetoed
+    tags = np.zeros(count, np.int64)
+    numbers = {tag: number for number, tag in enumerate(dict.fromkeys([None, *(e.closure.tag for e in entries)]))}
+    for entry in entries:
+        tags[entry.edge] = numbers[entry.closure.tag]
     certain = {entry.edge for entry in entries if entry.is_certain}
     evident = graph.graph if not certain else _with_certain(graph.graph, certain)
     sessions = graph.robots()
     senders = [robot_of(session) for session in sessions]
-    numbers = tuple(map(senders.index, senders))
-    return JointEvidence(evident, tuple(sessions.values()), informative, independent, vetoed, numbers)
+    sender_numbers = tuple(map(senders.index, senders))
+    return JointEvidence(evident, tuple(sessions.values()), informative, independent, vetoed, tags, sender_numbers)
 
 
 def _with_certain(graph: PoseGraph, certain: Container[int | None]) -> PoseGraph:

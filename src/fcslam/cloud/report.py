@@ -17,7 +17,7 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.certificate import MappedPath, certificate_json, certificate_png, certify
 from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
-from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
+from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import QUALITY, ClosureRow, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
@@ -92,7 +92,7 @@ def traffic_metrics(ledger: Ledger, tracks: Mapping[str, Track]) -> list[Metric]
     says nothing about the other.
     """
     traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
-    traffic |= {f"{channel}_{PacketKind.PLACE}": ledger.total(channel=channel) for channel in Channel}
+    traffic |= {f"{channel}_{PacketKind.PLACE}": ledger.total(channel=channel) for channel in PLACE_CHANNELS}
     robots = sorted({label.robot for label in ledger.accepted})
     return [
         *(Metric(f"{name}_packets", total.count, "1") for name, total in traffic.items()),

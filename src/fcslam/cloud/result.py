@@ -23,6 +23,7 @@ from fcslam.records import (
     LaserModel,
     LoopClosure,
     Reason,
+    TagSighting,
     frozen,
 )
 from fcslam.runs.map_files import OccupancyMap
@@ -75,6 +76,8 @@ class FleetResult:
     """All keyscans at their optimised poses, with the accepted constraints."""
     regions: tuple[PlacedRegion, ...] = ()
     """Regions that users drew in the maps."""
+    sightings: tuple[TagSighting, ...] = ()
+    """Of the tags that the robots saw."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

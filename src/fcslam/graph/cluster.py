@@ -22,6 +22,7 @@ DIRECTION_M = 1.0
 
 _SEPARATE_BUDGET = 500
 """Branches searched for the largest set of separate places; beyond them the result is a lower bound."""
+_MEAN_ROUNDS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,15 @@ def not_examined(members: NDArray[np.int64]) -> None:
     """Leave the maps unaligned: only separate places count."""
 
 
+CountTags = Callable[[NDArray[np.int64]], int]
+"""Counts the tags of some closures, given by their rows, shape (M,)."""
+
+
+def no_tags(_: NDArray[np.int64]) -> int:
+    """Count no tags."""
+    return 0
+
+
 def decide_cluster(
     a: Trajectory,
     b: Trajectory,
@@ -71,7 +81,10 @@ def decide_cluster(
         The decision; its members are rows of ``closures``.
     """
     consistent = pairwise_consistency(a, b, closures, settings)
-    return dominant_cluster(consistent, closure_positions(a, b, closures), informative, settings, examine)
+    positions = closure_positions(a, b, closures)
+    return dominant_cluster(
+        consistent, positions, informative, settings, examine, lambda m: closures.select(m).shared_tags()
+    )
 
 
 def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
@@ -83,7 +96,8 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     """Estimate ``T_a_b`` of the frames of two trajectories from the two matched places that lie farthest apart.
 
     Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other to fix a rotation, the first
-    closure alone gives the transform.
+    closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only without
+    others, and then all of them by their information.
 
     Args:
         a, b: trajectories, each in its own coordinate frame.
@@ -92,6 +106,11 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     Returns:
         ``T_a_b``, shape (3,), metres and radians.
     """
+    if (closures.tags > 0).any():
+        walls = np.flatnonzero(closures.tags == 0)
+        if not len(walls):
+            return _mean_frame(a, b, closures)
+        closures = closures.select(walls)
     T_a_j = se2.compose(a.poses[closures.i], closures.T_i_j)
     in_a, in_b = T_a_j[:, :2], b.poses[closures.j, :2]
     distance = np.hypot(*np.moveaxis(in_b[:, None] - in_b[None], -1, 0))
@@ -101,12 +120,27 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     return two_point_alignment(in_a[[k, m]], in_b[[k, m]])
 
 
+def _mean_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
+    """``T_a_b`` (3,) by least squares over all closures, from the most precise one."""
+    T_i_a, T_b_j = se2.inverse(a.poses[closures.i]), b.poses[closures.j]
+    best = int(np.argmax(np.linalg.det(closures.information)))
+    T_a_b = se2.compose(se2.inverse(T_i_a[best]), se2.compose(closures.T_i_j[best], se2.inverse(T_b_j[best])))
+    moved = se2.adjoint(se2.inverse(T_b_j))
+    weighted = moved.swapaxes(-1, -2) @ closures.information
+    for _ in range(_MEAN_ROUNDS):
+        residuals = se2.log(se2.between(closures.T_i_j, se2.compose(se2.compose(T_i_a, T_a_b), T_b_j)))
+        step = np.linalg.solve((weighted @ moved).sum(axis=0), -np.einsum("kab,kb->a", weighted, residuals))
+        T_a_b = se2.compose(T_a_b, se2.exp(step))
+    return T_a_b
+
+
 def dominant_cluster(
     consistent: NDArray[np.bool_],
     places: ArrayLike,
     informative: ArrayLike,
     settings: ConsistencySettings,
     examine: Examine = not_examined,
+    shared_tags: CountTags = no_tags,
 ) -> ClusterDecision:
     """Find the largest consistent cluster and decide whether it is enough to join two maps.
 
@@ -123,6 +157,7 @@ def dominant_cluster(
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: what a cluster needs.
         examine: called with the members where only the amount of evidence is open.
+        shared_tags: counts the tags among the members that both robots saw from several keyscans.
 
     Returns:
         The decision; its members are rows of ``consistent``.
@@ -141,6 +176,7 @@ def dominant_cluster(
         separate_places=count_separate_places(xy[members], settings.separation_m),
         rival_closures=len(runner_up),
         rival_places=count_separate_places(xy[runner_up], settings.separation_m),
+        tags=shared_tags(np.array(members, dtype=np.int64)),
     )
     shortfall = cluster_shortfall(evidence, settings)
     has_no_lead = shortfall is not None and shortfall.code in (ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES)

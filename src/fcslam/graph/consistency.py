@@ -5,7 +5,7 @@ the covariances of the closures and the drift of both stretches. The transform b
 trajectories plays no part.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ PROBABILITY = 0.99
 SUPPORT_M = 10.0
 """Largest path length between the ends of two closures, on both trajectories, at which consistent closures support
 each other, metres."""
+TAG_VIEWS = 2
+"""Keyscans of each trajectory from which a tag must be seen to be evidence: a tag misread once is none."""
 
 
 class ConsistencySettings(EvidenceSettings, DriftSettings):
@@ -51,6 +53,8 @@ class Closures:
     """Pose of keyscan j in keyscan i, shape (K, 3), metres and radians."""
     information: FloatArray
     """Information of T_i_j in the tangent space at T_i_j, shape (K, 3, 3)."""
+    tags: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    """Number from 1 of the tag that both keyscans saw, 0 without one, shape (K,); empty: no closure has one."""
 
     def __len__(self) -> int:
         return len(self.i)
@@ -63,11 +67,18 @@ class Closures:
         T_i_j, information = self.T_i_j.copy(), self.information.copy()
         T_i_j[rows] = se2.inverse(self.T_i_j[rows])
         information[rows] = back.swapaxes(-1, -2) @ self.information[rows] @ back
-        return Closures(i, j, T_i_j, information)
+        return Closures(i, j, T_i_j, information, self.tags)
 
     def select(self, rows: NDArray[np.int64]) -> "Closures":
         """The closures with the indices ``rows``, shape (S,)."""
-        return Closures(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows])
+        tags = self.tags[rows] if len(self.tags) else self.tags
+        return Closures(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows], tags)
+
+    def shared_tags(self) -> int:
+        """Count the tags that both trajectories saw from several keyscans each."""
+        rows = (self.tags == tag for tag in np.unique(self.tags[self.tags > 0]))
+        views = (min(len(np.unique(end[seen])) for end in (self.i, self.j)) for seen in rows)
+        return sum(count >= TAG_VIEWS for count in views)
 
 
 def pairwise_consistency(

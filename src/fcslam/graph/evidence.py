@@ -3,7 +3,8 @@
 Each separate place whose closures agree is one independent test of the transform: it counts one. Where the maps
 overlap in few places, an exhaustive alignment of them tells whether the transform is the only one that fits. It adds
 the ratio of its score to the best score elsewhere, less one. A corridor with equal doors scores nearly as well one door
-farther, so its alignment adds next to nothing. An unmistakable room replaces two further places.
+farther, so its alignment adds next to nothing. An unmistakable room replaces two further places. So does a tag that
+both robots saw: its number is unmistakable, but it may be there twice, and then the maps contradict each other.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,9 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.records import Reason, ReasonCode
+
+TAG_PLACES = 2.0
+"""Further places that a tag replaces, which both robots saw, if their maps do not contradict each other."""
 
 
 class EvidenceSettings(Settings):
@@ -60,6 +64,8 @@ class ClusterEvidence:
     rival_closures: int
     """Closures of the largest cluster that contradicts this one."""
     rival_places: int
+    tags: int = 0
+    """Tags that both robots saw from several keyscans."""
     uniqueness: Uniqueness | None = None
     """None if the maps were not aligned exhaustively."""
 
@@ -69,7 +75,7 @@ def amount(evidence: ClusterEvidence, settings: EvidenceSettings) -> float:
     unique = evidence.uniqueness
     if unique is None or unique.violation > settings.violation:
         return float(evidence.separate_places)
-    return evidence.separate_places + max(0.0, unique.ratio - 1.0)
+    return evidence.separate_places + max(0.0, unique.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0)
 
 
 def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:

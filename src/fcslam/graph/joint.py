@@ -64,6 +64,8 @@ class JointEvidence:
     Only such closures are evidence for this transform."""
     excluded: NDArray[np.bool_]
     """Per edge, shape (E,): closures that are known to be false, as by a veto."""
+    tags: NDArray[np.int64] | None = None
+    """Per edge, shape (E,): number from 1 of the tag that both keyscans saw, 0 without one. None: no edge has one."""
     senders: tuple[int, ...] | None = None
     """Sender of each robot's packets: the sessions of one sender count as one in the search for false bridges. None:
     each robot is its own sender."""
@@ -174,7 +176,9 @@ def solve_jointly(
         # 7. Robots that contradict others get maps of their own.
         _, bound = _merge_frames(len(own), known, ())
         owner = np.array(bound)[_owners(evidence)[0]]
-        left = contradicting_robots(factors, owner, solution.poses, solution.weights > INLIER_WEIGHT, contradiction)
+        # Sightings of one tag share their errors, which are no strain of the paths.
+        counting = (solution.weights > INLIER_WEIGHT) & (True if evidence.tags is None else evidence.tags == 0)
+        left = contradicting_robots(factors, owner, solution.poses, counting, contradiction)
         apart |= _separations(left, joining, bound, contradiction)
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         # 8. Robots that alone join maps that contradict each other leave them.
@@ -250,7 +254,9 @@ def _pairs(
     ends = np.sort(np.stack((owner[edges.i[between]], owner[edges.j[between]])), axis=0)
     for a, b in np.unique(ends, axis=1).T.tolist():
         rows = between[(ends[0] == a) & (ends[1] == b)]
-        closures = Closures(index[edges.i[rows]], index[edges.j[rows]], edges.T_i_j[rows], edges.information[rows])
+        ends_of = index[edges.i[rows]], index[edges.j[rows]]
+        tags = np.empty(0, np.int64) if evidence.tags is None else evidence.tags[rows]
+        closures = Closures(*ends_of, edges.T_i_j[rows], edges.information[rows], tags)
         yield a, b, rows, closures.reversed(owner[edges.i[rows]] == b)
 
 
@@ -399,6 +405,7 @@ def _is_confirmed(
         separate_places=count_separate_places(positions, settings.separation_m),
         rival_closures=0,
         rival_places=0,
+        tags=link.closures.select(members).shared_tags(),
     )
     return 3 * len(members) > 2 * len(link.members) and shortfall(remaining, settings) is None
 

@@ -268,7 +268,7 @@ class MissionCloud:
         self, result: FleetResult, tracks: Mapping[str, Track], anchors: Anchors,
         fixes: Mapping[str, Sequence[GnssFix]],
     ) -> Anchored:  # fmt: skip
-        if anchors == NOTHING_KNOWN and not any(fixes.values()):
+        if anchors == NOTHING_KNOWN and not any(fixes.values()) and not result.sightings:
             return Anchored(result)
         by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}

@@ -23,7 +23,7 @@ from fcslam.places.motions import Motion, propose_motions
 from fcslam.places.query_result import QueryResult
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, ReasonCode, frozen
+from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, ReasonCode, Tag, frozen
 from fcslam.storage.state_file import State
 
 START_SHARE = 1.0 / 3.0
@@ -119,6 +119,8 @@ class PlaceMatch:
     """Share of the points in known area that lie on a surface, of the worse direction."""
     predicted: bool
     """Whether the robots were in one map already and it predicted this pair."""
+    tag: Tag | None = None
+    """The tag that both saw, of channel ``tag``."""
 
     @classmethod
     def verified(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fcslam.errors import InputError, OutputError
 from fcslam.features.codes import code_words, nearest_codes
 from fcslam.places.kmeans_tree import TreeShape, k_means
-from fcslam.records import CODE_BYTES, NAME, Channel, Codes, frozen
+from fcslam.records import CODE_BYTES, NAME, PLACE_CHANNELS, Channel, Codes, frozen
 from fcslam.storage.files import write_file
 from fcslam.untrusted import Arrays, read_arrays
 
@@ -113,7 +113,7 @@ def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
     """
     try:
         archive = read_arrays(path)
-        found = tuple(_read(archive, channel) for channel in Channel if f"{channel}.centres" in archive)
+        found = tuple(_read(archive, channel) for channel in PLACE_CHANNELS if f"{channel}.centres" in archive)
         if not found:
             raise ValueError("it holds no words")
     except (OSError, ValueError, KeyError, TypeError) as error:

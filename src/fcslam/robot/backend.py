@@ -4,19 +4,35 @@ It builds submaps, closes loops, solves the pose graph and describes places. Its
 their order, so it gives the same records wherever and whenever it runs (``fcslam.robot.beside``).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, field_validator
 
 from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION
+from fcslam.geometry import se2
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
-from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, KeyscanId, LaserModel, LaserScan, Place
+from fcslam.records import (
+    PLACE_CHANNELS,
+    CameraImage,
+    Channel,
+    DetectorFile,
+    FloatArray,
+    KeyscanId,
+    LaserModel,
+    LaserScan,
+    Place,
+    Tag,
+    TagSighting,
+)
 from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.robot.keyframe_folder import KeyframeFolder
 from fcslam.robot.own_places import OwnPlaces
+from fcslam.robot.tags import TagDetector, TagsConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
 from fcslam.wire.messages import Body, Hello
@@ -27,9 +43,22 @@ class SessionConfig(SendingConfig):
 
     lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
     channels: tuple[Channel, ...] = Field(
-        default=tuple(Channel), min_length=1, description="sensors that describe places: lidar, camera"
+        default=PLACE_CHANNELS, min_length=1, description="sensors that describe places: lidar, camera"
     )
     views: ViewsConfig = Field(default=ViewsConfig(), description="binary descriptors of camera images")
+    tags: TagsConfig = Field(default=TagsConfig(), description="tags on walls, floors and ceilings")
+
+    @field_validator("channels")
+    @classmethod
+    def _channels_have_places(cls, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
+        if Channel.TAG in channels:
+            raise ValueError("tags describe no places; leave tag out and set robot.tags.size_m")
+        return channels
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether the robot needs its camera."""
+        return Channel.CAMERA in self.channels or self.tags.size_m is not None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,8 +157,9 @@ class RobotBackend:
             case NewKeyscan():
                 return self._session.add(input)
             case NewImage():
-                if self._session.describe(input):
+                if Channel.CAMERA in self._config.channels and self._session.describe(input):
                     self._place_sometimes()
+                return list(self._session.find_tags(input))
             case NewDetector():
                 self._set_detector(input.file, input.path)
                 return self._session.announcement()
@@ -182,6 +212,9 @@ class _Session:
         """By keyscan of a camera place: first and last keyscan of the submap that it was sent with."""
         self._described: set[tuple[int, str]] = set()
         """Keyscan and detector version of every camera place that was sent."""
+        self._tag_detector = None if config.tags.size_m is None else TagDetector(config.tags)
+        self._sighted: set[tuple[int, Tag]] = set()
+        """Keyscan and tag of every sighting that was sent."""
         self._announced: Hello | None = None
         """The last hello."""
 
@@ -202,6 +235,19 @@ class _Session:
         if view is not None:
             self._views.append(view)
         return view is not None
+
+    def find_tags(self, input: NewImage) -> Iterator[TagSighting]:
+        """Find the tags that no earlier image of the same keyscan showed."""
+        if self._tag_detector is None:
+            return
+        scan, pose, odometry = input.scan, input.pose, input.image.T_odom_base
+        T_scan_image = np.zeros(3) if odometry is None else se2.between(scan.T_odom_base, odometry)
+        T_keyscan_image = se2.compose(pose.T_keyscan_base, T_scan_image)
+        keyscan = KeyscanId(self._robot, pose.keyscan)
+        for sighting in self._tag_detector.find(input.image, keyscan, T_keyscan_image):
+            if (pose.keyscan, sighting.tag) not in self._sighted:
+                self._sighted.add((pose.keyscan, sighting.tag))
+                yield sighting
 
     def finish(self) -> list[Body]:
         """End the session; returns the open submaps."""

@@ -23,7 +23,7 @@ from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, drove_on, has_moved_unseen, is_doubtful, is_lost
 from fcslam.lidar.odometry import WHEELS, OdometryModel
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
-from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord, Sweep
+from fcslam.records import CameraImage, DetectorFile, FloatArray, LaserScan, SensorRecord, Sweep
 from fcslam.robot.backend import (
     BackendInput,
     NewDetector,
@@ -168,7 +168,7 @@ class RobotFrontend:
                     self.prediction = MotionPrediction() if self.prediction else None
                 self._before_s = self._before_s[1], record.stamp
                 self._process_scan(self._mapped.of(self._with_motion(record)))
-            case CameraImage() if Channel.CAMERA in self._config.channels:
+            case CameraImage() if self._config.uses_images:
                 image = self.odometry.image(record) if self.prediction is None else replace(record, T_odom_base=None)
                 if self._deferred:
                     self._deferred.append(image)

@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 
 from fcslam.features.detector_file import describe_detector_file
-from fcslam.records import Channel, DetectorFile
+from fcslam.records import PLACE_CHANNELS, Channel, DetectorFile
 
 LONGEST_FILE_BYTES = 64 * 2**20
 STAGING = ".staging"
@@ -22,7 +22,7 @@ class DetectorStore:
         self._lock = threading.Lock()
         self._announced = {
             channel: describe_detector_file(self.path(channel, announced.read_text(encoding="utf-8")))
-            for channel in Channel
+            for channel in PLACE_CHANNELS
             if (announced := root / channel / _ANNOUNCED).is_file()
         }
 
@@ -33,7 +33,9 @@ class DetectorStore:
     def versions(self) -> list[tuple[str, str]]:
         """Channel and version of every file."""
         return [
-            (channel, path.stem) for channel in sorted(Channel) for path in sorted(self._root.glob(f"{channel}/*.onnx"))
+            (channel, path.stem)
+            for channel in sorted(PLACE_CHANNELS)
+            for path in sorted(self._root.glob(f"{channel}/*.onnx"))
         ]
 
     def announced(self) -> dict[Channel, DetectorFile]:

@@ -30,6 +30,7 @@ from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.processes import obey_parent, start_method
 from fcslam.records import (
     CODE_BYTES,
+    PLACE_CHANNELS,
     Channel,
     Constraint,
     ConstraintKind,
@@ -190,14 +191,14 @@ def _packets() -> Iterator[bytes]:
 
 
 def _bodies(robot: str, start_s: float, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
-    yield Hello(robot, 0, (_LASER,), dict.fromkeys(Channel, _DETECTOR))
+    yield Hello(robot, 0, (_LASER,), dict.fromkeys(PLACE_CHANNELS, _DETECTOR))
     for k, pose in enumerate(poses):
         yield Keyscan(KeyscanId(robot, k), start_s + k, dequantise(quantise(_ranges(pose))))
         if k:
             yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
         anchor = k - _AROUND
         if anchor >= _AROUND and anchor % _PLACE_EVERY == 0:
-            yield from (_place(robot, channel, anchor, poses[anchor], landmarks, codes) for channel in Channel)
+            yield from (_place(robot, channel, anchor, poses[anchor], landmarks, codes) for channel in PLACE_CHANNELS)
     yield _constraint(robot, poses, 0, _CLOSURE_AFTER, ConstraintKind.CLOSURE)
 
 

@@ -1,9 +1,9 @@
 """Conversion between records and protobuf messages, with writing and reading side by side."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from google.protobuf.message import Message
@@ -25,6 +25,9 @@ from fcslam.records import (
     MapTile,
     Place,
     Sweep,
+    Tag,
+    TagFamily,
+    TagSighting,
     WordPlace,
     frozen,
 )
@@ -59,6 +62,8 @@ from fcslam.wire.streams import (
     unpack_ranges,
     unpack_words,
 )
+
+Measurement = TypeVar("Measurement", Constraint, TagSighting)
 
 _CHANNELS = {Channel.LIDAR: pb.CHANNEL_LIDAR, Channel.CAMERA: pb.CHANNEL_CAMERA}
 _CONSTRAINT_KINDS = {
@@ -156,14 +161,18 @@ def _read_constraint(message: pb.Constraint, envelope: pb.Packet) -> Constraint:
     kind = _CONSTRAINT_KIND_OF_CODE.get(message.kind)
     if kind is None:
         raise PacketError(f"constraint: kind {message.kind} is unknown")
-    if len(message.information) != 6:
-        raise PacketError(f"constraint: information has {len(message.information)} numbers, not 6")
-    information = unpack_information(message.information)
+    information = _read_information(message.information, "constraint")
     return Constraint(envelope.robot, message.i, message.j, kind, _read_pose(message, "t_i_j"), information)
 
 
-def _round_constraint(constraint: Constraint) -> Constraint:
-    return replace(constraint, information=unpack_information(pack_information(constraint.information)))
+def _read_information(numbers: Sequence[float], what: str) -> FloatArray:
+    if len(numbers) != 6:
+        raise PacketError(f"{what}: information has {len(numbers)} numbers, not 6")
+    return unpack_information(numbers)
+
+
+def _round_information(body: Measurement) -> Measurement:
+    return replace(body, information=unpack_information(pack_information(body.information)))
 
 
 def _write_place(place: Place) -> pb.Place:
@@ -257,6 +266,27 @@ def _read_map_tile(message: pb.MapTile, envelope: pb.Packet) -> MapTile:
     return MapTile(envelope.robot, message.resolution_m, message.column, message.row, cells)
 
 
+def _write_tag_sighting(sighting: TagSighting) -> pb.TagSighting:
+    return pb.TagSighting(
+        number=sighting.id.number,
+        family=sighting.tag.family,
+        tag=sighting.tag.number,
+        t_base_tag=_write_pose(sighting.T_base_tag),
+        information=pack_information(sighting.information),
+    )
+
+
+def _read_tag_sighting(message: pb.TagSighting, envelope: pb.Packet) -> TagSighting:
+    if message.family not in tuple(TagFamily):
+        raise PacketError(f"tag sighting: the family {message.family[:32]!r} is unknown")
+    return TagSighting(
+        KeyscanId(envelope.robot, message.number),
+        Tag(TagFamily(message.family), message.tag),
+        _read_pose(message, "t_base_tag"),
+        _read_information(message.information, "tag sighting"),
+    )
+
+
 def _check_at_most(count: int, most: int, what: str) -> None:
     """Refuse a count before memory is allocated for it."""
     if count > most:
@@ -336,10 +366,11 @@ class Codec(NamedTuple):
 CODECS = {
     PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
     PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
-    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_constraint),
+    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
     PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place),
     PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place),
     PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile),
+    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

@@ -22,6 +22,7 @@ from fcslam.records import (
     MapTile,
     Place,
     Sweep,
+    TagSighting,
     WordPlace,
 )
 from fcslam.runs.map_files import Occupancy
@@ -42,6 +43,7 @@ from fcslam.wire.limits import (
     MAXIMUM_RESOLUTION_M,
     MAXIMUM_SEQUENCE,
     MAXIMUM_SPEED,
+    MAXIMUM_TAG,
     MAXIMUM_TILE,
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
@@ -77,7 +79,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def _robot_of(body: Body) -> str:
-    return body.id.robot if isinstance(body, Keyscan | Place | WordPlace) else body.robot
+    return body.id.robot if isinstance(body, Keyscan | Place | WordPlace | TagSighting) else body.robot
 
 
 def _check_hello(hello: Hello, packet: Packet) -> None:
@@ -155,23 +157,23 @@ def _check_constraint(constraint: Constraint, _: Packet) -> None:
     _check_count(constraint.j, "constraint: j", MAXIMUM_NUMBER)
     _require(constraint.i < constraint.j, f"constraint: i = {constraint.i} is not below j = {constraint.j}")
     _check_pose(constraint.T_i_j, "constraint: T_i_j", math.pi)
-    _check_information(constraint.information)
+    _check_information(constraint.information, "constraint")
 
 
-def _check_information(information: FloatArray) -> None:
+def _check_information(information: FloatArray, what: str) -> None:
     """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite."""
-    _check_shape(information, (3, 3), "constraint: information")
+    _check_shape(information, (3, 3), f"{what}: information")
     xx, xy, xt, yy, yt, tt = sent = pack_information(information)
-    _require(all(map(math.isfinite, sent)), "constraint: information is not finite")
+    _require(all(map(math.isfinite, sent)), f"{what}: information is not finite")
     bounded = all(MINIMUM_INFORMATION <= diagonal <= MAXIMUM_INFORMATION for diagonal in (xx, yy, tt))
-    _require(bounded, "constraint: a diagonal element of information is not in [2^-20, 2^40]")
+    _require(bounded, f"{what}: a diagonal element of information is not in [2^-20, 2^40]")
     x, y, t = 1.0 / math.sqrt(xx), 1.0 / math.sqrt(yy), 1.0 / math.sqrt(tt)
     scale = (x * x, x * y, x * t, y * x, y * y, y * t, t * x, t * y, t * t)
     given = zip(information.ravel().tolist(), (xx, xy, xt, xy, yy, yt, xt, yt, tt), scale, strict=True)
     symmetric = all(abs(number - rounded) * factor <= 1e-6 for number, rounded, factor in given)
-    _require(symmetric, "constraint: information is not symmetric")
+    _require(symmetric, f"{what}: information is not symmetric")
     definite = _exceeds(MINIMUM_CORRELATION_EIGENVALUE, xy * x * y, xt * x * t, yt * y * t)
-    _require(definite, "constraint: information is not clearly positive definite")
+    _require(definite, f"{what}: information is not clearly positive definite")
 
 
 def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
@@ -204,6 +206,13 @@ def _check_map_tile(tile: MapTile, _: Packet) -> None:
     _check_shape(tile.cells, (TILE_CELLS, TILE_CELLS), "map tile: cells")
     _require(tile.cells.dtype == np.uint8, f"map tile: cells are {tile.cells.dtype}, not bytes")
     _require(int(tile.cells.max()) <= Occupancy.OCCUPIED, "map tile: a cell is neither unknown, free nor occupied")
+
+
+def _check_tag_sighting(sighting: TagSighting, _: Packet) -> None:
+    _check_count(sighting.id.number, "tag sighting: number", MAXIMUM_NUMBER)
+    _check_count(sighting.tag.number, "tag sighting: tag", MAXIMUM_TAG)
+    _check_pose(sighting.T_base_tag, "tag sighting: T_base_tag", math.pi)
+    _check_information(sighting.information, "tag sighting")
 
 
 def _check_described(place: Place | WordPlace) -> None:
@@ -251,6 +260,7 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Place: _check_place,
     WordPlace: _check_word_place,
     MapTile: _check_map_tile,
+    TagSighting: _check_tag_sighting,
     Correction: _check_correction,
     Acknowledgement: _check_acknowledgement,
     DetectorUpdate: _check_detector_update,

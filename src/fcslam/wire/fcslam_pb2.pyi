@@ -26,7 +26,7 @@ CONSTRAINT_KIND_ODOMETRY: ConstraintKind
 CONSTRAINT_KIND_CLOSURE: ConstraintKind
 
 class Packet(_message.Message):
-    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "correction", "acknowledgement", "detector_update")
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "tag_sighting", "correction", "acknowledgement", "detector_update")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     ROBOT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -38,6 +38,7 @@ class Packet(_message.Message):
     PLACE_FIELD_NUMBER: _ClassVar[int]
     WORD_PLACE_FIELD_NUMBER: _ClassVar[int]
     MAP_TILE_FIELD_NUMBER: _ClassVar[int]
+    TAG_SIGHTING_FIELD_NUMBER: _ClassVar[int]
     CORRECTION_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
     DETECTOR_UPDATE_FIELD_NUMBER: _ClassVar[int]
@@ -52,10 +53,11 @@ class Packet(_message.Message):
     place: Place
     word_place: WordPlace
     map_tile: MapTile
+    tag_sighting: TagSighting
     correction: Correction
     acknowledgement: Acknowledgement
     detector_update: DetectorUpdate
-    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
 
 class Pose(_message.Message):
     __slots__ = ("x_m", "y_m", "theta_rad")
@@ -192,6 +194,20 @@ class MapTile(_message.Message):
     row: int
     cells: bytes
     def __init__(self, resolution_m: _Optional[float] = ..., column: _Optional[int] = ..., row: _Optional[int] = ..., cells: _Optional[bytes] = ...) -> None: ...
+
+class TagSighting(_message.Message):
+    __slots__ = ("number", "family", "tag", "t_base_tag", "information")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    FAMILY_FIELD_NUMBER: _ClassVar[int]
+    TAG_FIELD_NUMBER: _ClassVar[int]
+    T_BASE_TAG_FIELD_NUMBER: _ClassVar[int]
+    INFORMATION_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    family: str
+    tag: int
+    t_base_tag: Pose
+    information: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, number: _Optional[int] = ..., family: _Optional[str] = ..., tag: _Optional[int] = ..., t_base_tag: _Optional[_Union[Pose, _Mapping]] = ..., information: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Correction(_message.Message):
     __slots__ = ("version", "map_index", "t_map_odom", "quality")

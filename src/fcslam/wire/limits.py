@@ -1,4 +1,4 @@
-"""All limits of the format, versions 2 to 6. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 to 7. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
@@ -9,6 +9,8 @@ WORDS_VERSION = 4
 """Version of packets that only a robot with words in place of descriptors sends."""
 SWEEP_VERSION = 6
 """Version of a keyscan whose beams were measured at different times."""
+TAG_VERSION = 7
+"""Version of a tag sighting."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -47,6 +49,9 @@ MAXIMUM_TILE = 2**15
 """Number of a tile along an axis; at 5 cm it is 400 km away."""
 MINIMUM_RESOLUTION_M = 0.001
 MAXIMUM_RESOLUTION_M = 10.0
+
+MAXIMUM_TAG = 4095
+"""Number of a tag; the largest family has 2320."""
 
 MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
 """Largest file of a detector; present ones have 0.5 to 5 MB."""

@@ -13,6 +13,7 @@ from fcslam.records import (
     LaserModel,
     MapTile,
     Place,
+    TagSighting,
     WordPlace,
 )
 
@@ -26,6 +27,7 @@ class PacketKind(StrEnum):
     PLACE = "place"
     WORD_PLACE = "word_place"
     MAP_TILE = "map_tile"
+    TAG_SIGHTING = "tag_sighting"
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
     DETECTOR_UPDATE = "detector_update"
@@ -39,6 +41,7 @@ UPLINK = frozenset(
         PacketKind.PLACE,
         PacketKind.WORD_PLACE,
         PacketKind.MAP_TILE,
+        PacketKind.TAG_SIGHTING,
     }
 )
 """Kinds that robots send; the cloud sends the others."""
@@ -78,7 +81,18 @@ class DetectorUpdate:
     file: DetectorFile
 
 
-Body = Hello | Keyscan | Constraint | Place | WordPlace | MapTile | Correction | Acknowledgement | DetectorUpdate
+Body = (
+    Hello
+    | Keyscan
+    | Constraint
+    | Place
+    | WordPlace
+    | MapTile
+    | TagSighting
+    | Correction
+    | Acknowledgement
+    | DetectorUpdate
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Channel, Keyscan, MapTile, Place, WordPlace
+from fcslam.records import CODE_BYTES, Channel, Keyscan, MapTile, Place, TagSighting, WordPlace
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
@@ -24,11 +24,12 @@ from fcslam.wire.limits import (
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
     SWEEP_VERSION,
+    TAG_VERSION,
     WORDS_VERSION,
 )
 from fcslam.wire.messages import Body, Hello, Packet, PacketKind
 
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION)
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION)
 
 
 class Label(NamedTuple):
@@ -168,6 +169,8 @@ def _version(body: Body) -> int:
     match body:
         case WordPlace() | MapTile():
             return WORDS_VERSION
+        case TagSighting():
+            return TAG_VERSION
         case Keyscan(ranges_m=ranges_m, sweep=sweep):
             return WORDS_VERSION if not len(ranges_m) else PROTOCOL_VERSION if sweep is None else SWEEP_VERSION
         case Hello(vocabularies=vocabularies) if vocabularies:

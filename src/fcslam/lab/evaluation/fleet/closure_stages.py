@@ -21,12 +21,12 @@ from fcslam.metrics.closures import (
 )
 from fcslam.metrics.relations import PoseTable
 from fcslam.metrics.revisits import RevisitCriteria, Revisits, find_revisits
-from fcslam.records import Channel, ClosureStatus, FloatArray
+from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus, FloatArray
 from fcslam.runs import Run
 
 BOTH = "both"
 CHANNELS: Mapping[str, frozenset[Channel]] = MappingProxyType(
-    {**{str(channel): frozenset({channel}) for channel in Channel}, BOTH: frozenset(Channel)}
+    {**{str(channel): frozenset({channel}) for channel in PLACE_CHANNELS}, BOTH: frozenset(PLACE_CHANNELS)}
 )
 """Sets of channels that are scored: each channel alone, and both together."""
 
@@ -115,5 +115,5 @@ def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
     return _Judged(
         truth, criteria, pairs, closure_errors(pairs, T_i_j, truth, reference),
         np.array([closure.similarity for closure in run.closures]),
-        {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in Channel},
+        {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in PLACE_CHANNELS},
     )  # fmt: skip

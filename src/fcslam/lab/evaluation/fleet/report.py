@@ -21,7 +21,7 @@ from fcslam.metrics.trajectory import (
     position_errors,
     relative_errors,
 )
-from fcslam.records import Channel, FloatArray
+from fcslam.records import PLACE_CHANNELS, Channel, FloatArray
 from fcslam.runs import Run, open_run
 
 
@@ -117,7 +117,7 @@ def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
         across=relative_errors(near_pairs(known.truth, rng, across_robots=True), known.truth, known.estimate),
         closures=score_closures(opened, known, criteria),
         agreement=_agreement(run, folder, alignments),
-        places={channel: _place_traffic(channel, figures) for channel in Channel},
+        places={channel: _place_traffic(channel, figures) for channel in PLACE_CHANNELS},
     )
 
 

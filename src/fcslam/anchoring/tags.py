@@ -1,0 +1,324 @@
+"""Where the tags of a map are, which of them contradict each other, and maps placed by surveyed tags.
+
+The joint graph decided before which sightings count. A tag whose sightings lie in several places was moved or is there
+twice. A robot that sees all tags too near or too far has a wrong calibration, or a wrong size of the tags.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fcslam.cloud.result import MappedRobot
+from fcslam.config import parse_yaml
+from fcslam.errors import SourceError
+from fcslam.geometry import se2
+from fcslam.geometry.alignment import n_point_alignment
+from fcslam.graph.anchored import PosePrior, optimize_anchored
+from fcslam.graph.pose_graph import PoseGraph
+from fcslam.records import FloatArray, Tag, TagFamily, TagSighting, frozen
+from fcslam.untrusted import MOST_TEXT_BYTES, read_text
+
+ONE_VISIT: Final = 40
+"""A session that sees a tag again after more keyscans has come back to it."""
+ELSEWHERE_M: Final = 0.2
+"""Visits that see a tag farther apart contradict each other."""
+FEWEST_SIGHTINGS: Final = 2
+"""A place of a tag that fewer sightings show says nothing."""
+SCALE_ERROR: Final = 0.05
+"""A robot whose distances to tags are off by a larger share is reported."""
+SCALE_SIGMAS: Final = 5.0
+SURVEY_SIGMA_M: Final = 0.02
+"""Standard deviation of a surveyed position."""
+ALIGNED_M: Final = 0.5
+"""A surveyed tag agrees with the map as it is if it lies within this of its place."""
+LARGEST_OFF_M: Final = 0.15
+"""A surveyed tag that is farther off in the solution does not count."""
+BASELINE_M: Final = 1.0
+"""Least distance of two surveyed tags that place a map without their headings."""
+_HEADING_INFORMATION: Final = 1e-6
+_ROUNDS: Final = 3
+
+Survey = Mapping[Tag, tuple[float, float, float | None]]
+"""Position of each surveyed tag and the direction that it faces, metres and radians; None: it is not known."""
+
+
+def read_survey(path: Path) -> Survey:
+    """Read the positions of surveyed tags.
+
+    Raises:
+        SourceError: the file cannot be read or has another form.
+    """
+    try:
+        content = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
+    except ValueError as error:
+        raise SourceError(f"{path}: not YAML: {error}") from error
+    if not isinstance(content, dict) or not isinstance(content.get("tags"), dict) or not content["tags"]:
+        raise SourceError(f"{path}: needs 'tags' with a line for each tag, as 7: {{x: 1.5, y: 0.2, yaw: 1.571}}")
+    unknown = sorted(str(key) for key in content.keys() - {"family", "tags"})
+    if unknown:
+        raise SourceError(f"{path}: '{unknown[0]}' is unknown; it has 'family' and 'tags'")
+    family = content.get("family", TagFamily.APRILTAG_36H11)
+    if family not in tuple(TagFamily):
+        raise SourceError(f"{path}: the family '{family}' is unknown; one of {', '.join(TagFamily)}")
+    return {Tag(TagFamily(family), _number(path, key)): _place(path, key, at) for key, at in content["tags"].items()}
+
+
+def _number(path: Path, key: object) -> int:
+    if not isinstance(key, int) or isinstance(key, bool) or key < 0:
+        raise SourceError(f"{path}: '{key}' is not the number of a tag")
+    return key
+
+
+def _place(path: Path, key: object, at: object) -> tuple[float, float, float | None]:
+    known = {"x", "y", "yaw"}
+    if not isinstance(at, dict) or not {"x", "y"} <= at.keys() <= known:
+        raise SourceError(f"{path}: tag {key} needs x and y in metres, and perhaps yaw in radians; it has {at!r:.60}")
+    for name, value in at.items():
+        if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):
+            raise SourceError(f"{path}: {name} of tag {key} is not a number: {value!r:.60}")
+    yaw = at.get("yaw")
+    return float(at["x"]), float(at["y"]), None if yaw is None else float(yaw)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """A place where a tag was seen."""
+
+    pose: FloatArray
+    """Shape (3,), weighted mean of its sightings."""
+    variance_m2: float
+    """Of its position along each axis."""
+    sightings: tuple[TagSighting, ...]
+
+
+class MapTags:
+    """The tags of one map."""
+
+    def __init__(self, robots: Sequence[MappedRobot], sightings: Sequence[TagSighting]) -> None:
+        """``robots`` of the map; sightings by others do not count."""
+        self._robots = {robot.robot: robot for robot in robots}
+        self._sightings = [one for one in sightings if one.id.robot in self._robots]
+        by_tag: dict[Tag, list[TagSighting]] = {}
+        for one in self._sightings:
+            by_tag.setdefault(one.tag, []).append(one)
+        self.places = {tag: self._places(seen) for tag, seen in sorted(by_tag.items())}
+        """Of each tag, the place with most sightings first."""
+
+    def variable(self, sighting: TagSighting) -> int:
+        """Number of the variable of its keyscan."""
+        return int(self._robots[sighting.id.robot].variables[sighting.id.number])
+
+    def of(self, tags: Sequence[Tag]) -> list[TagSighting]:
+        """Sightings of these tags at their first places."""
+        return [one for tag in tags for one in self.places[tag][0].sightings]
+
+    def _pose(self, sighting: TagSighting) -> FloatArray:
+        robot, keyscan = sighting.id
+        return se2.compose(self._robots[robot].T_map_base[keyscan], sighting.T_base_tag)
+
+    def _places(self, seen: Sequence[TagSighting]) -> list[_Place]:
+        """Places at which visits saw one tag; those that lie within ``ELSEWHERE_M`` are one."""
+        groups: list[list[TagSighting]] = []
+        for one in sorted(seen, key=lambda one: one.id):
+            last = groups[-1][-1] if groups else None
+            if last is None or not self._is_one_visit(last, one):
+                groups.append([])
+            groups[-1].append(one)
+        places: list[_Place] = []
+        for visit in sorted((self._mean(group) for group in groups), key=lambda place: -len(place.sightings)):
+            near = next((k for k, other in enumerate(places) if _gap_m(other, visit) <= ELSEWHERE_M), None)
+            if near is None:
+                places.append(visit)
+            else:
+                places[near] = self._mean([*places[near].sightings, *visit.sightings])
+        return sorted(places, key=lambda place: -len(place.sightings))
+
+    def _is_one_visit(self, before: TagSighting, after: TagSighting) -> bool:
+        gap_m = float(np.hypot(*(self._pose(before) - self._pose(after))[:2]))
+        is_soon = before.id.robot == after.id.robot and after.id.number - before.id.number <= ONE_VISIT
+        return is_soon and gap_m <= 2.0 * ELSEWHERE_M
+
+    def _mean(self, sightings: Sequence[TagSighting]) -> _Place:
+        poses = np.array([self._pose(one) for one in sightings])
+        covariances = np.array([np.linalg.inv(one.information) for one in sightings])
+        variances, turns = covariances[:, :2, :2].trace(axis1=1, axis2=2) / 2.0, covariances[:, 2, 2]
+        xy = np.average(poses[:, :2], axis=0, weights=1.0 / variances)
+        heading = np.arctan2(*((np.sin(poses[:, 2]) / turns).sum(), (np.cos(poses[:, 2]) / turns).sum()))
+        return _Place(np.append(xy, heading), float(1.0 / (1.0 / variances).sum()), tuple(sightings))
+
+    def report(self, k: int) -> list[dict[str, Any]]:
+        """What ``tags.json`` says about the tags of map ``k``."""
+        rows = []
+        for tag, places in self.places.items():
+            shown = [place for place in places if len(place.sightings) >= FEWEST_SIGHTINGS] or places[:1]
+            x, y, heading = shown[0].pose.tolist()
+            rows.append(
+                {
+                    "family": tag.family, "number": tag.number, "map": k, "x": round(x, 3), "y": round(y, 3),
+                    "heading_rad": round(heading, 4),
+                    "sightings": sum(len(place.sightings) for place in places),
+                    "doubtful": len(shown) > 1,
+                    "places": [
+                        {
+                            "x": round(float(place.pose[0]), 3), "y": round(float(place.pose[1]), 3),
+                            "robots": sorted({one.id.robot for one in place.sightings}),
+                        }
+                        for place in shown
+                    ],
+                }
+            )  # fmt: skip
+        return rows
+
+    def scales(self) -> dict[str, float]:
+        """By robot, its measured distances to tags as a share of the true ones, if they are clearly wrong."""
+        found = {}
+        for robot in self._robots:
+            moment = product = 0.0
+            for places in self.places.values():
+                for place in places:
+                    own = [one for one in place.sightings if one.id.robot == robot]
+                    if len(own) > 1:
+                        parts = self._scale_terms(own)
+                        moment, product = moment + parts[0], product + parts[1]
+            scale = 1.0 - product / moment if moment > 0.0 else 1.0
+            sigma = moment**-0.5 if moment > 0.0 else np.inf
+            if scale > 0.0 and abs(scale - 1.0) > max(SCALE_ERROR, SCALE_SIGMAS * sigma):
+                found[robot] = 1.0 / scale
+        return found
+
+    def _scale_terms(self, seen: Sequence[TagSighting]) -> tuple[float, float]:
+        """Sums of the weighted squares of the distances to one tag, and of their products with the residuals; both
+        without the part that another position of the tag explains."""
+        bases = np.array([self._robots[one.id.robot].T_map_base[one.id.number, :2] for one in seen])
+        ends = np.array([self._pose(one)[:2] for one in seen])
+        weights = np.array([2.0 / np.linalg.inv(one.information)[:2, :2].trace() for one in seen])
+        arms = ends - bases
+        arms = arms - np.average(arms, axis=0, weights=weights)
+        off = ends - np.average(ends, axis=0, weights=weights)
+        return float(weights @ (arms**2).sum(axis=1)), float(weights @ (arms * off).sum(axis=1))
+
+
+def _gap_m(a: _Place, b: _Place) -> float:
+    return float(np.hypot(*(a.pose[:2] - b.pose[:2])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surveyed:
+    """A map in the coordinates of surveyed tags."""
+
+    robots: tuple[MappedRobot, ...]
+    graph: PoseGraph
+    used: tuple[Tag, ...]
+    off_m: Mapping[Tag, float]
+    """How far each surveyed tag that was seen is from where it should be."""
+    refusal: str = ""
+    """Why the map is not placed; empty if it is."""
+
+    def report(self) -> dict[str, Any]:
+        """What ``tags.json`` says about it."""
+        ignored = {str(tag.number): round(off_m, 3) for tag, off_m in self.off_m.items() if tag not in self.used}
+        return {"reason": self.refusal, "used": [tag.number for tag in self.used], "ignored": ignored}
+
+
+def placed_by_tags(
+    robots: tuple[MappedRobot, ...], graph: PoseGraph, sightings: Sequence[TagSighting], survey: Survey
+) -> Surveyed:
+    """Place a map by surveyed tags, and straighten it. Tags that are not where they should be do not count.
+
+    Args:
+        robots: the robots of the map.
+        graph: the graph of these alone.
+        sightings: of all tags.
+        survey: where tags are.
+    """
+    tags = MapTags(robots, sightings)
+    known = [tag for tag in tags.places if tag in survey]
+    if not known:
+        return Surveyed(robots, graph, (), {}, "no robot in it saw a surveyed tag")
+    T, used = _aligned({tag: tags.places[tag][0].pose for tag in known}, survey)
+    if T is None:
+        refusal = (
+            "the tags that were seen are not as far apart as the surveyed ones"
+            if len(known) > 1
+            else "one tag without yaw fixes no heading; give its yaw, or survey a second tag"
+        )
+        return Surveyed(robots, graph, (), {}, refusal)
+    start = se2.compose(T, graph.poses())
+    while True:
+        poses = _solve(graph, start, tags, used, survey)
+        moved = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in robots)
+        places = MapTags(moved, sightings).places
+        off_m = {tag: float(np.hypot(*(places[tag][0].pose[:2] - np.array(survey[tag][:2])))) for tag in known}
+        worst = max(used, key=lambda tag: off_m[tag])
+        if off_m[worst] <= LARGEST_OFF_M or len(used) <= 2:
+            return Surveyed(moved, PoseGraph(poses, list(graph.edges)), tuple(used), off_m)
+        used = [tag for tag in used if tag != worst]
+
+
+def _aligned(seen: Mapping[Tag, FloatArray], survey: Survey) -> tuple[FloatArray | None, list[Tag]]:
+    """The motion of the map with which most surveyed tags agree, and these."""
+    motions = [
+        n_point_alignment(np.array([survey[a][:2], survey[b][:2]]), np.array([seen[a][:2], seen[b][:2]]))
+        for a, b in combinations(seen, 2)
+        if np.hypot(*(seen[a][:2] - seen[b][:2])) >= BASELINE_M
+    ]
+    least = 2
+    if not motions:
+        faced = [(survey[tag], seen[tag]) for tag in seen if survey[tag][2] is not None]
+        motions = [se2.compose(np.array(there), se2.inverse(here)) for there, here in faced]
+        least = 1
+    best: tuple[FloatArray | None, list[Tag]] = None, []
+    for T in motions:
+        off_m = {tag: float(np.hypot(*(se2.compose(T, seen[tag])[:2] - survey[tag][:2]))) for tag in seen}
+        agreeing = [tag for tag in seen if off_m[tag] <= ALIGNED_M]
+        if len(agreeing) >= max(least, len(best[1]) + 1):
+            best = T, agreeing
+    return best
+
+
+def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Tag], survey: Survey) -> FloatArray:
+    """Solve with the positions of surveyed tags; all sightings of a tag count as one measurement."""
+    if len(used) < 2:
+        return poses
+    sightings = tags.of(used)
+    counts = {tag: len(tags.places[tag][0].sightings) for tag in used}
+    for _ in range(_ROUNDS):
+        priors = []
+        for one in sightings:
+            variable = tags.variable(one)
+            arm = se2.compose(np.array((0.0, 0.0, poses[variable, 2])), one.T_base_tag)[:2]
+            variance = np.linalg.inv(one.information)[:2, :2].trace() / 2.0 + SURVEY_SIGMA_M**2
+            weight = 1.0 / (variance * counts[one.tag])
+            pose = np.append(np.array(survey[one.tag][:2]) - arm, poses[variable, 2])
+            priors.append(PosePrior(variable, pose, np.diag((weight, weight, _HEADING_INFORMATION))))
+        poses = optimize_anchored(graph, poses, priors)
+    return poses
+
+
+def tag_lines(report: Mapping[str, Any]) -> Iterator[str]:
+    """What ``tags.json`` says that a user should know, one sentence each."""
+    for row in report["tags"]:
+        if row["doubtful"]:
+            places = [f"{', '.join(at['robots'])} at ({at['x']:.2f}, {at['y']:.2f})" for at in row["places"]]
+            gap_m = max(float(np.hypot(a["x"] - b["x"], a["y"] - b["y"])) for a, b in combinations(row["places"], 2))
+            yield (
+                f"tag {row['family']} {row['number']} was moved or is there twice: seen by {' and by '.join(places)}, "
+                f"{gap_m:.2f} m apart"
+            )
+    for robot, scale in report["distances"].items():
+        yield (
+            f"{robot} measures tags at {scale:.2f} times their distance; check robot.tags.size_m and the camera's "
+            "calibration"
+        )
+    for row in report.get("surveyed", ()):
+        if row["reason"]:
+            yield f"map {row['map']} is not placed by surveyed tags: {row['reason']}"
+            continue
+        yield f"map {row['map']} is placed by surveyed tags: {', '.join(map(str, row['used']))}"
+        for number, off_m in row["ignored"].items():
+            yield f"tag {number} is {off_m:.2f} m from where it was surveyed, and does not count"

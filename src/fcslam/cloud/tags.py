@@ -1,0 +1,129 @@
+"""Tags that robots saw: two keyscans that saw the same tag are a closure, as two that match by their walls.
+
+A tag seen in two sessions is a candidate of the joint map and passes the same decisions. Seen twice by one session, it
+is a closure within its map. In both cases the joint graph may contradict it: the tag was moved, is there twice, or a
+camera is calibrated wrongly.
+"""
+
+from collections.abc import Collection
+from itertools import islice
+
+import numpy as np
+
+from fcslam.cloud.claims import check_sighting, with_least_noise
+from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.session_store import SessionStore
+from fcslam.errors import PacketError
+from fcslam.geometry import se2
+from fcslam.places.matcher import PlaceMatch
+from fcslam.records import (
+    Channel,
+    Constraint,
+    ConstraintKind,
+    FloatArray,
+    KeyscanId,
+    Reason,
+    ReasonCode,
+    Tag,
+    TagFamily,
+    TagSighting,
+    frozen,
+)
+from fcslam.storage.state_file import State
+
+MOST_SESSIONS = 10
+"""Other sessions, the newest ones, that a new sighting is paired with."""
+REVISIT_M = 10.0
+"""Path after which a session that sees a tag again has come back to it."""
+
+
+class SeenTags:
+    """The sightings of every tag, by session."""
+
+    def __init__(self, sessions: SessionStore, graph: JointGraph) -> None:
+        self._sessions = sessions
+        self._graph = graph
+        self._seen: dict[Tag, dict[str, dict[int, TagSighting]]] = {}
+        """By tag, session and keyscan."""
+        self._paired: dict[Tag, set[tuple[KeyscanId, str]]] = {}
+        """By tag, each keyscan and the session with which it has a closure: one at most, so that the errors of a
+        sighting are in one closure."""
+
+    def add(self, sighting: TagSighting) -> list[PlaceMatch]:
+        """Note a sighting; returns its closures with earlier ones.
+
+        Raises:
+            PacketError: its keyscan is not there or saw the tag before, or the tag is too far away.
+        """
+        self._sessions.require(sighting.id)
+        check_sighting(sighting)
+        session, number = sighting.id
+        seen = self._seen.setdefault(sighting.tag, {})
+        own = seen.setdefault(session, {})
+        if number in own:
+            raise PacketError(f"{session}: keyscan {number} saw tag {sighting.tag} before")
+        others = (name for name in reversed(seen) if name != session and self._share_floor(name, session))
+        chosen = [(name, seen[name].values()) for name in islice(others, MOST_SESSIONS)]
+        back_m = self._graph.travel_since(session)
+        earlier = [one for k, one in own.items() if k < number and back_m[k] - back_m[number] >= REVISIT_M]
+        paired = self._paired.setdefault(sighting.tag, set())
+        matches = []
+        for name, sightings in (*chosen, (session, earlier)):
+            free = [one for one in sightings if (one.id, session) not in paired]
+            if free:
+                partner = max(free, key=lambda one: float(np.linalg.det(one.information)))
+                paired |= {(partner.id, session), (sighting.id, name)}
+                matches.append(_match(partner, sighting))
+        own[number] = sighting
+        return matches
+
+    def of(self, sessions: Collection[str]) -> tuple[TagSighting, ...]:
+        """All sightings of these sessions, by tag."""
+        return tuple(
+            one
+            for tag in sorted(self._seen)
+            for session in sorted(self._seen[tag].keys() & set(sessions))
+            for one in self._seen[tag][session].values()
+        )
+
+    def state(self) -> State:
+        """The state that ``restore`` needs; empty without sightings."""
+        rows = [one for sessions in self._seen.values() for own in sessions.values() for one in own.values()]
+        if not rows:
+            return {}
+        return {
+            "tags": [(*one.id, *one.tag) for one in rows],
+            "T_base_tag": np.array([one.T_base_tag for one in rows]),
+            "tag_information": np.array([one.information for one in rows]),
+            "tag_pairs": [(*tag, *one, name) for tag, pairs in self._paired.items() for one, name in sorted(pairs)],
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over what ``state`` gave."""
+        if "tags" not in state:
+            return
+        rows = zip(state["tags"], frozen(state["T_base_tag"]), frozen(state["tag_information"]), strict=True)
+        for (session, keyscan, family, number), T_base_tag, information in rows:
+            tag = Tag(TagFamily(family), number)
+            sighting = TagSighting(KeyscanId(session, keyscan), tag, T_base_tag, information)
+            self._seen.setdefault(tag, {}).setdefault(session, {})[keyscan] = sighting
+        for family, number, session, keyscan, name in state["tag_pairs"]:
+            pair = KeyscanId(session, keyscan), name
+            self._paired.setdefault(Tag(TagFamily(family), number), set()).add(pair)
+
+    def _share_floor(self, a: str, b: str) -> bool:
+        return self._sessions.floor(a) == self._sessions.floor(b)
+
+
+def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:
+    """The closure of two sightings."""
+    T_i_j: FloatArray = frozen(se2.compose(i.T_base_tag, se2.inverse(j.T_base_tag)))
+    moved = se2.adjoint(j.T_base_tag)
+    covariance = moved @ (np.linalg.inv(i.information) + np.linalg.inv(j.information)) @ moved.T
+    information = np.linalg.inv(0.5 * (covariance + covariance.T))
+    robot, kind = j.id.robot, ConstraintKind.CLOSURE
+    measured = Constraint(robot, 0, 1, kind, T_i_j, frozen(0.5 * (information + information.T)))
+    return PlaceMatch(
+        i.id, j.id, Channel.TAG, 1.0, M=True, reason=Reason(ReasonCode.SAME_TAG, j.tag.number), T_i_j=T_i_j,
+        information=with_least_noise(measured).information, informative=True, explained=0.0, predicted=False, tag=j.tag,
+    )  # fmt: skip
