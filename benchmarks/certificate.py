@@ -5,7 +5,8 @@
 Two robots drive through each building; it is mapped with the default configuration. A cell of 1 m2 is good to 5 cm if
 the positions within 10 m, as seen from the nearest keyscan, have a smaller root mean square error. `SCALE` and
 `QUANTILE` of `fcslam.maps.certificate` were chosen on the seeds 0 to 5 (`--first 0 --seeds 6`), `CONTRADICTED` on weak
-scanners in other kinds of buildings, with drives in the buildings 100 and 101, too. Fit: the ratio of true to expected errors, median and 95 %.
+scanners in other kinds of buildings, with drives in the buildings 100 and 101, too. Fit: the ratio of true to expected
+errors, median and 95 %.
 
 The good scanner sees 12 m far, with noise of 0.015 m. The weak one sees 3 m far, with noise of 0.06 m, on one
 robot: its maps are worse than 5 cm. Logs: pairs of scans up to 10 m apart whose relation is known, and the
