@@ -222,21 +222,26 @@ class ServedJointMaps:
         return (live.pose, live.said_s) if is_credible else (session.pose, session.heard_s)
 
     def explorations(self, maps: JointMaps, now_s: float) -> dict[int, Exploration]:
-        """The frontiers of each map, about ``ASSIGN_EVERY_S`` old at most; of large maps older.
+        """The frontiers of each map, about ``ASSIGN_EVERY_S`` old at most; of large maps older. None before the first.
 
         Args:
             maps: as ``follow`` returns them.
             now_s: seconds since 1970.
         """
-        with self._exploring:
-            made_s, until_s, found = self._explorations
-            if not (made_s <= now_s < until_s and found.keys() == maps.grids.keys()):
-                began_s = time.perf_counter()
-                self._explorers = {frame: self._explorers.get(frame, Explorer()) for frame in maps.frames.values()}
-                found = {number: self._explored(maps, number, now_s) for number in maps.grids}
-                spent_s = time.perf_counter() - began_s
-                self._explorations = now_s, now_s + max(ASSIGN_EVERY_S, spent_s / ASSIGN_SHARE), found
+        made_s, until_s, found = self._explorations
+        is_fresh = made_s <= now_s < until_s and found.keys() == maps.grids.keys()
+        # While one request makes them, others get the ones before, and hold no thread.
+        if is_fresh or not self._exploring.acquire(blocking=False):
             return found
+        try:
+            began_s = time.perf_counter()
+            self._explorers = {frame: self._explorers.get(frame, Explorer()) for frame in maps.frames.values()}
+            found = {number: self._explored(maps, number, now_s) for number in maps.grids}
+            spent_s = time.perf_counter() - began_s
+            self._explorations = now_s, now_s + max(ASSIGN_EVERY_S, spent_s / ASSIGN_SHARE), found
+        finally:
+            self._exploring.release()
+        return found
 
     def _explored(self, maps: JointMaps, number: int, now_s: float) -> Exploration:
         poses = {one.robot: self.pose(one) for one in maps.sessions if one.map == number}
