@@ -183,17 +183,26 @@ def _returns(sample: _Sample) -> FloatArray:
 def _overflows(samples: Sequence[_Sample]) -> bool:
     """Whether the ranges go on at 0 after the largest one."""
     largest = max((_returns(one).max(initial=0.0) for one in samples), default=0.0)
-    values = np.concatenate([np.append(one.values, np.nan) for one in samples]).astype(np.float64)
-    one, other = np.concatenate((values[:-1], values[1:])), np.concatenate((values[1:], values[:-1]))
-    with np.errstate(invalid="ignore"):
-        known = (np.minimum(one, other) > 0.0) & (np.maximum(one, other) <= largest)
-    one, other = one[known], other[known]
-    is_top = one > _TOP * largest
-    ends = is_top & (other < _BOTTOM * largest)
-    if np.count_nonzero(ends) <= max(_OVERFLOWS * np.count_nonzero(is_top), _FEWEST_OVERFLOWS):
+    tops, ends = 0, []
+    for sample in samples:
+        one, other = _neighbours(sample, largest)
+        is_top = one > _TOP * largest
+        tops += int(np.count_nonzero(is_top))
+        ends.append(np.stack((one, other))[:, is_top & (other < _BOTTOM * largest)])
+    found = np.concatenate(ends, axis=1) if ends else np.empty((2, 0))
+    if found.shape[1] <= max(_OVERFLOWS * tops, _FEWEST_OVERFLOWS):
         return False
-    is_smooth = np.median(np.abs(one - other)) < _SMOOTH * largest
-    return bool(is_smooth) and all(len(np.unique(each[ends])) >= _FEWEST_ENDS for each in (one, other))
+    steps_m = np.concatenate([np.abs(np.subtract(*_neighbours(sample, largest))) for sample in samples])
+    return bool(np.median(steps_m) < _SMOOTH * largest) and all(len(np.unique(each)) >= _FEWEST_ENDS for each in found)
+
+
+def _neighbours(sample: _Sample, largest: float) -> tuple[Ranges, Ranges]:
+    """Returns side by side, each pair in both orders, shapes (N,)."""
+    values = sample.values
+    with np.errstate(invalid="ignore"):
+        known = (values > 0.0) & (values <= largest)
+    first, second = (values[part][known[:-1] & known[1:]] for part in (slice(-1), slice(1, None)))
+    return np.concatenate((first, second)), np.concatenate((second, first))
 
 
 def _is_beyond(sample: _Sample) -> np.ndarray:

@@ -21,7 +21,7 @@ STEPS = 151
 """Of each robot: 15 m, 0.5 m/s."""
 T_BUILDING_MAP = np.array([3.0, -1.0, 0.7])
 CANDIDATE, VERIFIED, ACCEPTED, REJECTED, REVOKED = ClosureStatus
-LIDAR, CAMERA = Channel
+LIDAR, CAMERA = Channel.LIDAR, Channel.CAMERA
 
 
 def truth(robot):
