@@ -9,6 +9,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.tags import MOST_CLOSURES, MOST_OF_TAG, MOST_TAGS
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.records import (
@@ -118,6 +119,40 @@ def test_a_tag_that_is_there_twice_joins_no_maps_that_contradict_each_other():
     assert len(set(map_of(result).values())) == 2
     (reason,) = {closure.reason.code for closure in result.closures}
     assert reason is ReasonCode.MAPS_CONTRADICT
+
+
+@pytest.mark.parametrize("length_m", [4.0, 7.5])
+def test_a_tag_is_one_place_from_wherever_it_is_seen(length_m):
+    """So a long way to a tag that is there twice is no more evidence than a short one."""
+    west = line((9.0 - length_m, 2.0), (9.0, 2.0), 0.0)
+    far = [
+        *drive("anna", west, [(TAG, AT, len(west))]),
+        *drive("berta", west, [(TAG, AT, len(west))], OTHER_WALLS, start_s=0.5, seed=1),
+    ]
+    assert len(set(map_of(concluded(far)).values())) == 2
+
+
+def test_many_sessions_of_one_robot_hide_a_tag_from_nobody():
+    anna, berta = (drive(name, way, [(TAG, AT, 5)]) for name, way in (("anna", SOUTH), ("berta", NORTH)))
+    zed = [
+        replace(packet, epoch=n, time=100.0 * (n + 1) + packet.time)
+        for n in range(10)
+        for packet in drive("zed", SOUTH, [(TAG, AT, 1)])
+    ]
+    late = [replace(packet, time=5000.0 + packet.time) for packet in berta]
+    result = concluded([*anna, *zed, *late])
+    assert sum({c.i.robot, c.j.robot} == {"anna", "berta"} for c in result.closures) == 5
+
+
+def test_tags_and_their_closures_are_limited():
+    many = [(Tag(TAG.family, number), AT, 9) for number in range(MOST_TAGS + 1)]
+    with pytest.raises(PacketError, match="saw more than 32 tags"):
+        concluded(drive("anna", SOUTH, many))
+    often = [(tag, AT, len(LOOP)) for tag, _, _ in many[:20]]
+    result = concluded([*drive("anna", LOOP, often), *drive("berta", LOOP, often)])
+    between = [closure.tag for closure in result.closures if closure.i.robot != closure.j.robot]
+    assert len(between) == MOST_CLOSURES
+    assert max(map(between.count, between)) <= MOST_OF_TAG
 
 
 def test_a_veto_keeps_them_apart():

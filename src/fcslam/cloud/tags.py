@@ -5,6 +5,7 @@ is a closure within its map. In both cases the joint graph may contradict it: th
 camera is calibrated wrongly.
 """
 
+from collections import Counter
 from collections.abc import Collection
 from itertools import islice
 
@@ -13,6 +14,7 @@ import numpy as np
 from fcslam.cloud.claims import check_sighting, with_least_noise
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
+from fcslam.cloud.sessions import robot_of
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
@@ -31,8 +33,12 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 
-MOST_SESSIONS = 10
-"""Other sessions, the newest ones, that a new sighting is paired with."""
+MOST_SENDERS = 10
+"""Robots, those that saw the tag last, whose newest session a new sighting is paired with."""
+MOST_TAGS = 32
+"""Tags that one keyscan sees at most."""
+MOST_OF_TAG, MOST_CLOSURES = 20, 200
+"""Closures between two sessions by one tag, and by all tags: their cost grows with the square."""
 REVISIT_M = 10.0
 """Path after which a session that sees a tag again has come back to it."""
 
@@ -48,12 +54,16 @@ class SeenTags:
         self._paired: dict[Tag, set[tuple[KeyscanId, str]]] = {}
         """By tag, each keyscan and the session with which it has a closure: one at most, so that the errors of a
         sighting are in one closure."""
+        self._tags: Counter[KeyscanId] = Counter()
+        """Number of tags of each keyscan."""
+        self._ends: Counter[tuple[Tag | None, frozenset[str]]] = Counter()
+        """Ends of closures between two sessions, by tag; None: by all tags."""
 
     def add(self, sighting: TagSighting) -> list[PlaceMatch]:
         """Note a sighting; returns its closures with earlier ones.
 
         Raises:
-            PacketError: its keyscan is not there or saw the tag before, or the tag is too far away.
+            PacketError: its keyscan is not there, saw the tag before or saw too many, or the tag is too far away.
         """
         self._sessions.require(sighting.id)
         check_sighting(sighting)
@@ -62,19 +72,26 @@ class SeenTags:
         own = seen.setdefault(session, {})
         if number in own:
             raise PacketError(f"{session}: keyscan {number} saw tag {sighting.tag} before")
-        others = (name for name in reversed(seen) if name != session and self._share_floor(name, session))
-        chosen = [(name, seen[name].values()) for name in islice(others, MOST_SESSIONS)]
+        if self._tags[sighting.id] >= MOST_TAGS:
+            raise PacketError(f"{session}: keyscan {number} saw more than {MOST_TAGS} tags")
+        newest: dict[str, str] = {}
+        for name in reversed(seen):
+            if name != session and self._share_floor(name, session):
+                newest.setdefault(robot_of(name), name)
+        chosen = [(name, seen[name].values()) for name in islice(newest.values(), MOST_SENDERS)]
         back_m = self._graph.travel_since(session)
         earlier = [one for k, one in own.items() if k < number and back_m[k] - back_m[number] >= REVISIT_M]
         paired = self._paired.setdefault(sighting.tag, set())
         matches = []
         for name, sightings in (*chosen, (session, earlier)):
             free = [one for one in sightings if (one.id, session) not in paired]
-            if free:
+            if free and not self._is_full(sighting.tag, session, name):
                 partner = max(free, key=lambda one: float(np.linalg.det(one.information)))
                 paired |= {(partner.id, session), (sighting.id, name)}
+                self._count(sighting.tag, session, name, ends=2)
                 matches.append(_match(partner, sighting))
         own[number] = sighting
+        self._tags[sighting.id] += 1
         return matches
 
     def of(self, sessions: Collection[str]) -> tuple[TagSighting, ...]:
@@ -107,9 +124,21 @@ class SeenTags:
             tag = Tag(TagFamily(family), number)
             sighting = TagSighting(KeyscanId(session, keyscan), tag, T_base_tag, information)
             self._seen.setdefault(tag, {}).setdefault(session, {})[keyscan] = sighting
+            self._tags[sighting.id] += 1
         for family, number, session, keyscan, name in state["tag_pairs"]:
             pair = KeyscanId(session, keyscan), name
-            self._paired.setdefault(Tag(TagFamily(family), number), set()).add(pair)
+            tag = Tag(TagFamily(family), number)
+            self._paired.setdefault(tag, set()).add(pair)
+            self._count(tag, session, name, ends=1)
+
+    def _is_full(self, tag: Tag, a: str, b: str) -> bool:
+        """Whether two sessions have as many closures by a tag, or by all, as may be."""
+        pair = frozenset((a, b))
+        return self._ends[tag, pair] >= 2 * MOST_OF_TAG or self._ends[None, pair] >= 2 * MOST_CLOSURES
+
+    def _count(self, tag: Tag, a: str, b: str, ends: int) -> None:
+        for key in (tag, None):
+            self._ends[key, frozenset((a, b))] += ends
 
     def _share_floor(self, a: str, b: str) -> bool:
         return self._sessions.floor(a) == self._sessions.floor(b)

@@ -88,8 +88,15 @@ def decide_cluster(
 
 
 def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """Positions of both ends of K closures, shape (K, 2, 2), metres; row 0 in the frame of a, row 1 in that of b."""
-    return np.stack((a.poses[closures.i, :2], b.poses[closures.j, :2]), axis=1)
+    """Positions of both ends of K closures, shape (K, 2, 2), metres; row 0 in the frame of a, row 1 in that of b.
+
+    Closures by one tag are one place, from wherever it is seen: all have the position of the first of them.
+    """
+    first = np.arange(len(closures))
+    for tag in np.unique(closures.tags[closures.tags > 0]):
+        rows = np.flatnonzero(closures.tags == tag)
+        first[rows] = rows[0]
+    return np.stack((a.poses[closures.i[first], :2], b.poses[closures.j[first], :2]), axis=1)
 
 
 def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
