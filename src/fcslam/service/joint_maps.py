@@ -174,8 +174,8 @@ class ServedJointMaps:
         self._exploring = threading.Lock()
         self._explorers: dict[str, Explorer] = {}
         """By frame."""
-        self._explorations: tuple[float, float, dict[int, Exploration]] = -math.inf, -math.inf, {}
-        """When they were made, until when they count, and by number of the map."""
+        self._explorations: tuple[float, float, dict[str, Exploration]] = -math.inf, -math.inf, {}
+        """When they were made, until when they count, and by frame: a map may change its number, or its frame."""
 
     def follow(self, path: Path) -> JointMaps:
         """The joint maps in a file as they are now; those without content before there is one.
@@ -229,19 +229,18 @@ class ServedJointMaps:
             now_s: seconds since 1970.
         """
         made_s, until_s, found = self._explorations
-        is_fresh = made_s <= now_s < until_s and found.keys() == maps.grids.keys()
+        is_fresh = made_s <= now_s < until_s and found.keys() == set(maps.frames.values())
         # While one request makes them, others get the ones before, and hold no thread.
-        if is_fresh or not self._exploring.acquire(blocking=False):
-            return found
-        try:
-            began_s = time.perf_counter()
-            self._explorers = {frame: self._explorers.get(frame, Explorer()) for frame in maps.frames.values()}
-            found = {number: self._explored(maps, number, now_s) for number in maps.grids}
-            spent_s = time.perf_counter() - began_s
-            self._explorations = now_s, now_s + max(ASSIGN_EVERY_S, spent_s / ASSIGN_SHARE), found
-        finally:
-            self._exploring.release()
-        return found
+        if not is_fresh and self._exploring.acquire(blocking=False):
+            try:
+                began_s = time.perf_counter()
+                self._explorers = {frame: self._explorers.get(frame, Explorer()) for frame in maps.frames.values()}
+                found = {frame: self._explored(maps, number, now_s) for number, frame in maps.frames.items()}
+                spent_s = time.perf_counter() - began_s
+                self._explorations = now_s, now_s + max(ASSIGN_EVERY_S, spent_s / ASSIGN_SHARE), found
+            finally:
+                self._exploring.release()
+        return {number: found[frame] for number, frame in maps.frames.items() if frame in found}
 
     def _explored(self, maps: JointMaps, number: int, now_s: float) -> Exploration:
         poses = {one.robot: self.pose(one) for one in maps.sessions if one.map == number}

@@ -1,0 +1,46 @@
+"""Who explores which frontier of the joint maps, as the service says it."""
+
+import numpy as np
+
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.service.joint_maps import JointMaps, JointSession, ServedJointMaps
+
+
+def room(open_side):
+    """A room of 4 m that is open on one side: -1 to the left, 0 to the right."""
+    cells = np.full((42, 42), Occupancy.OCCUPIED, np.uint8)
+    cells[1:-1, 1:-1] = Occupancy.FREE
+    cells[1:-1, open_side] = Occupancy.FREE
+    return OccupancyMap(cells, 0.1, (0.0, 0.0))
+
+
+def session(robot, number):
+    return JointSession(robot, 0, number, "", (2.0, 2.0, 0.0), 10.0, 1000.0)
+
+
+A, B = room(-1), room(0)
+
+
+def test_frontiers_follow_a_map_that_changes_its_number():
+    served = ServedJointMaps()
+    before = JointMaps([session("a", 0), session("b", 1)], {0: A, 1: B}, {0: "frame a", 1: "frame b"}, 0.2)
+    first = served.explorations(before, 1000.0)
+    assert first[0].goals["a"].point[0] > 3.5
+    assert first[1].goals["b"].point[0] < 0.5
+    after = JointMaps([session("b", 0), session("a", 1)], {0: B, 1: A}, {0: "frame b", 1: "frame a"}, 0.2)
+    assert served.explorations(after, 1001.0) == {0: first[1], 1: first[0]}
+
+
+def test_frontiers_of_a_frame_that_is_gone_are_not_served():
+    served = ServedJointMaps()
+    served.explorations(JointMaps([session("a", 0)], {0: A}, {0: "frame"}, 0.2), 1000.0)
+    turned = JointMaps([session("a", 0)], {0: B}, {0: "another frame"}, 0.2)
+    assert served.explorations(turned, 1001.0)[0].goals["a"].point[0] < 0.5
+
+
+def test_frontiers_are_kept_for_some_seconds():
+    served = ServedJointMaps()
+    maps = JointMaps([session("a", 0)], {0: A}, {0: "frame"}, 0.2)
+    first, second, later = (served.explorations(maps, now_s)[0] for now_s in (1000.0, 1004.0, 1100.0))
+    assert first is second
+    assert later is not first
