@@ -78,6 +78,16 @@ def test_a_back_end_that_dies_is_an_error(logs, monkeypatch):
         list(legs)
 
 
+def test_an_error_of_the_back_end_is_raised_as_it_is(logs, monkeypatch):
+    def fail(*_):
+        raise AssertionError("of the back end")
+
+    monkeypatch.setattr(RobotBackend, "process", fail)
+    with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,), pytest.raises(AssertionError) as caught:
+        list(legs)
+    assert "in fail" in str(caught.value.__cause__)  # the traceback of the other process
+
+
 def test_one_robot_needs_no_second_process(logs, monkeypatch):
     def refuse_process(*_):
         raise InputError("/dev/shm")

@@ -8,6 +8,7 @@ import queue
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from multiprocessing.process import BaseProcess
@@ -111,7 +112,7 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     """Drive one robot over its whole recording.
 
     Raises:
-        FcslamError: the process of its back end ended.
+        FcslamError: the process of its back end ended; errors of the back end itself are raised as they are.
     """
     packets: list[SizedPacket] = []
     stamps: list[float] = []
@@ -135,8 +136,15 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
 
 
 def _check_backend(robot: RobotFrontend) -> None:
-    if robot.backend_failure is not None:
-        raise FcslamError(f"{robot.robot}: the process that closes loops ended ({robot.backend_failure})")
+    match robot.backend_error:
+        case None:
+            return
+        case BrokenExecutor():
+            raise FcslamError(
+                f"{robot.robot}: the process that closes loops ended; if memory ran out, use fewer cores (taskset)"
+            ) from robot.backend_error
+        case error:
+            raise error
 
 
 def on_floor(legs: Iterator[Leg], floor: str) -> Iterator[Leg]:

@@ -6,8 +6,8 @@ definition of another topic does no harm.
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from heapq import merge
@@ -129,12 +129,16 @@ class BagFile:
         """
         numbers: Counter[Topic] = Counter()
         order = PartOrder()
-        streams = [zip(repeat(part), part.messages(topics), strict=False) for part in self._parts]
-        for part, (topic, bag_time_ns, payload) in merge(*streams, key=lambda found: found[1][1]):
-            if len(streams) > 1 and topic.type in SCANS:
-                order.check(topic.name, part.path, bag_time_ns)
-            numbers[topic] += 1
-            yield RawMessage(topic, numbers[topic], bag_time_ns, payload)
+        with ExitStack() as opened:  # a reader that stops early must not leave a part open
+            streams = [
+                zip(repeat(part), opened.enter_context(closing(part.messages(topics))), strict=False)
+                for part in self._parts
+            ]
+            for part, (topic, bag_time_ns, payload) in merge(*streams, key=lambda found: found[1][1]):
+                if len(streams) > 1 and topic.type in SCANS:
+                    order.check(topic.name, part.path, bag_time_ns)
+                numbers[topic] += 1
+                yield RawMessage(topic, numbers[topic], bag_time_ns, payload)
 
     def decode(self, message: RawMessage) -> Any:
         """Decode a message to an object of rosbags.
@@ -227,7 +231,7 @@ class _Part:
         """Whether it is a bag of ROS 1."""
         return self._magic.startswith(_ROS1)
 
-    def messages(self, topics: Sequence[Topic]) -> Iterator[tuple[Topic, int, bytes]]:
+    def messages(self, topics: Sequence[Topic]) -> Generator[tuple[Topic, int, bytes], None, None]:
         """The messages of ``topics``: by the index, and without it from where it proves wrong."""
         count = times = 0
         try:
