@@ -77,6 +77,31 @@ def test_one_tag_places_a_map_by_its_yaw_alone():
     assert lines(plain)[0].startswith("map 0 is not placed by surveyed tags: one tag without yaw")
 
 
+@pytest.mark.parametrize(
+    ("tags", "survey", "reason"),
+    [
+        # Tags 1 and 4 are 11.05 m apart.
+        ((1, 4), SURVEY | {Tag(FAMILY, 4): (16.7, 2.0, np.pi)}, "m apart in the map and 11.84 m in the survey"),
+        ((1, 4), SURVEY | {Tag(FAMILY, 4): (19.9, 2.0, np.pi)}, "m apart in the map and 15.03 m in the survey"),
+        ((1, 6), {Tag(FAMILY, 1): (4.9, 1.0, None), Tag(FAMILY, 6): (4.9, 1.6, None)}, "are less than 1 m apart"),
+    ],
+)
+def test_two_tags_that_contradict_each_other_or_fix_no_heading_place_nothing(tags, survey, reason):
+    result, true = mapped()
+    hung = WALL_TAGS | {6: (4.9, 1.6, np.pi)}
+    placing = placed(result, sightings(true, {number: hung[number] for number in tags}), survey)
+    assert np.array_equal(placing.result.robots[0].T_map_base, result.robots[0].T_map_base)
+    (line,) = lines(placing)
+    assert reason in line
+
+
+def test_two_tags_place_a_map():
+    result, true = mapped()
+    seen = sightings(true, {1: WALL_TAGS[1], 4: WALL_TAGS[4]})
+    plain = {Tag(FAMILY, number): (*WALL_TAGS[number][:2], None) for number in (1, 4)}
+    assert off_m(placed(result, seen, plain), true).max() < 0.1
+
+
 def test_a_map_without_surveyed_tags_or_placed_by_hand_stays():
     result, true = mapped()
     for seen, by_hand in (((), ()), (sightings(true), (0,))):

@@ -240,16 +240,15 @@ def placed_by_tags(
     known = [tag for tag in tags.places if tag in survey]
     if not known:
         return Surveyed(robots, graph, (), {}, "no robot in it saw a surveyed tag")
-    T, used = _aligned({tag: tags.places[tag][0].pose for tag in known}, survey)
+    seen = {tag: tags.places[tag][0].pose for tag in known}
+    T, used = _aligned(seen, survey)
     if T is None:
-        refusal = (
-            "the tags that were seen are not as far apart as the surveyed ones"
-            if len(known) > 1
-            else "one tag without yaw fixes no heading; give its yaw, or survey a second tag"
-        )
-        return Surveyed(robots, graph, (), {}, refusal)
+        return Surveyed(robots, graph, (), {}, _why_not_aligned(seen, survey))
     start = se2.compose(T, graph.poses())
     while True:
+        # Of two tags, no third one shows which is wrong, and the solution would bend the map between them.
+        if len(used) == 2 and abs(np.subtract(*_distances_m(seen, survey, *used))) > 2.0 * LARGEST_OFF_M:
+            return Surveyed(robots, graph, (), {}, _contradiction(seen, survey, *used))
         poses = _solve(graph, start, tags, used, survey)
         moved = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in robots)
         places = MapTags(moved, sightings).places
@@ -279,6 +278,32 @@ def _aligned(seen: Mapping[Tag, FloatArray], survey: Survey) -> tuple[FloatArray
         if len(agreeing) >= max(least, len(best[1]) + 1):
             best = T, agreeing
     return best
+
+
+def _why_not_aligned(seen: Mapping[Tag, FloatArray], survey: Survey) -> str:
+    if len(seen) == 1:
+        return "one tag without yaw fixes no heading; give its yaw, or survey a second tag"
+    a, b = max(combinations(seen, 2), key=lambda pair: _distances_m(seen, survey, *pair)[0])
+    if _distances_m(seen, survey, a, b)[0] < BASELINE_M:
+        return (
+            f"the tags that were seen are less than {BASELINE_M:g} m apart and fix no heading; give the yaw of one, "
+            "or survey a tag farther away"
+        )
+    return _contradiction(seen, survey, a, b)
+
+
+def _contradiction(seen: Mapping[Tag, FloatArray], survey: Survey, a: Tag, b: Tag) -> str:
+    mapped_m, surveyed_m = _distances_m(seen, survey, a, b)
+    return (
+        f"tags {a.number} and {b.number} are {mapped_m:.2f} m apart in the map and {surveyed_m:.2f} m in the survey; "
+        "check both"
+    )
+
+
+def _distances_m(seen: Mapping[Tag, FloatArray], survey: Survey, a: Tag, b: Tag) -> tuple[float, float]:
+    """How far apart two tags are in the map and in the survey."""
+    here, there = seen[a][:2] - seen[b][:2], np.subtract(survey[a][:2], survey[b][:2])
+    return float(np.hypot(*here)), float(np.hypot(*there))
 
 
 def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Tag], survey: Survey) -> FloatArray:
