@@ -40,6 +40,8 @@ LARGEST_OFF_M: Final = 0.15
 """A surveyed tag that is farther off in the solution does not count."""
 BASELINE_M: Final = 1.0
 """Least distance of two surveyed tags that place a map without their headings."""
+MOST_PAIRS: Final = 2000
+"""Pairs of surveyed tags that propose a motion of the map; the longest baselines count."""
 _HEADING_INFORMATION: Final = 1e-6
 _ROUNDS: Final = 3
 
@@ -261,22 +263,24 @@ def placed_by_tags(
 
 def _aligned(seen: Mapping[Tag, FloatArray], survey: Survey) -> tuple[FloatArray | None, list[Tag]]:
     """The motion of the map with which most surveyed tags agree, and these."""
-    motions = [
-        n_point_alignment(np.array([survey[a][:2], survey[b][:2]]), np.array([seen[a][:2], seen[b][:2]]))
-        for a, b in combinations(seen, 2)
-        if np.hypot(*(seen[a][:2] - seen[b][:2])) >= BASELINE_M
-    ]
+    tags, here = list(seen), np.array(list(seen.values()))
+    there = np.array([survey[tag][:2] for tag in tags])
+    pairs = np.column_stack(np.triu_indices(len(tags), 1))
+    baselines_m = np.hypot(*(here[pairs[:, 0], :2] - here[pairs[:, 1], :2]).T)
+    longest = np.argsort(-baselines_m, kind="stable")[:MOST_PAIRS]
+    pairs = pairs[longest[baselines_m[longest] >= BASELINE_M]]
+    motions = list(n_point_alignment(there[pairs], here[pairs, :2]))
     least = 2
     if not motions:
-        faced = [(survey[tag], seen[tag]) for tag in seen if survey[tag][2] is not None]
-        motions = [se2.compose(np.array(there), se2.inverse(here)) for there, here in faced]
+        faced = [(survey[tag], seen[tag]) for tag in tags if survey[tag][2] is not None]
+        motions = [se2.compose(np.array(at), se2.inverse(pose)) for at, pose in faced]
         least = 1
     best: tuple[FloatArray | None, list[Tag]] = None, []
     for T in motions:
-        off_m = {tag: float(np.hypot(*(se2.compose(T, seen[tag])[:2] - survey[tag][:2]))) for tag in seen}
-        agreeing = [tag for tag in seen if off_m[tag] <= ALIGNED_M]
+        off_m = np.hypot(*(se2.compose(T, here)[:, :2] - there).T)
+        agreeing = np.flatnonzero(off_m <= ALIGNED_M)
         if len(agreeing) >= max(least, len(best[1]) + 1):
-            best = T, agreeing
+            best = T, [tags[k] for k in agreeing]
     return best
 
 
