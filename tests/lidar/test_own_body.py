@@ -35,6 +35,14 @@ def test_the_posts_of_a_robot_are_found_within_two_degrees():
         assert post[1] <= sector[1] <= post[1] + 2.0
 
 
+@pytest.mark.parametrize("post", [(350, 360), (1, 360), (0, 360)])
+def test_what_is_proposed_up_to_the_front_is_a_setting(post):
+    (sector,) = LidarConfig.model_validate({"ignore": body_sectors(with_posts(posts=(post,)))}).ignore
+    hidden = is_in_sectors(LASER, ((post[0], post[1] - 0.5),))
+    assert is_in_sectors(LASER, (sector,))[hidden].all()
+    assert np.count_nonzero(is_in_sectors(LASER, (sector,))) <= np.count_nonzero(hidden) + 4
+
+
 def test_walls_and_short_or_straight_drives_propose_nothing():
     assert body_sectors(SCANS) == ()
     assert body_sectors(with_posts()[:20]) == ()
@@ -51,6 +59,11 @@ def test_a_sector_goes_counter_clockwise_and_may_cross_the_back(sector):
     off = np.abs(np.remainder(headings, 360.0) - 180.0)
     assert (is_in_sectors(LASER, (sector,)) == (off < 10.0 + 1e-9)).mean() > 0.99
     assert np.count_nonzero(is_in_sectors(LASER, ((sector[1], sector[0]),))) == pytest.approx(341, abs=2)
+
+
+@pytest.mark.parametrize("sector", [(-180.0, 180.0), (0.0, 360.0), (-360.0, 10.0)])
+def test_a_sector_of_a_turn_or_more_is_the_whole_turn(sector):
+    assert is_in_sectors(LASER, (sector,)).all()
 
 
 def test_beams_in_the_sectors_are_left_out_of_the_map():

@@ -1,6 +1,7 @@
 """The parts of a robot that its own laser sees: beams that never change, and sectors that are left out.
 
-Sectors are headings in ``base``, in degrees, counter-clockwise from the first to the second.
+Sectors are headings in ``base``, in degrees, counter-clockwise from the first to the second; 360 or more of them are
+the whole turn.
 """
 
 from collections.abc import Iterable
@@ -34,7 +35,8 @@ def is_in_sectors(laser: LaserModel, sectors: Sectors) -> NDArray[np.bool_]:
     """Which beams of a laser look into the sectors, shape (beam_count,)."""
     headings, found = _headings_deg(laser), np.zeros(laser.beam_count, np.bool_)
     for first_deg, last_deg in sectors:
-        found |= np.remainder(headings - first_deg, 360.0) <= np.remainder(last_deg - first_deg, 360.0)
+        width_deg = last_deg - first_deg if last_deg - first_deg >= 360.0 else np.remainder(last_deg - first_deg, 360.0)
+        found |= np.remainder(headings - first_deg, 360.0) <= width_deg
     found.setflags(write=False)
     return found
 
@@ -54,7 +56,14 @@ def body_sectors(scans: Iterable[LaserScan]) -> Sectors:
     parts = np.split(own, np.flatnonzero(np.diff(own) > LARGEST_GAP_DEG) + 1)
     if len(parts) > 1 and parts[0][0] + 360 - parts[-1][-1] <= LARGEST_GAP_DEG:
         parts[0] = np.concatenate((parts.pop() - 360, parts[0]))
-    return tuple((float(part[0] - MARGIN_DEG), float(part[-1] + 1 + MARGIN_DEG)) for part in parts)
+    return tuple(_sector(int(part[0]) - MARGIN_DEG, int(part[-1]) + 1 + MARGIN_DEG) for part in parts)
+
+
+def _sector(first_deg: int, last_deg: int) -> tuple[float, float]:
+    """The sector with ends that a setting may have, and of one turn at most."""
+    last_deg = min(last_deg, first_deg + 360)
+    turn_deg = 360 if last_deg > 360 else 0
+    return float(first_deg - turn_deg), float(last_deg - turn_deg)
 
 
 def _by_degree(scan: LaserScan) -> FloatArray:
