@@ -41,6 +41,10 @@ def test_the_state_of_a_robot_is_true(told):
     assert told["evidence"] == ["Nobody else has seen its places yet", "Saw the same places as b, 2 times"]
 
 
+def test_the_evidence_names_what_it_rests_on(told):
+    assert told["sensors"] == ["laser scanner", "camera", "tag"]
+
+
 def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):
     assert told["well"] == []
     assert told["silent"] == [["a and c are silent, the first for 2 min.", "Show the robots"]]

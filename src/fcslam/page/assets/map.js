@@ -287,7 +287,7 @@ function draw() {
   for (const [key, { picture }] of tiles) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; picture?.close(); tiles.delete(key); }
   if (isShown("quality")) drawQuality();
   if (isShown("grid")) drawGrid();
-  if (isShown("closures")) for (const channel of ["lidar", "camera"]) strokeWay(linksOf(channel), theme[channel === "lidar" ? "laser" : "camera"], 1, 0.5);
+  if (isShown("closures")) for (const [channel, colour] of [["lidar", theme.laser], ["camera", theme.camera], ["tag", theme.free]]) strokeWay(linksOf(channel), colour, 1, 0.5);
   if (isShown("areas")) for (const region of fleet.regions) drawRegion(region);
   const chosen = fleet.selected, shown = fleet.robots.filter((r) => r.map === chart.index && r.T_map_base && !r.removed);
   for (const robot of shown.filter((r) => r.session !== chosen)) drawRobot(robot);

@@ -99,7 +99,8 @@ export function attention({ robots, maps, separations, quality, counts, contradi
 
 const DECISIONS = { accepted: "used", verified: "fits, not needed", rejected: "left out", revoked: "taken back", candidate: "not confirmed" };
 export const decisionOf = (closure) => DECISIONS[closure.status] ?? closure.status;
-export const sensorOf = (closure) => (closure.channel === "camera" ? "camera" : "laser scanner");
+const SENSORS = { lidar: "laser scanner", camera: "camera", tag: "tag" };
+export const sensorOf = (closure) => SENSORS[closure.channel] ?? closure.channel;
 
 // What happened in a mission, oldest first: drives, first meetings, edits. `time` orders drives; an edit has its own clock.
 export function history({ robots, accepted, edits, maps }) {
