@@ -7,9 +7,10 @@ their order, so it gives the same records wherever and whenever it runs (``fcsla
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field
 
 from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION
@@ -38,22 +39,21 @@ from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
 from fcslam.wire.messages import Body, Hello
 
 
+def _of_places(channel: Channel) -> Channel:
+    if channel not in PLACE_CHANNELS:
+        raise ValueError("tags describe no places; leave tag out and set robot.tags.size_m")
+    return channel
+
+
 class SessionConfig(SendingConfig):
     """Settings of everything that turns sensor records into packets."""
 
     lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
-    channels: tuple[Channel, ...] = Field(
+    channels: tuple[Annotated[Channel, AfterValidator(_of_places)], ...] = Field(
         default=PLACE_CHANNELS, min_length=1, description="sensors that describe places: lidar, camera"
     )
     views: ViewsConfig = Field(default=ViewsConfig(), description="binary descriptors of camera images")
     tags: TagsConfig = Field(default=TagsConfig(), description="tags on walls, floors and ceilings")
-
-    @field_validator("channels")
-    @classmethod
-    def _channels_have_places(cls, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
-        if Channel.TAG in channels:
-            raise ValueError("tags describe no places; leave tag out and set robot.tags.size_m")
-        return channels
 
     @property
     def uses_images(self) -> bool:
