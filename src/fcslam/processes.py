@@ -44,14 +44,14 @@ def start_method() -> Any:
     return multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
-def worker_pool(start: Callable[[], None], context: Any = None) -> ProcessPoolExecutor:
-    """An executor with one worker, another process that calls ``start`` first; a fresh one without a ``context``.
+def worker_pool(start: Callable[[], None]) -> ProcessPoolExecutor:
+    """An executor with one worker, another process that calls ``start`` first.
 
     Raises:
         InputError: the host gives processes no semaphores.
     """
     with needing_semaphores():
-        return ProcessPoolExecutor(1, context or multiprocessing.get_context("spawn"), start)
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start)
 
 
 @contextmanager

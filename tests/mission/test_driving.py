@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.errors import FcslamError, InputError, SourceError
+from fcslam.errors import FcslamError, SourceError
 from fcslam.mission import driving
 from fcslam.mission.driving import one_by_one, side_by_side
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Keyscan
-from fcslam.robot.backend import RobotBackend
 from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import open_source
 from fcslam.sources.faults import Fault, Faults
@@ -42,17 +41,16 @@ def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-@pytest.mark.parametrize("robots", [1, 3])
-def test_processes_change_no_byte_of_a_run_and_faults_arrive(logs, tmp_path, robots):
+def test_processes_change_no_byte_of_a_run_and_faults_arrive(logs, tmp_path):
     damaged = tmp_path / "damaged.clf"
     damaged.write_bytes(logs[0].read_bytes() + b"FLASER 3 1 2\n")
-    recordings, seen = [damaged, *logs[1:robots]], []
+    recordings, seen = [damaged, *logs[1:]], []
     alone = run_mission([open_source(log) for log in recordings], MissionConfig())
     together = run_mission(
         [open_source(log) for log in recordings], MissionConfig(), seen.append, drive=side_by_side(2)
     )
     assert seen[-1].faults["damaged"][Fault.BROKEN_LINE].count == 1
-    assert not any(found for robot, found in seen[-1].faults.items() if robot != "damaged")
+    assert not seen[-1].faults["robot_2"]
     for name, run in (("alone", alone), ("together", together)):
         run.save(tmp_path / name)
     files = {path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*") if path.is_file()}
@@ -72,29 +70,10 @@ def test_legs_are_the_same_and_their_arrays_read_only(logs):
     assert legs[-1].faults == expected[-1].faults
 
 
-def test_a_back_end_that_dies_is_an_error(logs, monkeypatch):
-    monkeypatch.setattr(RobotBackend, "process", lambda *_: die())
-    with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,), pytest.raises(FcslamError, match="ended"):
-        list(legs)
-
-
-def test_an_error_of_the_back_end_is_raised_as_it_is(logs, monkeypatch):
-    def fail(*_):
-        raise AssertionError("of the back end")
-
-    monkeypatch.setattr(RobotBackend, "process", fail)
-    with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,), pytest.raises(AssertionError) as caught:
-        list(legs)
-    assert "in fail" in str(caught.value.__cause__)  # the traceback of the other process
-
-
-def test_one_robot_needs_no_second_process(logs, monkeypatch):
-    def refuse_process(*_):
-        raise InputError("/dev/shm")
-
-    monkeypatch.setattr(driving, "backend_process", refuse_process)
-    with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,):
-        assert list(legs)[-1].faults is not None
+def test_one_robot_needs_no_process(monkeypatch):
+    monkeypatch.setattr(driving, "start_method", lambda: pytest.fail("a process"))
+    with side_by_side(4)([Broken("a", refuse)], RobotConfig()) as (legs,), pytest.raises(SourceError):
+        next(legs)
 
 
 @pytest.mark.parametrize(("end", "error", "text"), [(refuse, SourceError, "cut off"), (die, FcslamError, "code -9")])

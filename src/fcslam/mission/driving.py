@@ -8,18 +8,16 @@ import queue
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
-from fcslam.errors import FcslamError, InputError
+from fcslam.errors import FcslamError
 from fcslam.processes import needing_semaphores, obey_parent, start_method
 from fcslam.records import GnssFix, Keyscan, LaserScan
-from fcslam.robot.beside import backend_process, worker_copy
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
@@ -28,8 +26,6 @@ from fcslam.wire.messages import Hello
 from fcslam.wire.packets import SizedPacket, decode, measure, readdress
 
 SCANS_PER_LEG: Final = 50
-MOST_BACKLOG: Final = 200
-"""Inputs that wait for a back end in another process; a front end that is further ahead waits for it."""
 _POLL_S: Final = 1.0
 """Interval at which the cloud's process looks whether one that owes it something still runs."""
 
@@ -65,15 +61,15 @@ def one_by_one(sources: Sequence[Source], config: RobotConfig) -> AbstractContex
 
 
 def side_by_side(processes: int) -> Drive:
-    """Drive every robot in a process of its own, ``processes`` at a time; the back end of a single one has its own.
+    """Drive every robot in a process of its own, ``processes`` at a time.
 
-    A robot's error is raised where its legs are read.
+    One robot, or one process, needs none. A robot's error is raised where its legs are read.
     """
 
     @contextmanager
     def drive(sources: Sequence[Source], config: RobotConfig) -> Iterator[Sequence[Iterator[Leg]]]:
         if min(processes, len(sources)) == 1:
-            with one_by_one(sources, config) if processes == 1 else _in_two(sources[0], config) as robots:
+            with one_by_one(sources, config) as robots:
                 yield robots
             return
         context = start_method()
@@ -97,23 +93,8 @@ def side_by_side(processes: int) -> Drive:
     return drive
 
 
-@contextmanager
-def _in_two(source: Source, config: RobotConfig) -> Iterator[Sequence[Iterator[Leg]]]:
-    """Drive one robot with its back end in a process of its own, or here if that cannot begin."""
-    with ExitStack() as stack:
-        try:
-            backend = stack.enter_context(backend_process(source.name, config, worker_copy))
-        except InputError:
-            backend = None
-        yield [legs(source, RobotFrontend(source.name, config, backend))]
-
-
 def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
-    """Drive one robot over its whole recording.
-
-    Raises:
-        FcslamError: the process of its back end ended; errors of the back end itself are raised as they are.
-    """
+    """Drive one robot over its whole recording."""
     packets: list[SizedPacket] = []
     stamps: list[float] = []
     fixes: list[GnssFix] = []
@@ -124,27 +105,12 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
         if isinstance(record, GnssFix):
             fixes.append(record)
         if len(stamps) == SCANS_PER_LEG:
-            packets += map(measure, robot.ready(wait=robot.backlog > MOST_BACKLOG))
-            _check_backend(robot)
             yield Leg(robot.robot, tuple(packets), tuple(stamps))
             packets, stamps = [], []
     packets += map(measure, robot.finish())
-    _check_backend(robot)
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults, tuple(fixes))
-
-
-def _check_backend(robot: RobotFrontend) -> None:
-    match robot.backend_error:
-        case None:
-            return
-        case BrokenExecutor():
-            raise FcslamError(
-                f"{robot.robot}: the process that closes loops ended; if memory ran out, use fewer cores (taskset)"
-            ) from robot.backend_error
-        case error:
-            raise error
 
 
 def on_floor(legs: Iterator[Leg], floor: str) -> Iterator[Leg]:

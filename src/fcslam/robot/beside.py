@@ -6,14 +6,14 @@ scan comes, and a solve of a large graph takes longer than that. Both get the sa
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from fcslam.errors import FeatureError
-from fcslam.processes import obey_parent, start_method, worker_pool
+from fcslam.processes import obey_parent, worker_pool
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionConfig
 from fcslam.wire.messages import Body
 
@@ -72,21 +72,10 @@ def worker_process() -> ProcessPoolExecutor:
     return worker_pool(_start_worker)
 
 
-def worker_copy() -> ProcessPoolExecutor:
-    """The same, but the worker is a copy of this process where such copies are safe: it starts at once.
-
-    Raises:
-        InputError: the host gives processes no semaphores.
-    """
-    return worker_pool(obey_parent, start_method())
-
-
 @contextmanager
-def backend_process(
-    robot: str, config: SessionConfig, start: Callable[[], Executor] = worker_process
-) -> Iterator[Beside]:
-    """A back end in a process of its own, by default a fresh one, which ends with this block."""
-    executor = start()
+def backend_process(robot: str, config: SessionConfig) -> Iterator[Beside]:
+    """A back end in a process of its own, which ends with this block."""
+    executor = worker_process()
     try:
         yield Beside(robot, config, executor)
     finally:

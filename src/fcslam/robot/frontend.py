@@ -97,8 +97,8 @@ class RobotFrontend:
         self.robot = robot
         self.tracks: list[ScanTrack] = []
         """Poses of the scans, by session."""
-        self.backend_error: Exception | None = None
-        """What ended the back end early; from then on the robot sends neither closures nor places. None if it works."""
+        self.backend_failure: str | None = None
+        """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
         self.odometry = OdometryGate(config.odometry)
         """Jumps of the odometry so far."""
         self.prediction: MotionPrediction | None = None
@@ -153,11 +153,6 @@ class RobotFrontend:
     def backlog(self) -> int:
         """Number of inputs that the back end has not handled yet."""
         return len(self._waiting)
-
-    @property
-    def backend_failure(self) -> str | None:
-        """``backend_error`` in words."""
-        return None if self.backend_error is None else f"{type(self.backend_error).__name__}: {self.backend_error}"
 
     @property
     def newest_output(self) -> "Future[list[Body]] | None":
@@ -362,8 +357,8 @@ class RobotFrontend:
         except FeatureError:  # ``set_detector`` reports it
             return []
         except Exception as error:  # tracking must go on, whatever ended the back end
-            self.backend_error = self.backend_error or error
-        if self.backend_error is None:
+            self.backend_failure = self.backend_failure or f"{type(error).__name__}: {error}"
+        if self.backend_failure is None:
             return bodies
         if not isinstance(done.input, NewKeyscan):
             return []
