@@ -37,8 +37,8 @@ MOST_SENDERS = 10
 """Robots, those that saw the tag last, whose newest session a new sighting is paired with."""
 MOST_TAGS = 32
 """Tags that one keyscan sees at most."""
-MOST_OF_TAG, MOST_CLOSURES = 20, 200
-"""Closures between two sessions by one tag, and by all tags: their cost grows with the square."""
+MOST_CLOSURES = 200
+"""Closures by tags between two sessions: their cost grows with the square."""
 REVISIT_M = 10.0
 """Path after which a session that sees a tag again has come back to it."""
 
@@ -56,8 +56,8 @@ class SeenTags:
         sighting are in one closure."""
         self._tags: Counter[KeyscanId] = Counter()
         """Number of tags of each keyscan."""
-        self._ends: Counter[tuple[Tag | None, frozenset[str]]] = Counter()
-        """Ends of closures between two sessions, by tag; None: by all tags."""
+        self._ends: Counter[frozenset[str]] = Counter()
+        """Ends of closures by tags between two sessions."""
 
     def add(self, sighting: TagSighting) -> list[PlaceMatch]:
         """Note a sighting; returns its closures with earlier ones.
@@ -85,10 +85,11 @@ class SeenTags:
         matches = []
         for name, sightings in (*chosen, (session, earlier)):
             free = [one for one in sightings if (one.id, session) not in paired]
-            if free and not self._is_full(sighting.tag, session, name):
+            pair = frozenset((session, name))
+            if free and self._ends[pair] < 2 * MOST_CLOSURES:
                 partner = max(free, key=lambda one: float(np.linalg.det(one.information)))
                 paired |= {(partner.id, session), (sighting.id, name)}
-                self._count(sighting.tag, session, name, ends=2)
+                self._ends[pair] += 2
                 matches.append(_match(partner, sighting))
         own[number] = sighting
         self._tags[sighting.id] += 1
@@ -127,18 +128,8 @@ class SeenTags:
             self._tags[sighting.id] += 1
         for family, number, session, keyscan, name in state["tag_pairs"]:
             pair = KeyscanId(session, keyscan), name
-            tag = Tag(TagFamily(family), number)
-            self._paired.setdefault(tag, set()).add(pair)
-            self._count(tag, session, name, ends=1)
-
-    def _is_full(self, tag: Tag, a: str, b: str) -> bool:
-        """Whether two sessions have as many closures by a tag, or by all, as may be."""
-        pair = frozenset((a, b))
-        return self._ends[tag, pair] >= 2 * MOST_OF_TAG or self._ends[None, pair] >= 2 * MOST_CLOSURES
-
-    def _count(self, tag: Tag, a: str, b: str, ends: int) -> None:
-        for key in (tag, None):
-            self._ends[key, frozenset((a, b))] += ends
+            self._paired.setdefault(Tag(TagFamily(family), number), set()).add(pair)
+            self._ends[frozenset((session, name))] += 1
 
     def _share_floor(self, a: str, b: str) -> bool:
         return self._sessions.floor(a) == self._sessions.floor(b)
