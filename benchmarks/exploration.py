@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import label
 
 from fcslam.compiled import njit
-from fcslam.lab.simulation.drivable_space import _obstacles
+from fcslam.lab.simulation.drivable_space import obstacle_cells
 from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.options import Building
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -162,7 +162,7 @@ def _is_seen(known, point):
 
 
 def _walls(kind, seed):
-    fine = _obstacles(draw_floor_plan(np.random.default_rng(seed), kind))  # cells of 0.05 m
+    fine = obstacle_cells(draw_floor_plan(np.random.default_rng(seed), kind))  # cells of 0.05 m
     height, width = (-(-size // 2) * 2 for size in fine.shape)
     whole = np.ones((height, width), bool)
     whole[: fine.shape[0], : fine.shape[1]] = fine

@@ -47,7 +47,7 @@ class DrivableSpace:
         Raises:
             SimulationError: the plan has no drivable space.
         """
-        self._clearance_m = _CELL_M * distance_transform_edt(~_obstacles(plan))
+        self._clearance_m = _CELL_M * distance_transform_edt(~obstacle_cells(plan))
         parts, count = label(self._clearance_m[::_STEP, ::_STEP] >= _CLEARANCE_M, np.ones((3, 3)))
         if not count:
             raise SimulationError(
@@ -127,7 +127,7 @@ def _price(clearance_m: FloatArray) -> FloatArray:
     return np.asarray(1.0 + _NARROW * tightness**2)
 
 
-def _obstacles(plan: FloorPlan) -> Cells:
+def obstacle_cells(plan: FloorPlan) -> Cells:
     """Occupied cells, shape (H, W), row 0 in the south."""
     width, height = (int(np.ceil(size / _CELL_M)) for size in plan.size_m)
     occupied = np.zeros((height, width), dtype=bool)
