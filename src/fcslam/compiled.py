@@ -30,12 +30,12 @@ def is_compiled(function: Any) -> bool:
 def njit(function: Any = None, *, nogil: bool = False, allocates: bool = True) -> Any:
     """As ``numba.njit`` with a cache, if there can be one.
 
-    A function that makes no array may say so with ``allocates=False``: it then counts no references to the arrays it
-    is given, which costs a short function more than its work.
+    A function that makes no array may say so with ``allocates=False``. It then counts no references to the arrays it is
+    given and is inlined: both would cost a short function more than its work.
     """
     if function is None:
         return lambda function: njit(function, nogil=nogil, allocates=allocates)
-    dispatcher = numba.njit(nogil=nogil, _nrt=allocates)(function)
+    dispatcher = numba.njit(nogil=nogil, _nrt=allocates, forceinline=not allocates)(function)
     try:
         dispatcher._cache = _Cache(function)
     except RuntimeError:  # no locator available: no folder can be written
