@@ -113,6 +113,12 @@ class Sweep(NamedTuple):
         """Time between the first and the last beam."""
         return abs(self.last_s - self.first_s)
 
+    @property
+    def mean_velocity(self) -> tuple[float, float, float]:
+        """Over as long as the sweep lasts, from the stamp on; x and y in m/s, heading in rad/s."""
+        half_s, (vx, vy, vtheta), (ax, ay, atheta) = 0.5 * self.duration_s, self.velocity, self.acceleration
+        return vx + half_s * ax, vy + half_s * ay, vtheta + half_s * atheta
+
     def displacement(self, t_s: float | FloatArray) -> FloatArray:
         """Pose of ``base`` at ``t_s`` after the stamp in ``base`` at the stamp, shape (3,), metres and radians.
 

@@ -293,8 +293,9 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams
         raise ValueError(f"poses must be finite and within {FARTHEST_M:g} m of the origin")
     sweeps = [scan.sweep or _AT_ONCE for scan in keyscans]
     return _Beams(
-        ranges_m, *rays_of(laser), beam_times(laser, times), poses, np.array([sweep.velocity for sweep in sweeps]),
-        np.array([sweep.acceleration for sweep in sweeps]), laser.max_range_m,
+        ranges_m, *rays_of(laser)[:2], beam_times(laser, times), poses,
+        np.array([sweep.velocity for sweep in sweeps]), np.array([sweep.acceleration for sweep in sweeps]),
+        laser.max_range_m,
     )  # fmt: skip
 
 

@@ -78,9 +78,8 @@ def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) 
     points, normals, solitary, kept = _project(
         ranges_m, rays.origins, rays.directions, abs(laser.angle_increment_rad), laser.max_range_m
     )
-    if sweep is None:
-        return PointScan(points, normals, solitary, rays.origins[0])
-    return PointScan(points, normals, solitary, rays.origins[laser.beam_count // 2], beam_times(laser, sweep)[kept])
+    times_s = AT_ONCE if sweep is None else rays.times_s[kept]
+    return PointScan(points, normals, solitary, rays.origins[laser.beam_count // 2], times_s)
 
 
 def keyscan_points(keyscan: Keyscan, lasers: Sequence[LaserModel]) -> PointScan:
@@ -95,15 +94,17 @@ class Rays(NamedTuple):
     """Where the laser was at each beam, shape (beam_count, 2), metres."""
     directions: FloatArray
     """Unit vectors, shape (beam_count, 2)."""
+    times_s: FloatArray
+    """Time of each beam after the stamp, shape (beam_count,); shape (0,): all are measured at the stamp."""
 
 
 def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> Rays:
     """The beams of a scan of ``laser``. This is the only place where beams get positions and directions."""
     if sweep is None:
         return _rays(laser)
-    return Rays(
-        *_swept(*_rays(laser), beam_times(laser, sweep), np.array(sweep.velocity), np.array(sweep.acceleration))
-    )
+    origins, directions, _ = _rays(laser)
+    first_s, last_s, velocity, acceleration = sweep
+    return Rays(*_swept(origins, directions, first_s, last_s, np.array(velocity), np.array(acceleration)))
 
 
 def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
@@ -116,18 +117,20 @@ def _rays(laser: LaserModel) -> Rays:
     """The beams if all are measured at the stamp."""
     angles = laser.angles_rad() + laser.T_base_laser[2]
     origins = np.tile(laser.T_base_laser[:2], (laser.beam_count, 1))
-    return Rays(origins, np.stack((np.cos(angles), np.sin(angles)), axis=1))
+    return Rays(origins, np.stack((np.cos(angles), np.sin(angles)), axis=1), AT_ONCE)
 
 
 @njit
-def _swept(origins, directions, times, velocity, acceleration):  # type: ignore[no-untyped-def]
-    """Each beam where the robot was at its time."""
-    moved, turned = np.empty_like(origins), np.empty_like(directions)
+def _swept(origins, directions, first, last, velocity, acceleration):  # type: ignore[no-untyped-def]
+    """Each beam where the robot was at its time, and these times, as ``beam_times``."""
+    moved, turned, times = np.empty_like(origins), np.empty_like(directions), np.empty(len(origins))
+    step = (last - first) / max(1, len(times) - 1)
     for i in range(len(times)):
+        times[i] = first + i * step if i < len(times) - 1 else last
         moved[i, 0], moved[i, 1], turned[i, 0], turned[i, 1] = ray_at(
             origins[i], directions[i], times[i], velocity, acceleration
         )
-    return moved, turned
+    return moved, turned, times
 
 
 @njit(allocates=False)
@@ -161,8 +164,11 @@ def _project(ranges, origins, directions, spacing, max_range):  # type: ignore[n
     points, kept = xy[:n].copy(), kept[:n].copy()
     normals = np.zeros((n, 2))
     solitary = np.zeros(n, np.bool_)
+    connected = np.empty(max(0, n - 1), np.bool_)
+    for k in range(n - 1):
+        connected[k] = _is_connected(points, kept, ranges, spacing, k)
     for k in range(n):
-        _fit_normal(points, kept, ranges, spacing, k, origins[kept[k]], normals)
+        _fit_normal(points, connected, k, origins[kept[k]], normals)
         if normals[k, 0] == 0.0 and normals[k, 1] == 0.0:
             solitary[k] = not _in_row(points, k)
     return points, normals, solitary, kept
@@ -182,12 +188,12 @@ def _in_row(points, k):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _fit_normal(points, kept, ranges, spacing, k, origin, normals):  # type: ignore[no-untyped-def]
+def _fit_normal(points, connected, k, origin, normals):  # type: ignore[no-untyped-def]
     """Total least squares through the neighbours of return k on the same surface; facing the laser."""
     first = last = k
-    while first > 0 and k - first < NORMAL_REACH and _connected(points, kept, ranges, spacing, first - 1):
+    while first > 0 and k - first < NORMAL_REACH and connected[first - 1]:
         first -= 1
-    while last < len(points) - 1 and last - k < NORMAL_REACH and _connected(points, kept, ranges, spacing, last):
+    while last < len(connected) and last - k < NORMAL_REACH and connected[last]:
         last += 1
     m = last - first + 1
     if m < 3:
@@ -231,7 +237,7 @@ def _across(difference, mixed):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def]
+def _is_connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def]
     """Whether returns i and i + 1 lie on one surface."""
     if kept[i + 1] - kept[i] > 2:
         return False

@@ -228,9 +228,10 @@ class ScanTracker:
         """Information of the velocity in a sweep, shape (3,), by odometry's error in the motion during the sweep."""
         if sweep is None:
             return FIXED
-        x, y, theta = sweep.displacement(sweep.duration_s).tolist()
-        error = self._trust.scale(odometry_error(math.hypot(x, y), abs(theta), self._odometry))
-        position, heading = (sweep.duration_s / sigma for sigma in error)
+        duration_s, (x, y, theta) = sweep.duration_s, sweep.mean_velocity
+        moved_m, turned_rad = duration_s * math.hypot(x, y), duration_s * abs(theta)
+        error = self._trust.scale(odometry_error(moved_m, turned_rad, self._odometry))
+        position, heading = duration_s / error.position_m, duration_s / error.heading_rad
         return np.array((position**2, position**2, heading**2))
 
     def _match(
@@ -267,7 +268,10 @@ def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
     """The sweep with its velocity moved by a correction, shape (3,)."""
     if sweep is None:
         return None
-    x, y, theta = np.clip(np.array(sweep.velocity) + velocity, -LARGEST_VELOCITY, LARGEST_VELOCITY).tolist()
+    x, y, theta = (
+        min(max(assumed + correction, -LARGEST_VELOCITY), LARGEST_VELOCITY)
+        for assumed, correction in zip(sweep.velocity, velocity.tolist(), strict=True)
+    )
     return sweep._replace(velocity=(x, y, theta))
 
 

@@ -72,9 +72,8 @@ class OdometryGate:
         sweep, limits = scan.sweep, self._limits
         if sweep is None:
             return scan
-        mean = sweep.displacement(sweep.duration_s) / sweep.duration_s
-        fastest = np.maximum(np.abs(sweep.velocity), np.abs(mean))
-        if math.hypot(fastest[0], fastest[1]) <= limits.speed_m_s and fastest[2] <= limits.turn_rad_s:
+        x, y, theta = (max(abs(v), abs(mean)) for v, mean in zip(sweep.velocity, sweep.mean_velocity, strict=True))
+        if math.hypot(x, y) <= limits.speed_m_s and theta <= limits.turn_rad_s:
             self._velocity = sweep.velocity
             return scan
         return replace(scan, sweep=sweep._replace(velocity=self._velocity, acceleration=(0.0, 0.0, 0.0)))
