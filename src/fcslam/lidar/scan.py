@@ -50,7 +50,10 @@ class PointScan:
         Returns farther than ``radius_m`` from the origin of ``base`` are left out.
         """
         most = len(self) if limit is None else limit
-        return self.only(_thin(self.points, spacing_m, most, radius_m))
+        points, normals, solitary, times_s = _thin(
+            self.points, self.normals, self.solitary, self.times_s, spacing_m, most, radius_m
+        )
+        return PointScan(points, normals, solitary, self.origin, times_s)
 
     def only(self, kept: NDArray[Any]) -> "PointScan":
         """The returns with the indices ``kept``, shape (K,), or where the mask ``kept``, shape (N,), is true."""
@@ -248,8 +251,8 @@ def _is_connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-
 
 
 @njit
-def _thin(points, spacing, limit, radius):  # type: ignore[no-untyped-def]
-    """Numbers of the points that ``PointScan.thinned`` keeps."""
+def _thin(points, normals, solitary, times, spacing, limit, radius):  # type: ignore[no-untyped-def]
+    """The arrays of ``PointScan.thinned``."""
     keep = np.empty(len(points), np.int64)
     n = 0
     for i in range(len(points)):
@@ -263,7 +266,13 @@ def _thin(points, spacing, limit, radius):  # type: ignore[no-untyped-def]
         keep[n] = i
         n += 1
     count = min(n, limit)
-    spread = np.empty(count, np.int64)
+    some_points, some_normals, some_solitary = np.empty((count, 2)), np.empty((count, 2)), np.empty(count, np.bool_)
+    some_times = np.empty(count if len(times) > 0 else 0)
     for k in range(count):  # evenly spread over those that are far enough apart
-        spread[k] = keep[k * (n - 1) // max(1, count - 1)]
-    return spread
+        i = keep[k * (n - 1) // max(1, count - 1)]
+        some_points[k, 0], some_points[k, 1] = points[i, 0], points[i, 1]
+        some_normals[k, 0], some_normals[k, 1] = normals[i, 0], normals[i, 1]
+        some_solitary[k] = solitary[i]
+        if len(times) > 0:
+            some_times[k] = times[i]
+    return some_points, some_normals, some_solitary, some_times

@@ -6,7 +6,7 @@ each stretch of a wall gives an estimate of ``c`` by least squares. The estimate
 
 import math
 from collections.abc import Iterable, Iterator
-from itertools import islice, pairwise
+from itertools import groupby, islice, pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.records import FloatArray, LaserScan
+from fcslam.records import FloatArray, LaserModel, LaserScan, Ranges
 
 MOST_SCANS: Final = 300
 """Scans that are examined at most."""
@@ -65,8 +65,9 @@ class Excess(NamedTuple):
 
 def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
     """By how much the ranges of a laser are too long, if most walls show it; None if they are straight, or few."""
+    examined = groupby(islice(scans_apart(_steady(scans)), MOST_SCANS), lambda scan: scan.laser)
     ranges_m, excess_m = np.concatenate(
-        [np.empty((0, 2)), *map(_stretches, islice(scans_apart(_steady(scans)), MOST_SCANS))]
+        [np.empty((0, 2)), *(_stretches(laser, [scan.ranges_m for scan in same]) for laser, same in examined)]
     ).T
     if len(ranges_m) < FEWEST_STRETCHES:
         return None
@@ -95,20 +96,20 @@ def _steady(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
             yield scan
 
 
-def _stretches(scan: LaserScan) -> FloatArray:
-    """Middle range and excess of each stretch of a wall, shape (N, 2), metres."""
-    step_rad = scan.laser.beams.angle_increment_rad
-    count = round(STRETCH_RAD / step_rad)
-    if count < FEWEST_BEAMS or len(scan.ranges_m) < count:
+def _stretches(laser: LaserModel, scans: list[Ranges]) -> FloatArray:
+    """Middle range and excess of each stretch of a wall in scans with the same beams, shape (N, 2), metres."""
+    count = round(STRETCH_RAD / abs(laser.angle_increment_rad))
+    if count < FEWEST_BEAMS or laser.beam_count < count:
         return np.empty((0, 2))
-    ranges_m = sliding_window_view(scan.ranges_m.astype(np.float64), count)[:: count // 4]
-    seen = (ranges_m > 0.0) & (ranges_m < scan.laser.max_range_m)
+    windows = sliding_window_view(np.array(scans, np.float64), count, axis=1)[:, :: count // 4]
+    ranges_m = windows.reshape(-1, count)
+    seen = (ranges_m > 0.0) & (ranges_m < laser.max_range_m)
     ranges_m = np.where(seen, ranges_m, 1.0)
     steps_m = np.abs(np.diff(ranges_m, axis=1))
     is_step = (steps_m > STEP_M + STEP_SHARE * ranges_m[:, 1:]) & seen[:, 1:] & seen[:, :-1]
     chosen = (seen.mean(axis=1) > LEAST_RETURNS) & ~is_step.any(axis=1)
     seen, ranges_m = seen[chosen], ranges_m[chosen]
-    excess_m = _excess(np.asarray(step_rad * (np.arange(count) - 0.5 * count)), ranges_m, seen)
+    excess_m = _excess(np.asarray(laser.angle_increment_rad * (np.arange(count) - 0.5 * count)), ranges_m, seen)
     return np.column_stack((np.median(ranges_m, axis=1), excess_m))[np.isfinite(excess_m)]
 
 

@@ -5,17 +5,19 @@ numbers.
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fcslam.compiled import njit
 from fcslam.records import FloatArray, Ranges, frozen
 from fcslam.wire.streams import KeypointCodes, RangeCodes
 
-RANGE_STEP_M = 0.002
+RANGE_STEP_M: Final = 0.002
 """Rounding adds a standard deviation of 0.6 mm to the 10-30 mm of a 2D LiDAR; 16 bits then reach 131 m."""
-_NO_RETURN = 65535
-MAXIMUM_RANGE_M = (_NO_RETURN - 1) * RANGE_STEP_M
+_NO_RETURN: Final = 65535
+MAXIMUM_RANGE_M: Final = (_NO_RETURN - 1) * RANGE_STEP_M
 KEYPOINT_STEP_M = 0.01
 MAXIMUM_KEYPOINT_M = 32767 * KEYPOINT_STEP_M
 
@@ -30,9 +32,20 @@ def quantise(ranges_m: ArrayLike) -> RangeCodes:
 
     65535 stands for no return (inf), 0 for an invalid range (NaN, not positive, over 131.068 m).
     """
-    ranges = np.asarray(ranges_m, dtype=np.float64)
-    steps = np.where((ranges > 0.0) & (ranges < MAXIMUM_RANGE_M + RANGE_STEP_M / 2), ranges, 0.0) / RANGE_STEP_M
-    return np.where(np.isposinf(ranges), _NO_RETURN, np.rint(steps)).astype(np.uint16)
+    codes: RangeCodes = _quantise(np.array(ranges_m, dtype=np.float64))  # a writable copy: code is compiled once
+    return codes
+
+
+@njit
+def _quantise(ranges):  # type: ignore[no-untyped-def]
+    codes = np.zeros(len(ranges), np.uint16)
+    for i in range(len(ranges)):
+        r = ranges[i]
+        if r == np.inf:
+            codes[i] = _NO_RETURN
+        elif 0.0 < r < MAXIMUM_RANGE_M + RANGE_STEP_M / 2:  # false for NaN
+            codes[i] = np.rint(r / RANGE_STEP_M)
+    return codes
 
 
 def dequantise(codes: RangeCodes) -> Ranges:
