@@ -50,7 +50,7 @@ def main() -> None:
         kept, found = largest_map(plain, robot)
         without = position_errors(found, robot.T_building_base[kept])
         for reflections in (False, True):
-            records = [*scans, *fixes(robot, seed, reflections)]
+            records = sorted([*scans, *fixes(robot, seed, reflections)], key=lambda record: record.stamp)
             run = run_mission([Recording(robot.name, records)], MissionConfig())
             kept, found = largest_map(run, robot)
             georeference = json.loads(run.map_files["map_georeference.json"])

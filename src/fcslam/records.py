@@ -346,6 +346,22 @@ class TagSighting:
 
 
 @dataclass(frozen=True, slots=True)
+class KeyscanFix:
+    """A position by satellites near a keyscan."""
+
+    id: KeyscanId
+    latitude_deg: float
+    """On the ellipsoid WGS 84."""
+    longitude_deg: float
+    altitude_m: float
+    """Above the ellipsoid; 0 if unknown."""
+    sigma_m: float
+    """Standard deviation, east and north each."""
+    antenna_xy: tuple[float, float]
+    """Position of the antenna in the keyscan's base, metres."""
+
+
+@dataclass(frozen=True, slots=True)
 class Place:
     """One channel of one keyscan: keypoints with binary descriptors."""
 

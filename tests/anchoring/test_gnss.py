@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.api import map_recordings
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.records import GnssFix, LaserModel, LaserScan, frozen
+from fcslam.records import GnssFix, Keyscan, KeyscanFix, KeyscanId, LaserModel, LaserScan, frozen
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.writer import write_bag
 from fcslam.sources.faults import Fault
 from tests.anchoring.test_plan import placed
-from tests.planned_building import mapped
+from tests.planned_building import LASER, WALLS, mapped, ranges_at, sides, true_poses
 
 pyproj = pytest.importorskip("pyproj")
 
@@ -38,7 +40,13 @@ def fixes_of(true, T_earth_building, sigma_m=SIGMA_M, wrong=slice(0, 0)):
     at = np.array([se2.transform(se2.compose(T_earth_building, pose), np.array([ANTENNA]))[0] for pose in true])
     at += rng.normal(0.0, sigma_m, at.shape)
     at[wrong] += (6.0, -4.0)
-    return [GnssFix(float(k), *position, 400.0, sigma_m, ANTENNA) for k, position in enumerate(to_earth(at).tolist())]
+    fixes = enumerate(to_earth(at).tolist())
+    return tuple(KeyscanFix(KeyscanId("anna", k), *position, 400.0, sigma_m, ANTENNA) for k, position in fixes)
+
+
+def fixed(result, fixes):
+    """The result whose robots have these fixes."""
+    return replace(result, robots=tuple(replace(robot, fixes=fixes) for robot in result.robots))
 
 
 def off_m(placing, true, T_earth_building):
@@ -54,14 +62,14 @@ def off_m(placing, true, T_earth_building):
 @pytest.mark.parametrize("T_earth_building", [(35.0, -20.0, 0.7), (-300.0, 500.0, -2.0)])
 def test_fixes_place_a_map_on_the_earth(T_earth_building):
     result, true = mapped()
-    placing = placed(result, fixes={"anna": fixes_of(true, T_earth_building, 0.05)})
+    placing = placed(fixed(result, fixes_of(true, T_earth_building, 0.05)))
     assert off_m(placing, true, T_earth_building).max() < 0.15
 
 
 def test_fixes_that_contradict_the_others_bend_nothing():
     T, (result, true) = (35.0, -20.0, 0.7), mapped()
     fixes = fixes_of(true, T, wrong=slice(8, 17))
-    placing = placed(result, fixes={"anna": fixes})
+    placing = placed(fixed(result, fixes))
     assert json.loads(placing.files["map_georeference.json"])["ignored"] >= 9
     steps = se2.relative(placing.result.robots[0].T_map_base)
     assert np.abs(steps - se2.relative(true)).max() < 0.02
@@ -70,7 +78,7 @@ def test_fixes_that_contradict_the_others_bend_nothing():
 
 def test_fixes_that_leave_the_heading_open_place_nothing():
     result, true = mapped()
-    placing = placed(result, fixes={"anna": fixes_of(true, (0.0, 0.0, 0.0), 8.0)})
+    placing = placed(fixed(result, fixes_of(true, (0.0, 0.0, 0.0), 8.0)))
     assert not json.loads(placing.files["map_georeference.json"])["georeferenced"]
     assert np.array_equal(placing.result.robots[0].T_map_base, result.robots[0].T_map_base)
 
@@ -86,8 +94,8 @@ def test_fixes_of_several_robots_at_one_time_are_no_more_frequent_for_it():
     graph = PoseGraph(poses, [*result.graph.edges, *edges, joined])
     both = replace(result, robots=(robot, bert), graph=graph)
     turns = []
-    for one, names in ((result, ["anna"]), (both, ["anna", "bert"])):
-        placing = placed(one, fixes=dict.fromkeys(names, fixes_of(true, (0.0, 0.0, 0.0), 2.0)))
+    for one in (result, both):
+        placing = placed(fixed(one, fixes_of(true, (0.0, 0.0, 0.0), 2.0)))
         turns.append(
             float(json.loads(placing.files["map_georeference.json"])["reason"].split(" deg only")[0].split()[-1])
         )
@@ -96,7 +104,7 @@ def test_fixes_of_several_robots_at_one_time_are_no_more_frequent_for_it():
 
 def test_a_map_that_a_user_placed_stays_and_is_found_on_the_earth():
     T, (result, true) = (35.0, -20.0, 0.7), mapped()
-    placing = placed(result, fixes={"anna": fixes_of(true, T, 0.05)}, by_hand={0})
+    placing = placed(fixed(result, fixes_of(true, T, 0.05)), by_hand={0})
     assert np.array_equal(placing.result.robots[0].T_map_base, result.robots[0].T_map_base)
     assert off_m(placing, true, T).max() < 0.15
 
@@ -117,3 +125,50 @@ def test_a_bag_gives_its_fixes_and_names_those_at_zero(tmp_path, suffix):
     assert {fix.antenna_xy for fix in found} == {ANTENNA}
     assert {fix.sigma_m for fix in found} == {1.5}
     assert bag.faults[Fault.FIX_AT_ZERO].count == 1
+
+
+def test_fixes_are_part_of_the_mission_and_place_it_again(tmp_path):
+    T, true, walls = (35.0, -20.0, 0.7), true_poses(), sides(WALLS)
+    scans = [
+        LaserScan(float(k), frozen(ranges_at(pose, walls), np.float32), LASER, frozen(se2.between(true[0], pose)))
+        for k, pose in enumerate(true)
+    ]
+    measured = fixes_of(true, T, 0.05)
+    fixes = [
+        GnssFix(k + 0.3, fix.latitude_deg, fix.longitude_deg, 400.0, 0.1, ANTENNA) for k, fix in enumerate(measured)
+    ]
+    write_bag(tmp_path / "anna.bag", sorted([*scans, *fixes], key=lambda record: record.stamp))
+    first = map_recordings(tmp_path / "anna.bag", output=tmp_path / "run")
+    again = map_recordings([], onto=tmp_path / "run")
+    place = json.loads(first.map_files["map_georeference.json"])
+    assert place["fixes"] > 0.9 * len(true)
+    assert place["ignored"] == 0
+    assert first.map_files == again.map_files
+    found = np.concatenate([each.T_map_base for each in first.trajectories.values()])
+    expected = to_earth(se2.compose(np.array(T), true)[:, :2])
+    metres = 111_200.0 * np.array((1.0, np.cos(np.radians(ORIGIN[0]))))
+    east_north = ((expected - (place["latitude_deg"], place["longitude_deg"])) * metres)[:, ::-1]
+    assert np.hypot(*(found[:, :2] - east_north).T).max() < 0.15
+
+
+def test_a_fix_is_sent_with_the_keyscan_of_the_scan_next_to_it():
+    """The antenna in the base of the keyscan is where the truth has it."""
+    steps = np.arange(30)
+    true, walls = np.column_stack((1.0 + 0.1 * steps, np.full(30, 3.0), 0.02 * steps)), sides(WALLS)
+    robot, packets = RobotFrontend("anna", RobotConfig()), []
+    for k, pose in enumerate(true):
+        odometry = frozen(se2.between(true[0], pose))
+        if k % 2:  # not at every keyscan itself
+            packets += robot.process(GnssFix(k - 0.1, 47.0, 8.0 + k, 400.0, 1.0, ANTENNA))
+        packets += robot.process(LaserScan(float(k), frozen(ranges_at(pose, walls), np.float32), LASER, odometry))
+    packets += robot.process(GnssFix(99.0, 47.0, 99.0, 400.0, 1.0, ANTENNA))
+    packets += robot.finish()
+    at = {packet.body.id.number: packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)}
+    sent = [packet.body for packet in packets if isinstance(packet.body, KeyscanFix)]
+    assert len(sent) >= 9
+    for fix in sent:
+        scan = round(fix.longitude_deg - 8.0)
+        keyscan = true[round(at[fix.id.number])]
+        expected = se2.transform(se2.between(keyscan, true[scan]), np.array([ANTENNA]))[0]
+        assert fix.antenna_xy == pytest.approx(tuple(expected), abs=0.02)
+    assert len({fix.id for fix in sent}) == len(sent)

@@ -11,7 +11,7 @@ from fcslam.anchoring.anchors import Anchors, anchored
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.cli.map import _anchors
-from fcslam.cloud.report import fuse_members, keyscan_track
+from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.field import SurfelField
@@ -22,12 +22,9 @@ from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 pytestmark = pytest.mark.slow
 
 
-def placed(result, plan=None, to_walls=False, by_hand=(), fixes=None):
-    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+def placed(result, plan=None, to_walls=False, by_hand=()):
     anchors = Anchors(None if plan is None else BuildingPlan(plan), to_walls)
-    return anchored(
-        result, anchors, fixes or {}, tracks, by_hand, lambda members: fuse_members(members, OccupancyConfig())
-    )
+    return anchored(result, anchors, by_hand, lambda members: fuse_members(members, OccupancyConfig()))
 
 
 def report_of(placing):

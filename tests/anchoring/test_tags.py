@@ -8,7 +8,7 @@ import pytest
 
 from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines
 from fcslam.anchoring.tags import read_survey
-from fcslam.cloud.report import fuse_members, keyscan_track
+from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -36,9 +36,8 @@ def sightings(true, tags=WALL_TAGS, scale=1.0, robot="anna", rows=slice(None)):
 
 
 def placed(result, seen, survey=None, by_hand=()):
-    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     return anchored(
-        replace(result, sightings=seen), Anchors(survey=survey), {}, tracks, by_hand,
+        replace(result, sightings=seen), Anchors(survey=survey), by_hand,
         lambda members: fuse_members(members, OccupancyConfig()),
     )  # fmt: skip
 

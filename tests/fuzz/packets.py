@@ -17,6 +17,7 @@ from fcslam.records import (
     Correction,
     DetectorFile,
     Keyscan,
+    KeyscanFix,
     KeyscanId,
     LaserModel,
     Place,
@@ -67,6 +68,7 @@ def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
         yield Place(KeyscanId("alice", size), channel, "light-1", size, size + 9, keypoints, codes)
     tag = Tag(TagFamily.APRILTAG_36H11, size % 587)
     yield TagSighting(KeyscanId("alice", size), tag, motion, (information + information.T) / 2.0)
+    yield KeyscanFix(KeyscanId("alice", size), *rng.uniform(-80.0, 80.0, 3).tolist(), 1.5, (0.25, size / 4096))
     yield Correction("alice", size, 0, motion)
     yield Acknowledgement("alice", 7, size)
     yield DetectorUpdate("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))

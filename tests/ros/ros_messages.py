@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 CODEC = MessageCodec(ros1=False)
@@ -66,6 +66,14 @@ def camera_info(stamp, width=8, height=6):
     return CODEC.make(
         CAMERA_INFO, header=header(stamp, "camera"), height=height, width=width, distortion_model="plumb_bob",
         d=np.zeros(5), k=K, r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=region,
+    )  # fmt: skip
+
+
+def fix(stamp, latitude, longitude, frame="gnss"):
+    status = CODEC.make("sensor_msgs/NavSatStatus", status=0, service=1)
+    return CODEC.make(
+        FIX, header=header(stamp, frame), status=status, latitude=latitude, longitude=longitude, altitude=400.0,
+        position_covariance=np.zeros(9), position_covariance_type=0,
     )  # fmt: skip
 
 

@@ -4,18 +4,20 @@ import numpy as np
 import pytest
 
 from fcslam.errors import NetworkError
-from fcslam.records import CameraImage
+from fcslam.records import CameraImage, GnssFix
 from fcslam.ros import sensors
 from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
+from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
+from fcslam.sources.faults import Fault
 from tests.ros.ros_messages import (
     CODEC,
     KINDS,
     LASER_POSE,
     camera_info,
     encoded,
+    fix,
     header,
     image,
     multi_echo,
@@ -31,10 +33,10 @@ RANGES = np.full(180, 5.0)
 class Robot:
     """Feeds messages to sensors and keeps what comes out."""
 
-    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), **options):
+    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), fixes=None, **options):
         self.said = []
         self.kinds = kinds
-        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info)
+        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info, fixes)
         self.sensors = LiveSensors(topics, "", BagOptions(**options), False, self.hears_of)
         self.records = []
         self.now_s = 0.0
@@ -450,3 +452,17 @@ def test_depth_images_wait_for_their_calibration():
     record = robot.records[0]
     errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, record.laser.angles_rad()))
     assert np.nanmedian(errors) < 0.005
+
+
+def test_a_fix_of_satellite_navigation_has_the_antenna_that_tf_says():
+    robot = Robot(kinds={**KINDS, "/fix": FIX}, fixes="/fix")
+    robot.hears("/fix", fix(0.5, 47.0, 8.5))  # nobody knows yet where the antenna sits
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "gnss", (-0.3, 0.2, 0.0)))
+    robot.drives(np.arange(1.0, 9.0))
+    robot.hears("/fix", fix(8.1, 47.0, 8.5)).hears("/fix", fix(8.2, 0.0, 0.0)).hears("/fix", fix(8.3, 91.0, 8.5))
+    found = [record for record in robot.records if isinstance(record, GnssFix)]
+    assert [(each.stamp, each.latitude_deg, each.longitude_deg) for each in found] == [(8.1, 47.0, 8.5)]
+    assert found[0].antenna_xy == pytest.approx((-0.3, 0.2))
+    assert robot.sensors.audit.faults()[Fault.FIX_AT_ZERO].count == 1
+    assert robot.sensors.audit.faults()[Fault.BROKEN_MESSAGE].count == 1

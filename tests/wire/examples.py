@@ -14,6 +14,7 @@ from fcslam.records import (
     Correction,
     DetectorFile,
     Keyscan,
+    KeyscanFix,
     KeyscanId,
     LaserModel,
     MapTile,
@@ -98,6 +99,7 @@ TAG_SIGHTING = TagSighting(
     frozen([1.5, -0.25, 3.0]),
     frozen([[400.0, 16.0, -8.0], [16.0, 900.0, 4.0], [-8.0, 4.0, 100.0]]),
 )
+KEYSCAN_FIX = KeyscanFix(KeyscanId("alice", 12), 47.3769, 8.5417, 408.0, 1.5, (-0.25, 0.5))
 CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]), 0.75)
 ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
 DETECTOR_UPDATE = DetectorUpdate(
@@ -124,6 +126,7 @@ EXAMPLES = {
     "word_place": packet(WORD_PLACE),
     "map_tile": packet(MAP_TILE),
     "tag_sighting": packet(TAG_SIGHTING),
+    "keyscan_fix": packet(KEYSCAN_FIX),
     "correction": packet(CORRECTION),
     "acknowledgement": packet(ACKNOWLEDGEMENT),
     "detector_update": packet(DETECTOR_UPDATE),

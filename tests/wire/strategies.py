@@ -11,6 +11,7 @@ from fcslam.records import (
     Correction,
     DetectorFile,
     Keyscan,
+    KeyscanFix,
     KeyscanId,
     LaserModel,
     MapTile,
@@ -159,6 +160,14 @@ def hellos(draw, robot, epoch):
     )
 
 
+def keyscan_fixes(identity):
+    arms = st.floats(-50.0, 50.0)
+    return st.builds(
+        KeyscanFix, identity, st.floats(-90.0, 90.0), st.floats(-360.0, 360.0), st.floats(-1e5, 1e5),
+        st.floats(1e-3, 1e4), st.tuples(arms, arms),
+    )  # fmt: skip
+
+
 def bodies(robot, epoch, time):
     stamps = st.floats(max_value=time, allow_nan=False, allow_infinity=False)
     identity = st.builds(KeyscanId, st.just(robot), NUMBERS)
@@ -170,6 +179,7 @@ def bodies(robot, epoch, time):
         word_places(robot),
         map_tiles(robot),
         st.builds(TagSighting, identity, tags(), poses(), informations()),
+        keyscan_fixes(identity),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), EPOCHS, SEQUENCES),
         st.builds(DetectorUpdate, st.just(robot), detector_files()),

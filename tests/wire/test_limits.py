@@ -242,7 +242,7 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
 @pytest.mark.parametrize(
     ("name", "fields", "reason"),
     [
-        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 to 7"),
+        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 to 8"),
         ("hello", {"version": 3}, "version 3 of a packet of version 2"),
         ("keyscan", {"version": 3}, "version 3 of a packet of version 2"),
         ("floor_hello", {"version": 2}, "version 2 of a packet of version 3"),
@@ -319,6 +319,13 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("tag_sighting", {"information": [1.0] * 5}, "5 numbers"),
         ("tag_sighting", {"information": [1.0, 0.0, 0.0, NAN, 0.0, 1.0]}, "tag sighting: information is not finite"),
         ("tag_sighting", {"information": [1.0] * 6}, "positive definite"),
+        ("keyscan_fix", {"number": 2**31}, "number"),
+        ("keyscan_fix", {"latitude_deg": 90.5}, "not on the earth"),
+        ("keyscan_fix", {"longitude_deg": NAN}, "not on the earth"),
+        ("keyscan_fix", {"altitude_m": INF}, "altitude"),
+        ("keyscan_fix", {"sigma_m": 0.0}, "standard deviation"),
+        ("keyscan_fix", {"sigma_m": NAN}, "standard deviation"),
+        ("keyscan_fix", {"antenna_x_m": 2e3}, "antenna"),
         ("correction", {"t_map_odom": pb.Pose(y_m=2e6)}, "not within"),
         ("correction", {"t_map_odom": None}, "t_map_odom is missing"),
         ("acknowledgement", {"robot": "a" * 65}, "is not a name"),

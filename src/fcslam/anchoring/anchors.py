@@ -14,14 +14,13 @@ from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
 from fcslam.anchoring.tags import MapTags, Survey, placed_by_tags, tag_lines
 from fcslam.anchoring.walls import wall_direction
-from fcslam.cloud.report import Track
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
-from fcslam.records import FloatArray, GnssFix, frozen
+from fcslam.records import FloatArray, frozen
 from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
@@ -64,8 +63,6 @@ class _Part:
 def anchored(
     result: FleetResult,
     anchors: Anchors,
-    fixes: Mapping[str, Sequence[GnssFix]],
-    tracks: Mapping[str, Track],
     placed: Collection[int],
     fuse: FuseMembers,
 ) -> Anchored:
@@ -74,8 +71,6 @@ def anchored(
     Args:
         result: the maps, each in a frame of its own.
         anchors: what is known.
-        fixes: fixes of satellite navigation of each robot, by its sessions.
-        tracks: the scans of each session.
         placed: maps that a user placed; they stay about there.
         fuse: draws a map.
     """
@@ -112,8 +107,7 @@ def anchored(
                 found_tags = placed_by_tags(part.robots, part.graph, result.sightings, anchors.survey)
                 part, by_tags = _Part(found_tags.robots, found_tags.graph), not found_tags.refusal
                 surveyed.append({"map": k, **found_tags.report()})
-        own = {robot.robot: fixes[robot.robot] for robot in part.robots if fixes.get(robot.robot)}
-        found = georeferenced(part.robots, part.graph, own, tracks, is_fixed=in_plan or is_placed or by_tags)
+        found = georeferenced(part.robots, part.graph, is_fixed=in_plan or is_placed or by_tags)
         if found is not None:
             part = _Part(found.robots, found.graph)
             files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))

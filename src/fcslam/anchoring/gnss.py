@@ -5,23 +5,19 @@ others are weak factors of the pose graph. Coordinates are metres east and north
 are known, on the plane that touches the ellipsoid there (azimuthal equidistant projection of PROJ).
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.report import Track
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.anchored import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.records import FloatArray, GnssFix, frozen
+from fcslam.records import FloatArray, frozen
 
-LATE_S: Final = 0.5
-"""Largest time between a fix and the scan whose pose it measures."""
 OUTLIER: Final = 3.0
 """A fix that is farther off than this many standard deviations does not count."""
 CORRELATED_S: Final = 10.0
@@ -87,30 +83,21 @@ class _Measured:
         return off
 
 
-def georeferenced(
-    robots: tuple[MappedRobot, ...],
-    graph: PoseGraph,
-    fixes: Mapping[str, Sequence[GnssFix]],
-    tracks: Mapping[str, Track],
-    is_fixed: bool,
-) -> Georeference | None:
+def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: bool) -> Georeference | None:
     """Place a map on the earth, conclusively or not at all.
 
     Args:
         robots: the robots of the map.
         graph: the graph of these alone.
-        fixes: of each session.
-        tracks: the scans of each session.
         is_fixed: the map keeps its frame and its poses; else it is turned so that x is east and y is north.
 
     Returns:
         The map and where it lies; None if it has no fix.
     """
-    by_robot = [_at_scans(robot, fixes.get(robot.robot, ()), tracks) for robot in robots]
-    placed = [found for its in by_robot for found in its]
-    if not placed:
+    kept = [fix for robot in robots for fix in robot.fixes]
+    if not kept:
         return None
-    kept = [fix for _, _, fix in placed]
+    at = [np.array([fix.id.number for fix in robot.fixes], np.int64) for robot in robots]
     try:
         from pyproj import Proj
     except ImportError:
@@ -118,10 +105,11 @@ def georeferenced(
     middle = np.median([(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in kept], axis=0)
     projection: Any = Proj(proj="aeqd", lat_0=middle[0], lon_0=middle[1], ellps="WGS84")
     east, north = projection([fix.longitude_deg for fix in kept], [fix.latitude_deg for fix in kept])
-    gaps_s = np.concatenate([np.diff(np.sort([fix.stamp for _, _, fix in its])) for its in by_robot])
+    gaps_s = np.concatenate([np.diff(robot.stamps[rows]) for robot, rows in zip(robots, at, strict=True)])
     interval_s = float(np.median(gaps_s)) if len(gaps_s) else CORRELATED_S
     measured = _Measured(
-        np.array([variable for variable, _, _ in placed]), np.array([arm for _, arm, _ in placed]),
+        np.concatenate([robot.variables[rows] for robot, rows in zip(robots, at, strict=True)]),
+        np.array([fix.antenna_xy for fix in kept]),
         np.column_stack((east, north)), np.array([fix.sigma_m for fix in kept]),
         max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
     )  # fmt: skip
@@ -138,22 +126,6 @@ def georeferenced(
     return Georeference(
         robots, graph, len(kept), int((~agreeing).sum()), "", latitude, longitude, float(middle[2]), float(T[2])
     )
-
-
-def _at_scans(
-    robot: MappedRobot, fixes: Sequence[GnssFix], tracks: Mapping[str, Track]
-) -> list[tuple[int, FloatArray, GnssFix]]:
-    """Each fix with the variable of its keyscan and the antenna's position in the base of the keyscan."""
-    track = tracks.get(robot.robot)
-    if track is None or not len(track.stamps):
-        return []
-    found = []
-    for fix in fixes:
-        scan = int(np.argmin(np.abs(track.stamps - fix.stamp)))
-        if abs(track.stamps[scan] - fix.stamp) <= LATE_S:
-            arm = se2.transform(track.T_keyscan_base[scan], np.array([fix.antenna_xy]))[0]
-            found.append((int(robot.variables[track.keyscans[scan]]), arm, fix))
-    return found
 
 
 def _vote(measured: _Measured, antennas: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

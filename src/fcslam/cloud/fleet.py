@@ -38,6 +38,7 @@ from fcslam.records import (
     Correction,
     FloatArray,
     Keyscan,
+    KeyscanFix,
     KeyscanId,
     ManualClosure,
     MapTile,
@@ -123,6 +124,8 @@ class Fleet:
                 self._place(self._words.place(place, self._sessions.vocabularies(place.id.robot)))
             case TagSighting() as sighting:
                 self._add_sighting(sighting)
+            case KeyscanFix() as fix:
+                self._sessions.add_fix(fix)
             case MapTile() as tile:
                 self._sessions.add_tile(tile, packet.sequence)
             case Correction() | Acknowledgement() | DetectorUpdate():

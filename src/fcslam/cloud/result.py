@@ -19,6 +19,7 @@ from fcslam.records import (
     Correction,
     FloatArray,
     Keyscan,
+    KeyscanFix,
     KeyscanId,
     LaserModel,
     LoopClosure,
@@ -53,6 +54,8 @@ class MappedRobot:
     """Floor that the session named; empty: none."""
     own_map: OccupancyMap | None = None
     """The map that it sent, in its own frame, if its ranges stay on the robot."""
+    fixes: tuple[KeyscanFix, ...] = ()
+    """Fixes of satellite navigation at its keyscans."""
 
     @property
     def T_map_local(self) -> FloatArray:
@@ -135,6 +138,7 @@ def conclude(
             sessions.lasers(robot),
             sessions.floor(robot),
             sessions.own_map(robot),
+            tuple(fix for fix in sessions.fixes(robot) if not is_cut(robot, sessions.stamp(fix.id), changes)),
         )
         for robot in names
     )

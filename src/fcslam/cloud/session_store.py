@@ -12,7 +12,18 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
 from fcslam.maps.fusion import joined_tiles
-from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, MapTile, Place, frozen
+from fcslam.records import (
+    Channel,
+    Constraint,
+    FloatArray,
+    Keyscan,
+    KeyscanFix,
+    KeyscanId,
+    LaserModel,
+    MapTile,
+    Place,
+    frozen,
+)
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
@@ -55,6 +66,8 @@ class SessionStore:
         """Tiles of the session's own map, by column and row."""
         self._tile_sequences: dict[str, list[int]] = {}
         """Numbers of their packets."""
+        self._fixes: dict[str, dict[int, KeyscanFix]] = {}
+        """Of satellite navigation, by keyscan."""
         self._places: set[tuple[KeyscanId, Channel, str]] = set()
         """Keyscan, channel and detector version of every place."""
         self._spans: dict[tuple[KeyscanId, Channel], tuple[int, int]] = {}
@@ -152,6 +165,23 @@ class SessionStore:
         check_tile(tile, earlier, self._limits)
         self._tiles[tile.robot] = {**earlier, (tile.column, tile.row): tile}
         self._tile_sequences.setdefault(tile.robot, []).append(sequence)
+
+    def add_fix(self, fix: KeyscanFix) -> None:
+        """A fix of satellite navigation.
+
+        Raises:
+            PacketError: its keyscan is not there, or has one already.
+        """
+        self.require(fix.id)
+        robot, number = fix.id
+        fixes = self._fixes.setdefault(robot, {})
+        if number in fixes:
+            raise PacketError(f"{robot}: keyscan {number} has a fix already")
+        fixes[number] = fix
+
+    def fixes(self, robot: str) -> tuple[KeyscanFix, ...]:
+        """The fixes of satellite navigation of the robot."""
+        return tuple(self._fixes.get(robot, {}).values())
 
     def own_map(self, robot: str) -> OccupancyMap | None:
         """The map that the session sent, in its own frame; None if it sent none."""
@@ -255,6 +285,15 @@ class SessionStore:
             },
             "connected": list(self._connected.values()),
             "T_odom_base": {robot: np.array(pose) for robot, pose in self._T_odom_base.items()},
+            "fixes": {
+                robot: np.array(
+                    [
+                        (number, fix.latitude_deg, fix.longitude_deg, fix.altitude_m, fix.sigma_m, *fix.antenna_xy)
+                        for number, fix in fixes.items()
+                    ]
+                )
+                for robot, fixes in self._fixes.items()
+            },
         }
 
     def restore(self, state: State) -> None:
@@ -278,6 +317,12 @@ class SessionStore:
         for robot, sequences in self._tile_sequences.items():
             tiles = (self._stored(PacketNumber(robot, sequence), MapTile) for sequence in sequences)
             self._tiles[robot] = {(tile.column, tile.row): tile for tile in tiles}
+        for robot, rows in state["fixes"].items():
+            for number, latitude, longitude, altitude, sigma, *antenna in rows.tolist():
+                id, (x, y) = KeyscanId(robot, int(number)), antenna
+                self._fixes.setdefault(robot, {})[id.number] = KeyscanFix(
+                    id, latitude, longitude, altitude, sigma, (x, y)
+                )
         self._connected = dict(zip(state["robots"], state["connected"], strict=True))
         self._T_odom_base = {robot: frozen(pose) for robot, pose in state["T_odom_base"].items()}
 

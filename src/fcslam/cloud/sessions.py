@@ -8,7 +8,17 @@ import re
 from dataclasses import replace
 
 from fcslam.errors import PacketError
-from fcslam.records import Constraint, Correction, Keyscan, KeyscanId, MapTile, Place, TagSighting, WordPlace
+from fcslam.records import (
+    Constraint,
+    Correction,
+    Keyscan,
+    KeyscanFix,
+    KeyscanId,
+    MapTile,
+    Place,
+    TagSighting,
+    WordPlace,
+)
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 
 _SESSION = re.compile(r"(.+)\+(\d+)", re.ASCII)
@@ -56,7 +66,7 @@ def in_session(packet: Packet) -> Packet:
 
 def _renamed(body: Body, session: str) -> Body:
     match body:
-        case Keyscan() | Place() | WordPlace() | TagSighting():
+        case Keyscan() | Place() | WordPlace() | TagSighting() | KeyscanFix():
             return replace(body, id=KeyscanId(session, body.id.number))
         case Hello() | Constraint() | MapTile() | Correction() | Acknowledgement() | DetectorUpdate():
             return replace(body, robot=session)

@@ -17,7 +17,7 @@ from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError
 from fcslam.processes import needing_semaphores, obey_parent, start_method
-from fcslam.records import GnssFix, Keyscan, LaserScan
+from fcslam.records import Keyscan, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
@@ -42,8 +42,6 @@ class Leg:
     """All scans, by the name of the session; empty before the last leg."""
     faults: Faults | None = None
     """Faults of the recording; None before the last leg."""
-    fixes: tuple[GnssFix, ...] = ()
-    """Positions by satellites, which need no packet; all of them are in the last leg."""
 
     @property
     def keyscans(self) -> int:
@@ -97,20 +95,17 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     """Drive one robot over its whole recording."""
     packets: list[SizedPacket] = []
     stamps: list[float] = []
-    fixes: list[GnssFix] = []
     for record in source.records():
         packets += map(measure, robot.process(record))
         if isinstance(record, LaserScan):
             stamps.append(record.stamp)
-        if isinstance(record, GnssFix):
-            fixes.append(record)
         if len(stamps) == SCANS_PER_LEG:
             yield Leg(robot.robot, tuple(packets), tuple(stamps))
             packets, stamps = [], []
     packets += map(measure, robot.finish())
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
-    yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults, tuple(fixes))
+    yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)
 
 
 def on_floor(legs: Iterator[Leg], floor: str) -> Iterator[Leg]:

@@ -32,7 +32,7 @@ from fcslam.mission.driving import Drive, Leg, continued, on_floor, one_by_one
 from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
 from fcslam.mission.mission_store import StoredPacket
 from fcslam.places.matcher import MatchDecision
-from fcslam.records import Channel, Edit, GnssFix, Placement, Veto
+from fcslam.records import Channel, Edit, Placement, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
@@ -158,7 +158,7 @@ def run_mission(
             cloud.apply(sent)
             live(cloud)
     meter.report(fusing=True)
-    return cloud.run(meter.tracks, meter.scans, meter.recorded_s, anchors, meter.fixes)
+    return cloud.run(meter.tracks, meter.scans, meter.recorded_s, anchors)
 
 
 class MissionCloud:
@@ -239,10 +239,7 @@ class MissionCloud:
         metrics = traffic_metrics(self._traffic.ledger(), tracks)
         return run_of(result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False)
 
-    def run(
-        self, tracks: Mapping[str, Track], scans: int, recorded_s: float, anchors: Anchors = NOTHING_KNOWN,
-        fixes: Mapping[str, Sequence[GnssFix]] = MappingProxyType({}),
-    ) -> Run:  # fmt: skip
+    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float, anchors: Anchors = NOTHING_KNOWN) -> Run:
         """The result of all packets so far.
 
         Args:
@@ -250,7 +247,6 @@ class MissionCloud:
             scans: number of scans.
             recorded_s: length of the recordings together, seconds.
             anchors: what is known about the building.
-            fixes: positions by satellites, by robot.
         """
         result = self._cloud.finalize()
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
@@ -259,21 +255,18 @@ class MissionCloud:
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
         mission = mission_bytes(self._settings, self._edits, self._packets, self._refused, tracks)
-        placing = self._placed(result, tracks, anchors, fixes)
+        placing = self._placed(result, anchors)
         run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
         run = replace(run, map_files={**run.map_files, **placing.files})
         return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
 
-    def _placed(
-        self, result: FleetResult, tracks: Mapping[str, Track], anchors: Anchors,
-        fixes: Mapping[str, Sequence[GnssFix]],
-    ) -> Anchored:  # fmt: skip
-        if anchors == NOTHING_KNOWN and not any(fixes.values()) and not result.sightings:
+    def _placed(self, result: FleetResult, anchors: Anchors) -> Anchored:
+        is_fixed = any(robot.fixes for robot in result.robots)
+        if anchors == NOTHING_KNOWN and not is_fixed and not result.sightings:
             return Anchored(result)
         by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
-        own = {robot.robot: fixes.get(robot_of(robot.robot), ()) for robot in result.robots}
-        return anchored(result, anchors, own, tracks, placed, lambda members: fuse_members(members, self.config.map))
+        return anchored(result, anchors, placed, lambda members: fuse_members(members, self.config.map))
 
     @property
     def _settings(self) -> CloudConfig:
@@ -311,8 +304,6 @@ class _Meter:
         self.scans = self.keyscans = 0
         self._tracks: dict[str, dict[str, Track]] = {robot: {} for robot in robots}
         """By robot and session, of the robots that are done."""
-        self.fixes: dict[str, tuple[GnssFix, ...]] = {}
-        """By robot, of the robots that are done."""
 
     @property
     def tracks(self) -> dict[str, Track]:
@@ -336,7 +327,6 @@ class _Meter:
             self.report()
         else:
             self._tracks[leg.robot] |= leg.tracks
-            self.fixes[leg.robot] = self.fixes.get(leg.robot, ()) + leg.fixes
             self._faults[leg.robot] = leg.faults
 
     def take_over(self, onto: SavedMission) -> None:

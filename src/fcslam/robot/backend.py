@@ -23,6 +23,7 @@ from fcslam.records import (
     Channel,
     DetectorFile,
     FloatArray,
+    KeyscanFix,
     KeyscanId,
     LaserModel,
     LaserScan,
@@ -104,7 +105,7 @@ class SessionEnd:
 PLACED_AFTER, PLACED_AFTER_SHARE = 20, 0.1
 """Keyframes after which the poses of all are written again, and as a share of those that there are."""
 
-BackendInput = NewKeyscan | NewImage | NewDetector | PlaceKeyframes | SessionEnd
+BackendInput = NewKeyscan | NewImage | KeyscanFix | NewDetector | PlaceKeyframes | SessionEnd
 
 
 class RobotBackend:
@@ -160,6 +161,8 @@ class RobotBackend:
                 if Channel.CAMERA in self._config.channels and self._session.describe(input):
                     self._place_sometimes()
                 return list(self._session.find_tags(input))
+            case KeyscanFix():
+                return [input]
             case NewDetector():
                 self._set_detector(input.file, input.path)
                 return self._session.announcement()

@@ -23,7 +23,17 @@ from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, drove_on, has_moved_unseen, is_doubtful, is_lost
 from fcslam.lidar.odometry import WHEELS, OdometryModel
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
-from fcslam.records import CameraImage, DetectorFile, FloatArray, LaserScan, SensorRecord, Sweep
+from fcslam.records import (
+    CameraImage,
+    DetectorFile,
+    FloatArray,
+    GnssFix,
+    KeyscanFix,
+    KeyscanId,
+    LaserScan,
+    SensorRecord,
+    Sweep,
+)
 from fcslam.robot.backend import (
     BackendInput,
     NewDetector,
@@ -48,6 +58,10 @@ from fcslam.wire.messages import Body, Hello, Packet
 
 SCANS_THAT_CHANGED = 10
 """So many scans in a row that changed while the odometry said nothing show that it measures nothing."""
+LATE_S = 0.5
+"""Largest time between a fix and the scan whose pose it measures."""
+MOST_FIXES = 100
+"""Fixes that wait for a scan; older ones are dropped."""
 
 
 class RobotConfig(SessionConfig):
@@ -131,6 +145,10 @@ class RobotFrontend:
         """Records since the first doubtful scan."""
         self._T_local_deferred: FloatArray | None = None
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
+        self._fixes: deque[GnssFix] = deque(maxlen=MOST_FIXES)
+        """Fixes of satellite navigation that wait for the next scan."""
+        self._fixed = -1
+        """The newest keyscan of the present session with a fix."""
         self._at_rest: LaserScan | None = None
         """The first scan."""
         self._odometry = PathSummary()
@@ -174,6 +192,8 @@ class RobotFrontend:
                     self._deferred.append(image)
                 else:
                     self._describe(image)
+            case GnssFix():
+                self._fixes.append(record)
         return self.ready()  # scans carry their odometry; images never leave the robot
 
     def ready(self, wait: bool = False) -> list[Packet]:
@@ -306,7 +326,7 @@ class RobotFrontend:
     def _begin(self) -> None:
         """Begin a session."""
         self._lidar = LidarFrontend(self.robot, self._config.lidar, self.odometry_model)
-        self._newest, self._scans, self._explained = None, {}, {}
+        self._newest, self._scans, self._explained, self._fixed = None, {}, {}, -1
         self.tracks.append(ScanTrack())
 
     def _process_deferred(self) -> None:
@@ -328,12 +348,27 @@ class RobotFrontend:
                 self.scan_poses.extend(keyscan.odometry.T_i_j)
             self._submit(NewKeyscan(keyscan, self._lidar.lasers))
         self.scan_poses.add(step.pose)
+        self._send_fixes(step.pose)
         self.newest = _newest(step.pose, tracking, is_deferred=False)
         self._newest = scan, step.pose
         self._scans[scan.laser.T_base_laser] = scan
         if tracking.explained >= DOUBTFUL * tracking.known:  # false if it was not matched
             self._explained[scan.laser.T_base_laser] = scan
         self._jumps = self.odometry.jumps
+
+    def _send_fixes(self, pose: ScanPose) -> None:
+        """Send the fixes up to the newest scan, each with the keyscan of the scan next to it, one for each keyscan."""
+        poses = (pose,) if self._newest is None else (self._newest[1], pose)
+        while self._fixes and self._fixes[0].stamp <= pose.stamp:
+            fix = self._fixes.popleft()
+            nearest = min(poses, key=lambda pose: abs(pose.stamp - fix.stamp))
+            if abs(nearest.stamp - fix.stamp) > LATE_S or nearest.keyscan <= self._fixed:
+                continue
+            self._fixed = nearest.keyscan
+            x, y = se2.transform(nearest.T_keyscan_base, np.array([fix.antenna_xy]))[0].tolist()
+            keyscan = KeyscanId(self.robot, nearest.keyscan)
+            position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
+            self._submit(KeyscanFix(keyscan, *position, fix.sigma_m, (x, y)))
 
     def _describe(self, image: CameraImage) -> None:
         if self._newest is not None:

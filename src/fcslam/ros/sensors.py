@@ -11,13 +11,14 @@ from dataclasses import replace
 from math import inf
 
 from fcslam.errors import NetworkError
-from fcslam.records import Beams, SensorRecord
+from fcslam.records import Beams, GnssFix, SensorRecord
 from fcslam.ros.topics import SensorTopics, info_beside
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
 from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    FIX,
     IMAGE,
     LASER_SCANS,
     ODOMETRY,
@@ -25,6 +26,7 @@ from fcslam.sources.bags.codec import (
     TRANSFORMS,
     MessageCodec,
 )
+from fcslam.sources.bags.fixes import FixAtZeroError, fix_of
 from fcslam.sources.bags.merging import ScanMerger
 from fcslam.sources.bags.messages import (
     UNKNOWN_RANGE_M,
@@ -139,6 +141,9 @@ class LiveSensors:
             NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
         """
         self._counts[topic] += 1
+        if topic == self._topics.fixes:
+            yield from self._fix(topic, payload, received_ns)
+            return
         if topic not in self._topics.scans and self._is_needless(self._topics.kinds[topic], now_s):
             return
         try:
@@ -206,6 +211,20 @@ class LiveSensors:
             self._next_image_s = now_s + RAW_IMAGE_PERIOD_S
         # Once the mountings are known, tf has nothing but the odometry.
         return self._rig is not None and self._topics.odometry is not None and kind in (TRANSFORMS, OLD_TRANSFORMS)
+
+    def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
+        """The fix in a message, once the mounting is known."""
+        if self._rig is None:
+            return
+        try:
+            fix = fix_of(self._codec.decode(payload, FIX), received_ns, self._tree, self.base_frame)
+        except FixAtZeroError:
+            self.audit.add(Fault.FIX_AT_ZERO, self._counts[topic])
+        except ValueError:
+            self.audit.add(Fault.BROKEN_MESSAGE, self._counts[topic])
+        else:
+            if fix is not None:
+                yield fix
 
     def _keep_early(self, number: int, item: Message) -> None:
         """Keep a message until the mounting is known; of images, the newest."""

@@ -9,6 +9,7 @@ from fcslam.ros.network import Endpoint, named_topics, published
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    FIX,
     IMAGE,
     ODOMETRY,
     OLD_TRANSFORMS,
@@ -38,6 +39,8 @@ class SensorTopics:
     """All topics of tf."""
     camera: str | None = None
     camera_info: str | None = None
+    fixes: str | None = None
+    """Of satellite navigation."""
     notes: tuple[str, ...] = ()
 
 
@@ -53,6 +56,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
       name;
     - odometry: the name ``odom``, first by name, else tf; ground truth only if the user names it;
     - camera: calibrated, compressed images, first by name;
+    - fixes of satellite navigation: first by name;
     - tf: the namespace's own if there is one, else that of all robots.
 
     Raises:
@@ -91,9 +95,10 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
         transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
     camera, info = _camera(chosen, known, inside, options.camera_topic)
     depth_infos = [info_beside(topic) for topic in scans if known[topic] == IMAGE]
-    read = (*scans, *depth_infos, *transforms, *filter(None, (odometry, camera, info)))
+    fixes = min((topic for topic in inside if known[topic] == FIX), default=None)
+    read = (*scans, *depth_infos, *transforms, *filter(None, (odometry, camera, info, fixes)))
     kinds = {topic: known.get(topic, TRANSFORMS) for topic in read}
-    return SensorTopics(kinds, tuple(scans), odometry, transforms, camera, info, tuple(notes))
+    return SensorTopics(kinds, tuple(scans), odometry, transforms, camera, info, fixes, tuple(notes))
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from fcslam.records import (
     DetectorFile,
     FloatArray,
     Keyscan,
+    KeyscanFix,
     KeyscanId,
     LaserModel,
     MapTile,
@@ -287,6 +288,21 @@ def _read_tag_sighting(message: pb.TagSighting, envelope: pb.Packet) -> TagSight
     )
 
 
+def _write_fix(fix: KeyscanFix) -> pb.KeyscanFix:
+    x, y = fix.antenna_xy
+    return pb.KeyscanFix(
+        number=fix.id.number, latitude_deg=fix.latitude_deg, longitude_deg=fix.longitude_deg,
+        altitude_m=fix.altitude_m, sigma_m=fix.sigma_m, antenna_x_m=x, antenna_y_m=y,
+    )  # fmt: skip
+
+
+def _read_fix(message: pb.KeyscanFix, envelope: pb.Packet) -> KeyscanFix:
+    return KeyscanFix(
+        KeyscanId(envelope.robot, message.number), message.latitude_deg, message.longitude_deg, message.altitude_m,
+        message.sigma_m, (message.antenna_x_m, message.antenna_y_m),
+    )  # fmt: skip
+
+
 def _check_at_most(count: int, most: int, what: str) -> None:
     """Refuse a count before memory is allocated for it."""
     if count > most:
@@ -371,6 +387,7 @@ CODECS = {
     PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place),
     PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile),
     PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information),
+    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

@@ -18,6 +18,7 @@ from fcslam.records import (
     Correction,
     FloatArray,
     Keyscan,
+    KeyscanFix,
     LaserModel,
     MapTile,
     Place,
@@ -30,14 +31,19 @@ from fcslam.wire.limits import (
     DIGEST_BYTES,
     KEYPOINT_AXES,
     MAXIMUM_ACCELERATION,
+    MAXIMUM_ALTITUDE_M,
+    MAXIMUM_ANTENNA_M,
     MAXIMUM_BEAM_TIME_S,
     MAXIMUM_BEAMS,
     MAXIMUM_COORDINATE_M,
     MAXIMUM_EPOCH,
+    MAXIMUM_FIX_SIGMA_M,
     MAXIMUM_INFORMATION,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASER_RANGE_M,
     MAXIMUM_LASERS,
+    MAXIMUM_LATITUDE_DEG,
+    MAXIMUM_LONGITUDE_DEG,
     MAXIMUM_NETWORK_BYTES,
     MAXIMUM_NUMBER,
     MAXIMUM_RESOLUTION_M,
@@ -79,7 +85,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def _robot_of(body: Body) -> str:
-    return body.id.robot if isinstance(body, Keyscan | Place | WordPlace | TagSighting) else body.robot
+    return body.id.robot if isinstance(body, Keyscan | Place | WordPlace | TagSighting | KeyscanFix) else body.robot
 
 
 def _check_hello(hello: Hello, packet: Packet) -> None:
@@ -215,6 +221,18 @@ def _check_tag_sighting(sighting: TagSighting, _: Packet) -> None:
     _check_information(sighting.information, "tag sighting")
 
 
+def _check_fix(fix: KeyscanFix, _: Packet) -> None:
+    _check_count(fix.id.number, "fix: number", MAXIMUM_NUMBER)
+    # false for NaN
+    is_on_earth = abs(fix.latitude_deg) <= MAXIMUM_LATITUDE_DEG and abs(fix.longitude_deg) <= MAXIMUM_LONGITUDE_DEG
+    _require(is_on_earth, f"fix: latitude {fix.latitude_deg:g}, longitude {fix.longitude_deg:g} are not on the earth")
+    _require(abs(fix.altitude_m) <= MAXIMUM_ALTITUDE_M, f"fix: an altitude of {fix.altitude_m:g} m")
+    is_known = 0.0 < fix.sigma_m <= MAXIMUM_FIX_SIGMA_M
+    _require(is_known, f"fix: a standard deviation of {fix.sigma_m:g} m, not in 0..{MAXIMUM_FIX_SIGMA_M:g}")
+    is_near = math.hypot(*fix.antenna_xy) <= MAXIMUM_ANTENNA_M
+    _require(is_near, f"fix: the antenna is not within {MAXIMUM_ANTENNA_M:g} m of the robot")
+
+
 def _check_described(place: Place | WordPlace) -> None:
     _check_count(place.id.number, "place: number", MAXIMUM_NUMBER)
     _check_count(place.first, "place: first", MAXIMUM_NUMBER)
@@ -261,6 +279,7 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     WordPlace: _check_word_place,
     MapTile: _check_map_tile,
     TagSighting: _check_tag_sighting,
+    KeyscanFix: _check_fix,
     Correction: _check_correction,
     Acknowledgement: _check_acknowledgement,
     DetectorUpdate: _check_detector_update,

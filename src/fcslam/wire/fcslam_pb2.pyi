@@ -26,7 +26,7 @@ CONSTRAINT_KIND_ODOMETRY: ConstraintKind
 CONSTRAINT_KIND_CLOSURE: ConstraintKind
 
 class Packet(_message.Message):
-    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "tag_sighting", "correction", "acknowledgement", "detector_update")
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "tag_sighting", "keyscan_fix", "correction", "acknowledgement", "detector_update")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     ROBOT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -39,6 +39,7 @@ class Packet(_message.Message):
     WORD_PLACE_FIELD_NUMBER: _ClassVar[int]
     MAP_TILE_FIELD_NUMBER: _ClassVar[int]
     TAG_SIGHTING_FIELD_NUMBER: _ClassVar[int]
+    KEYSCAN_FIX_FIELD_NUMBER: _ClassVar[int]
     CORRECTION_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
     DETECTOR_UPDATE_FIELD_NUMBER: _ClassVar[int]
@@ -54,10 +55,11 @@ class Packet(_message.Message):
     word_place: WordPlace
     map_tile: MapTile
     tag_sighting: TagSighting
+    keyscan_fix: KeyscanFix
     correction: Correction
     acknowledgement: Acknowledgement
     detector_update: DetectorUpdate
-    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., keyscan_fix: _Optional[_Union[KeyscanFix, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
 
 class Pose(_message.Message):
     __slots__ = ("x_m", "y_m", "theta_rad")
@@ -208,6 +210,24 @@ class TagSighting(_message.Message):
     t_base_tag: Pose
     information: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, number: _Optional[int] = ..., family: _Optional[str] = ..., tag: _Optional[int] = ..., t_base_tag: _Optional[_Union[Pose, _Mapping]] = ..., information: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class KeyscanFix(_message.Message):
+    __slots__ = ("number", "latitude_deg", "longitude_deg", "altitude_m", "sigma_m", "antenna_x_m", "antenna_y_m")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    LATITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    LONGITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    ALTITUDE_M_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_M_FIELD_NUMBER: _ClassVar[int]
+    ANTENNA_X_M_FIELD_NUMBER: _ClassVar[int]
+    ANTENNA_Y_M_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    sigma_m: float
+    antenna_x_m: float
+    antenna_y_m: float
+    def __init__(self, number: _Optional[int] = ..., latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., altitude_m: _Optional[float] = ..., sigma_m: _Optional[float] = ..., antenna_x_m: _Optional[float] = ..., antenna_y_m: _Optional[float] = ...) -> None: ...
 
 class Correction(_message.Message):
     __slots__ = ("version", "map_index", "t_map_odom", "quality")

@@ -1,4 +1,4 @@
-"""All limits of the format, versions 2 to 7. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 to 8. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
@@ -11,6 +11,8 @@ SWEEP_VERSION = 6
 """Version of a keyscan whose beams were measured at different times."""
 TAG_VERSION = 7
 """Version of a tag sighting."""
+FIX_VERSION = 8
+"""Version of a fix of satellite navigation."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -52,6 +54,12 @@ MAXIMUM_RESOLUTION_M = 10.0
 
 MAXIMUM_TAG = 4095
 """Number of a tag; the largest family has 2320."""
+
+MAXIMUM_LATITUDE_DEG, MAXIMUM_LONGITUDE_DEG = 90.0, 360.0
+MAXIMUM_ALTITUDE_M = 1e5
+MAXIMUM_FIX_SIGMA_M = 1e4
+MAXIMUM_ANTENNA_M = 1000.0
+"""Distance of an antenna from the base of a keyscan."""
 
 MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
 """Largest file of a detector; present ones have 0.5 to 5 MB."""

@@ -10,6 +10,7 @@ from fcslam.records import (
     Correction,
     DetectorFile,
     Keyscan,
+    KeyscanFix,
     LaserModel,
     MapTile,
     Place,
@@ -28,6 +29,7 @@ class PacketKind(StrEnum):
     WORD_PLACE = "word_place"
     MAP_TILE = "map_tile"
     TAG_SIGHTING = "tag_sighting"
+    KEYSCAN_FIX = "keyscan_fix"
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
     DETECTOR_UPDATE = "detector_update"
@@ -42,6 +44,7 @@ UPLINK = frozenset(
         PacketKind.WORD_PLACE,
         PacketKind.MAP_TILE,
         PacketKind.TAG_SIGHTING,
+        PacketKind.KEYSCAN_FIX,
     }
 )
 """Kinds that robots send; the cloud sends the others."""
@@ -89,6 +92,7 @@ Body = (
     | WordPlace
     | MapTile
     | TagSighting
+    | KeyscanFix
     | Correction
     | Acknowledgement
     | DetectorUpdate

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Channel, Keyscan, MapTile, Place, TagSighting, WordPlace
+from fcslam.records import CODE_BYTES, Channel, Keyscan, KeyscanFix, MapTile, Place, TagSighting, WordPlace
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
@@ -15,6 +15,7 @@ from fcslam.wire.limits import (
     BYTES_PER_RANGE,
     BYTES_PER_TILE,
     BYTES_PER_WORD,
+    FIX_VERSION,
     FLOOR_VERSION,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
@@ -29,7 +30,13 @@ from fcslam.wire.limits import (
 )
 from fcslam.wire.messages import Body, Hello, Packet, PacketKind
 
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION)
+_VERSION_OF: dict[type, int] = {
+    WordPlace: WORDS_VERSION,
+    MapTile: WORDS_VERSION,
+    TagSighting: TAG_VERSION,
+    KeyscanFix: FIX_VERSION,
+}
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION)
 
 
 class Label(NamedTuple):
@@ -167,10 +174,6 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
 
 def _version(body: Body) -> int:
     match body:
-        case WordPlace() | MapTile():
-            return WORDS_VERSION
-        case TagSighting():
-            return TAG_VERSION
         case Keyscan(ranges_m=ranges_m, sweep=sweep):
             return WORDS_VERSION if not len(ranges_m) else PROTOCOL_VERSION if sweep is None else SWEEP_VERSION
         case Hello(vocabularies=vocabularies) if vocabularies:
@@ -178,7 +181,7 @@ def _version(body: Body) -> int:
         case Hello(floor=floor) if floor:
             return FLOOR_VERSION
         case _:
-            return PROTOCOL_VERSION
+            return _VERSION_OF.get(type(body), PROTOCOL_VERSION)
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:

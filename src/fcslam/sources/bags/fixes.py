@@ -1,6 +1,6 @@
 """The fixes of a satellite receiver in a bag: sensor_msgs/NavSatFix."""
 
-from math import isfinite
+import math
 from typing import Any, Final
 
 from fcslam.records import GnssFix
@@ -14,6 +14,12 @@ SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
 """Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
 stations."""
 LEAST_SIGMA_M: Final = 0.02
+FIX_INTERVAL_S: Final = 0.9
+"""Least time between two fixes that are used; the errors of nearer ones are the same."""
+FARTHEST_ANTENNA_M: Final = 50.0
+HIGHEST_M: Final = 1e5
+"""A larger altitude is unknown."""
+LARGEST_SIGMA_M: Final = 1e4
 _NO_FIX: Final = -1
 
 
@@ -45,9 +51,14 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
     sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
     if content.position_covariance_type and 0.0 < east2 < 1e8 and 0.0 < north2 < 1e8:
-        sigma_m = max(LEAST_SIGMA_M, (0.5 * (east2 + north2)) ** 0.5)
+        sigma_m = min(max(LEAST_SIGMA_M, (0.5 * (east2 + north2)) ** 0.5), LARGEST_SIGMA_M)
     return GnssFix(
-        stamp, latitude, longitude, altitude if isfinite(altitude) else 0.0, sigma_m, _antenna(tree, base_frame, frame)
+        stamp,
+        latitude,
+        longitude,
+        altitude if abs(altitude) <= HIGHEST_M else 0.0,
+        sigma_m,
+        _antenna(tree, base_frame, frame),
     )
 
 
@@ -57,4 +68,6 @@ def _antenna(tree: TransformTree, base_frame: str, frame: str) -> tuple[float, f
         x, y, _ = mounting(tree.fixed(base_frame, frame)).T_base_laser
     except NoTransformError:
         return 0.0, 0.0
+    if not math.hypot(x, y) <= FARTHEST_ANTENNA_M:
+        raise ValueError(f"the antenna is {math.hypot(x, y):g} m from the robot")
     return x, y

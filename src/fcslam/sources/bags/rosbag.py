@@ -6,6 +6,7 @@ shows that there is odometry.
 """
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -17,7 +18,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord
 from fcslam.sources.bags.codec import LASER_SCANS
-from fcslam.sources.bags.fixes import FixAtZeroError, fix_of, fix_topics
+from fcslam.sources.bags.fixes import FIX_INTERVAL_S, FixAtZeroError, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
@@ -100,14 +101,15 @@ class RosBag:
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
-        first_s, last_s = math.inf, -math.inf
+        fixes = deque(self._fixes(audit))
         for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
+                while fixes and fixes[0].stamp <= record.stamp:
+                    yield fixes.popleft()
                 if values := placeholders[entry.scan.laser]:
                     record = replace(record, ranges_m=without(record.ranges_m, values))
                 watch.add(number, record)
-                first_s, last_s = min(first_s, record.stamp), max(last_s, record.stamp)
                 yield record
             elif isinstance(entry, OdometryReading):
                 yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
@@ -116,11 +118,10 @@ class RosBag:
                     yield rig.image(entry)
                 except ValueError:
                     audit.add(Fault.BROKEN_IMAGE, number)
-        # Where the fixes are in the order does not matter: they are used when all scans are mapped.
-        yield from (fix for fix in self._fixes(audit) if first_s <= fix.stamp <= last_s)
 
     def _fixes(self, audit: Audit) -> Iterator[GnssFix]:
-        stream = self.stream
+        """The fixes of satellite navigation, at most one a second."""
+        stream, newest_s = self.stream, -math.inf
         topics = fix_topics(stream.robot)[:1]
         for message in stream.bag.messages(topics) if topics else ():
             try:
@@ -130,7 +131,8 @@ class RosBag:
             except ValueError:
                 audit.add(Fault.BROKEN_MESSAGE, message.number)
             else:
-                if fix is not None:
+                if fix is not None and fix.stamp >= newest_s + FIX_INTERVAL_S:
+                    newest_s = fix.stamp
                     yield fix
 
     def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
