@@ -29,7 +29,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -209,7 +209,7 @@ class Fleet:
     def _start(self, name: str) -> Process:
         port = self.proxy.port if name == NAMES[-1] else self.server.port
         url = f"postgresql://fcslam@127.0.0.1:{port}/postgres"
-        options = ("--store", url, "--instance", name, "--data", self._place / name, "--port", self.ports[name])
+        options = ("--store", url, "--data", self._place / name, "--port", self.ports[name])
         return Process(("serve", *options), self._place / f"{name}.log")
 
     def stop(self) -> None:
@@ -223,7 +223,8 @@ class Fleet:
 class Watch:
     """Which instance has the ready worker of each mission."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, ports: Mapping[str, int]) -> None:
+        self._names = {str(port): name for name, port in ports.items()}
         self._server = Postgres(url, "benchmark")
 
     def held(self) -> dict[str, str]:
@@ -233,7 +234,7 @@ class Watch:
                 rows = self._server.rows(
                     "SELECT name, holder FROM missions WHERE is_ready AND expires > clock_timestamp()"
                 )
-                return dict(rows)
+                return {mission: self._names[holder.rpartition("-")[2]] for mission, holder in rows}
 
     def fail_over(self, name: str, missions: Iterable[str], since: float) -> list[float]:
         """Seconds until each of the missions has a ready worker on another instance."""
@@ -279,7 +280,7 @@ def faults(chosen: Any, place: Path, buildings: Sequence[Building], report: comm
     server = Server(place / "server")
     url = take_password(server.url)
     fleet = Fleet(place, server)
-    watch = Watch(url)
+    watch = Watch(url, fleet.ports)
     missions = {f"m{number}": buildings[number % BUILDINGS] for number in range(MISSIONS)}
     for name in missions:
         post(fleet.ports["one"], "/api/v1/missions", json.dumps({"name": name}).encode())
@@ -363,7 +364,7 @@ def latency(place: Path, buildings: Sequence[Building], report: common.Report) -
     every = [packets for building in buildings for packets in building.packets.values()]
     report.table("Intake", INTAKE, intake_rows(place, url, every))
     ports = {"SQLite": free_port(), "PostgreSQL": free_port()}
-    stored = {"SQLite": (), "PostgreSQL": ("--store", url, "--instance", "latency")}
+    stored = {"SQLite": (), "PostgreSQL": ("--store", url)}
     servers = {
         store: Process(
             ("serve", "--data", place / f"of-{store}", "--port", port, *stored[store]), place / f"{store}.log"

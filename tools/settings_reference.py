@@ -122,14 +122,14 @@ The federated commands read these keys from a YAML file. `training` holds the ke
 LEARNING = """\
 ## Learning while the fleet maps
 
-`fcslam serve --learn-config` reads these keys from a YAML file. `federated` holds the keys of
+`fcslam serve --learn` reads these keys from the file `learning.yaml` in `--data`. `federated` holds the keys of
 [Federated training](#federated-training) with the defaults below.
 """
 
 LEARNING_ROBOT = """\
 ## A robot that learns
 
-`fcslam robot --learn-config` reads these keys from a YAML file.
+`fcslam robot --learn` reads these keys from the file `learning.yaml` in `--state`.
 """
 
 

@@ -13,6 +13,7 @@ from zipfile import ZipFile
 
 import httpx
 import pytest
+import yaml
 
 from fcslam.cli import main
 from fcslam.maps.palette import FLOOR, ROBOTS, WALL
@@ -288,7 +289,8 @@ def credentials(tmp_path_factory):
 
 def test_a_viewer_sees_and_may_not_veto(page, packets, credentials, tmp_path):
     def token(name):
-        return (credentials / "tokens" / name).read_text().strip()
+        (place,) = credentials.glob(f"*/{name}/token")
+        return place.read_text().strip()
 
     with closing(Service(tmp_path / "data", "--tokens", str(credentials / "tokens.yaml"))) as service:
         for robot in ("robot_1", "robot_2"):
@@ -317,15 +319,16 @@ def test_a_viewer_sees_and_may_not_veto(page, packets, credentials, tmp_path):
 def test_a_token_that_expires_is_asked_for_again_and_nothing_is_lost(page, packets, credentials, tmp_path):
     tokens = tmp_path / "tokens.yaml"
     tokens.write_bytes((credentials / "tokens.yaml").read_bytes())
-    eye = (credentials / "tokens" / "eye").read_text().strip()
-    robot = {"Authorization": f"Bearer {(credentials / 'tokens' / 'robot_1').read_text().strip()}"}
+    eye = (credentials / "users" / "eye" / "token").read_text().strip()
+    robot = {"Authorization": f"Bearer {(credentials / 'robots' / 'robot_1' / 'token').read_text().strip()}"}
     with closing(Service(tmp_path / "data", "--tokens", str(tokens))) as service:
         play(service.url, packets, ("robot_1",), **robot)
         page.goto(service.url)
         page.get_by_label("Token").fill(eye)
         page.keyboard.press("Enter")
         says(page, "#robots", "robot_1")
-        assert main(["setup", "tokens", "revoke", "--tokens", str(tokens), "eye"]) == 0
+        entries = yaml.safe_load(tokens.read_text())["tokens"]
+        tokens.write_text(yaml.safe_dump({"tokens": [entry for entry in entries if entry["name"] != "eye"]}))
         service.process.send_signal(signal.SIGHUP)
         page.get_by_role("button", name="robot_1").click()
         says(page, "#status", "needs a token")

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
 from fcslam.cli import live, main
@@ -70,7 +71,7 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
 @pytest.mark.slow
 def test_the_token_goes_with_every_request(log, cloud, tmp_path):
     (tmp_path / "token").write_text("s3cret\n")
-    arguments = ["--server", cloud.url, "--state", str(tmp_path), "--token-file", str(tmp_path / "token")]
+    arguments = ["--server", cloud.url, "--state", str(tmp_path), "--credentials", str(tmp_path)]
     assert main(["play", str(log), *arguments]) == 0
     assert {headers["Authorization"] for _, _, headers, _ in cloud.requests} == {"Bearer s3cret"}
 
@@ -82,17 +83,24 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         (["--speed", "fast"], "--speed 'fast' is not a speed"),
         (["--speed", "-1"], "is not a speed"),
         (["--speed", "nan"], "is not a speed"),
-        (["--token-file", "nowhere"], "no token can be read"),
-        (["--certificate", "nowhere"], "--certificate and --key belong together"),
+        (["--credentials", "nowhere"], "holds no credentials"),
+        (["--credentials", "{token: two words}"], "holds no token"),
+        (["--credentials", "{robot.pem: x}"], "robot.pem and robot.key belong together"),
         (
-            ["--server", "https://localhost", "--certificate", "no.pem", "--key", "no.key"],
+            ["--server", "https://localhost", "--credentials", "{robot.pem: x, robot.key: x}"],
             "cannot read the certificate and its key",
         ),
         (["--state", "/dev/null/state"], "cannot be made"),
-        (["--ca", "nowhere"], "cannot read a certificate authority"),
+        (["--credentials", "{ca.pem: x}"], "cannot read a certificate authority"),
     ],
 )
 def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reason):
+    if arguments[-1].startswith("{"):  # a folder with these files
+        folder = tmp_path / "credentials"
+        folder.mkdir()
+        for name, content in yaml.safe_load(arguments[-1]).items():
+            (folder / name).write_text(content)
+        arguments = [*arguments[:-1], str(folder)]
     given = ["--server", cloud.url, "--state", str(tmp_path / "state")]
     assert main(["play", str(log), *given, *arguments]) == 2
     err = capsys.readouterr().err

@@ -44,11 +44,11 @@ def credentials(tmp_path_factory):
 
 
 def token(folder, name):
-    return (folder / "tokens" / name).read_text().strip()
+    return (folder / ("robots" if name.startswith("robot") else "users") / name / "token").read_text().strip()
 
 
 def test_secrets_are_their_owners_alone_and_the_cloud_knows_hashes_only(credentials):
-    for name in ("ca.key", "cloud.key", "robots/robot_1.key", "tokens/robot_1", "tokens/boss"):
+    for name in ("ca.key", "cloud.key", "robots/robot_1/robot.key", "robots/robot_1/token", "users/boss/token"):
         assert stat.S_IMODE((credentials / name).stat().st_mode) == 0o600
     text = (credentials / "tokens.yaml").read_text()
     assert token(credentials, "robot_1") not in text
@@ -56,12 +56,16 @@ def test_secrets_are_their_owners_alone_and_the_cloud_knows_hashes_only(credenti
 
 
 def test_only_robots_have_certificates_of_their_own(credentials):
-    assert {path.stem for path in (credentials / "robots").glob("*.pem")} == {"robot_1", "robot_2", "robot_3"}
+    found = {path.parent.name for path in credentials.rglob("robot.pem")}
+    assert found == {"robot_1", "robot_2", "robot_3"}
 
 
 def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials, tmp_path):
     mine = shutil.copytree(credentials, tmp_path / "credentials")  # the other tests share theirs
-    before = {name: (mine / name).read_bytes() for name in ("ca.pem", "ca.key", "tokens/boss")}
+    before = {
+        name: (mine / name).read_bytes()
+        for name in ("ca.pem", "ca.key", "cloud.pem", "users/boss/token", "robots/robot_1/token")
+    }
     assert main(["setup", "certificates", "-o", str(mine), "--robot", "new", "--robot", "robot_1"]) == 0
     assert {name: (mine / name).read_bytes() for name in before} == before
     names = [entry["name"] for entry in yaml.safe_load((mine / "tokens.yaml").read_text())["tokens"]]
@@ -278,7 +282,8 @@ def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, crede
         assert client.get(f"{API}/fleet", headers=bearer).status_code == 403
         boss = {"Authorization": f"Bearer {token(credentials, 'boss')}"}
         assert client.get(f"{API}/fleet", headers=boss).json()["packets"] == 40
-    trusted.load_cert_chain(credentials / "robots" / "robot_2.pem", credentials / "robots" / "robot_2.key")
+    own = credentials / "robots" / "robot_2"
+    trusted.load_cert_chain(own / "robot.pem", own / "robot.key")
     with httpx.Client(base_url=service.url, verify=trusted, timeout=60.0) as client:
         assert client.get(f"{API}/robots/robot_2/state").status_code == 200, "it has shown its certificate"
         assert client.get(f"{API}/robots/robot_1/state").status_code == 403

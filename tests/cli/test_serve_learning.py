@@ -16,16 +16,16 @@ from fcslam.robot.frontend import RobotConfig
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--learn-config", "few.yaml"], "--learn-config needs --learn"),
-        (["--learn", "--learn-config", "all.yaml"], "set federated.trained to codes"),
-        (["--learn", "--learn-config", "few.yaml"], "fewest_pairs"),
+        (["--learn", "--data", "all"], "set federated.trained to codes"),
+        (["--learn", "--data", "few"], "fewest_pairs"),
         (["--learn", "--store", "postgresql://u@h/d"], "leave out --store"),
     ],
 )
 def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "all.yaml").write_text("federated: {trained: all}")
-    (tmp_path / "few.yaml").write_text("gate: {fewest_pairs: 0}")
+    for name, settings in (("all", "federated: {trained: all}"), ("few", "gate: {fewest_pairs: 0}")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "learning.yaml").write_text(settings)
     assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0", *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line
@@ -34,14 +34,13 @@ def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeyp
 
 def plan(tmp_path, config=None, learn=True):
     (tmp_path / "token").write_text("secret\n")
-    server = ServerFlags("http://localhost:8340,http://192.0.2.1:8340", tmp_path / "token")
+    server = ServerFlags("http://localhost:8340,http://192.0.2.1:8340", tmp_path)
     return LearningFlags(learn).plan(config or RobotConfig(), server, tmp_path)
 
 
 def test_a_robot_learns_at_the_service_that_maps_it(tmp_path):
     found = plan(tmp_path)
-    shown = (found.server, found.token_file, found.ca, found.state)
-    assert shown == ("http://localhost:8340", tmp_path / "token", None, tmp_path)
+    assert (found.server, found.credentials, found.state) == ("http://localhost:8340", tmp_path, tmp_path)
     assert plan(tmp_path, learn=False) is None
 
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -81,13 +82,19 @@ def test_a_store_of_a_newer_version_is_told(postgres, postgres_server, tmp_path,
         postgres.rows("UPDATE version SET number = number - 1 RETURNING 1")
 
 
-def test_a_name_that_is_taken_or_none_is_told(postgres, postgres_server, tmp_path, capsys, monkeypatch):
+def test_a_name_that_is_taken_is_told(postgres, postgres_server, tmp_path, capsys, monkeypatch):
     postgres.rows("DELETE FROM instances RETURNING 1")
     monkeypatch.setattr("fcslam.service.shared.instance.NAME_S", 0.5)
-    assert Registry(postgres, "hall", "another process").register(1)
-    line = refused([postgres_server.url, "--instance", "hall"], tmp_path, capsys)
-    assert "another instance is called 'hall'" in line
-    assert "is not a name" in refused([postgres_server.url, "--instance", "two words"], tmp_path, capsys)
+    port = free_port()
+    assert Registry(postgres, f"{socket.gethostname()}-{port}", "another process").register(1)
+    line = refused([postgres_server.url, "--port", str(port)], tmp_path, capsys)
+    assert f"another instance is called '{socket.gethostname()}-{port}'" in line
+
+
+@pytest.mark.parametrize("limit", ["few", "0", "-1"])
+def test_a_limit_that_is_not_one_is_told(limit, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("FCSLAM_MAX_ROBOTS", limit)
+    assert f"FCSLAM_MAX_ROBOTS={limit}" in refused(["postgresql://u@h/d"], tmp_path, capsys)
 
 
 @pytest.mark.slow
@@ -96,7 +103,7 @@ def test_an_instance_shows_no_password_and_ends_in_order(postgres, postgres_serv
         postgres.rows(f"DELETE FROM {table} RETURNING 1")
     port = free_port()
     command = [sys.executable, "-c", "from fcslam.cli import main; raise SystemExit(main())"]
-    options = ["serve", "--data", str(tmp_path), "--port", str(port), "--store", postgres.url, "--instance", "one"]
+    options = ["serve", "--data", str(tmp_path), "--port", str(port), "--store", postgres.url]
     environment = {**os.environ, "PGPASSWORD": PASSWORD}
     with subprocess.Popen(
         [*command, *options], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

@@ -100,7 +100,7 @@ def test_the_service_of_the_unit_runs_under_its_restrictions(tmp_path):
                 except (urllib.error.URLError, ConnectionError, TimeoutError):
                     time.sleep(0.5)
             assert process.poll() is None, process.stderr.read()
-            token = (etc / "tokens" / "lab").read_text().strip()
+            token = (etc / "users" / "lab" / "token").read_text().strip()
             assert ask("/api/v1/fleet", token) == 200
             process.send_signal(signal.SIGHUP)  # ExecReload
             assert ask("/api/v1/fleet", token) == 200

@@ -25,7 +25,6 @@ from fcslam.cli import (
     serve,
     show,
     simulate,
-    tokens,
     train,
     vocabulary,
 )
@@ -106,7 +105,7 @@ app.command(
     rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam robot ros2:/robot1 -o runs/robot1",
-        "fcslam robot ros2:/robot1 --server https://cloud:8340 --state s --token-file t",
+        "fcslam robot ros2:/robot1 --server https://cloud:8340 --state s --credentials c",
         "fcslam robot anna=ros1:/robot1 --scan-topic /front/scan",
         "fcslam robot --explain-traffic",
     ),
@@ -116,7 +115,7 @@ app.command(
     rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state",
-        "fcslam play robot1.bag --server https://cloud:8340 --state s --token-file t",
+        "fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c",
     ),
 )(playback.play)
 app.command(
@@ -207,7 +206,6 @@ setup.command(
         "fcslam setup certificates --host cloud.local --robot robot1 --admin boss",
     ),
 )(certificates.certificates)
-setup.add_typer(tokens.app, name="tokens")
 setup.command(
     "warm-up",
     epilog=examples(

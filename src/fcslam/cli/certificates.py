@@ -35,7 +35,7 @@ def certificates(
 
     from fcslam.cloud.sessions import check_robot
     from fcslam.errors import InputError, PacketError
-    from fcslam.service.credentials import make_cluster_credentials, make_credentials
+    from fcslam.service.credentials import folder_of, make_cluster_credentials, make_credentials
     from fcslam.service.http.authentication import Role
     from fcslam.wire.checks import check_name
 
@@ -56,10 +56,7 @@ def certificates(
     typer.echo(f"authority, for all clients: {output / 'ca.pem'}")
     typer.echo(f"for the service: {output / 'cloud.pem'}, {output / 'cloud.key'}, {output / 'tokens.yaml'}")
     for name, role in names:
-        typer.echo(f"for {role} {name}: {output / 'tokens' / name}")
-        if role is Role.ROBOT:
-            stem = output / "robots" / name
-            typer.echo(f"or, for a service with --client-ca, instead of the token: {stem}.pem, {stem}.key")
+        typer.echo(f"for {role} {name}: {folder_of(output, name, role)}")
     if cluster:
         stem = output / "cluster"
         typer.echo(f"for a cluster, robots excepted: {stem / 'ca.pem'}, {stem / 'member.pem'}, {stem / 'member.key'}")

@@ -13,10 +13,8 @@ if TYPE_CHECKING:
 
 _LEARNING = "Learning"
 
-LearnConfig = Annotated[
-    Path | None,
-    typer.Option(help="YAML file of settings of learning.", rich_help_panel=_LEARNING),
-]
+LEARNING_FILE = "learning.yaml"
+"""Settings of learning, in a robot's state folder or a service's data folder; each key has a default."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +26,9 @@ class LearningFlags:
         typer.Option(
             "--learn", rich_help_panel=_LEARNING,
             help="Train the detector with the fleet on what the camera saw again: after a recording, and while a live "
-            "robot stands still. No image leaves.",
+            "robot stands still. No image leaves. Settings: learning.yaml in --state.",
         ),
     ] = False  # fmt: skip
-    learn_config: LearnConfig = None
 
     def plan(self, settings: "RobotConfig", server: "ServerFlags", state: Path | None) -> "RobotLearningPlan | None":
         """Where and how the robot learns, with this service; None: it does not.
@@ -46,8 +43,6 @@ class LearningFlags:
         from fcslam.errors import InputError
 
         if not self.learn:
-            if self.learn_config is not None:
-                raise InputError("--learn-config needs --learn")
             return None
         from fcslam.cli.training_options import require_training_libraries
         from fcslam.config import load
@@ -64,10 +59,7 @@ class LearningFlags:
             )
         if Channel.CAMERA not in settings.channels or settings.views.detector is not DetectorKind.ONNX:
             raise InputError("--learn trains the camera's network; robot.channels or robot.views.detector leave it out")
-        chosen = RobotLearningSettings()
-        if self.learn_config is not None:
-            chosen = load(RobotLearningSettings, self.learn_config)
+        file = state / LEARNING_FILE
+        chosen = load(RobotLearningSettings, file) if file.exists() else RobotLearningSettings()
         require_training_libraries("flwr", extra="federated")
-        return RobotLearningPlan(
-            addresses(access.url)[0], chosen, state, server.token_file, server.ca, access.certificate
-        )
+        return RobotLearningPlan(addresses(access.url)[0], chosen, state, server.credentials)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.learning_options import LearnConfig
 from fcslam.cli.listening import check_tls, is_loopback, listen
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
@@ -60,33 +59,21 @@ def serve(
         typer.Option(
             "--learn",
             rich_help_panel=_LEARNING,
-            help="Let the robots train the detector together while they map, on what they see again.",
+            help="Let the robots train the detector together while they map, on what they see again. Settings: "
+            "learning.yaml in --data.",
         ),
     ] = False,
-    learn_config: LearnConfig = None,
     quiet: Quiet = False,
     store: Annotated[
         str | None,
         typer.Option(
             metavar="URL",
             help="PostgreSQL database for all missions, postgresql://USER@HOST:PORT/DATABASE; several instances may "
-            "share it. The default is a file for each mission in --data.",
+            "share it (FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit this one). The default is a file for "
+            "each mission in --data.",
             rich_help_panel=_INSTANCES,
         ),
     ] = None,
-    instance: Annotated[
-        str | None,
-        typer.Option(
-            help="Name of this instance of --store; the default is the host's name.", rich_help_panel=_INSTANCES
-        ),
-    ] = None,
-    max_missions: Annotated[
-        int, typer.Option(min=0, help="Workers that this instance of --store runs.", rich_help_panel=_INSTANCES)
-    ] = 20,
-    max_robots: Annotated[
-        int,
-        typer.Option(min=1, help="Robots that may send to this instance of --store.", rich_help_panel=_INSTANCES),
-    ] = 200,
     workers: WorkersOption = "1",
 ) -> None:
     """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
@@ -94,7 +81,7 @@ def serve(
     import logging
 
     from fcslam.cli.serve_learning import learning_beside, learning_plan
-    from fcslam.cli.shared_service import Shared, shared_state
+    from fcslam.cli.shared_service import shared_state
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
     from fcslam.errors import ServiceError
@@ -113,7 +100,7 @@ def serve(
     if chosen.is_cluster:
         with verifying(chosen):  # refused here, not by the worker of each mission
             pass
-    plan = learning_plan(learn, learn_config, data / "learning", store)
+    plan = learning_plan(learn, data, store)
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
@@ -121,8 +108,7 @@ def serve(
         if store is None:
             state = _state(data, authenticator, given, chosen)
         else:
-            shared = Shared(store, instance, max_missions, max_robots)
-            state = shared_state(shared, data, authenticator, given, chosen)
+            state = shared_state(store, listening.getsockname()[1], data, authenticator, given, chosen)
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()

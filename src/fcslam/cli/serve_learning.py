@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
+from fcslam.cli.learning_options import LEARNING_FILE
 from fcslam.learning.federated.live_settings import RELEASE, RELEASES
 
 if TYPE_CHECKING:
@@ -22,13 +23,12 @@ class FleetLearningPlan(NamedTuple):
     settings: "FleetLearningSettings"
 
 
-def learning_plan(learn: bool, config: Path | None, output: Path, store: str | None) -> FleetLearningPlan | None:
+def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPlan | None:
     """Check all that learning needs, before anything starts; None without --learn.
 
     Args:
         learn: whether the robots learn.
-        config: file of settings.
-        output: folder of the rounds.
+        data: folder of the missions; it may hold a file of settings, and receives the rounds.
         store: database of the missions; None: they are files.
 
     Raises:
@@ -42,12 +42,11 @@ def learning_plan(learn: bool, config: Path | None, output: Path, store: str | N
     from fcslam.learning.federated.live_settings import FleetLearningSettings
 
     if not learn:
-        if config is not None:
-            raise ServiceError("--learn-config needs --learn")
         return None
     if store is not None:
         raise ServiceError("--learn follows missions in --data; leave out --store")
-    settings = FleetLearningSettings() if config is None else load(FleetLearningSettings, config)
+    config = data / LEARNING_FILE
+    settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
     if not settings.federated.on_revisits:
         raise ServiceError(
             f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes or heads"
@@ -55,7 +54,7 @@ def learning_plan(learn: bool, config: Path | None, output: Path, store: str | N
     if settings.federated.privacy.noise_multiplier:
         raise ServiceError(f"{config}: robots report on held-out pairs without noise; set noise_multiplier to 0")
     require_training_libraries("flwr", extra="federated")
-    return FleetLearningPlan(output, settings)
+    return FleetLearningPlan(data / "learning", settings)
 
 
 @contextmanager

@@ -26,39 +26,29 @@ class AccessFlags:
             "between them.",
         ),
     ] = None  # fmt: skip
-    token_file: Annotated[Path | None, typer.Option(help="File with the robot's token.", rich_help_panel=NETWORK)] = (
-        None
-    )
-    ca: Annotated[
+    credentials: Annotated[
         Path | None,
         typer.Option(
-            help="Certificate of the authority that signed the cloud's certificate (PEM).",
-            show_default="the authorities of this system", rich_help_panel=NETWORK,
+            metavar="FOLDER", rich_help_panel=NETWORK,
+            help="Folder with the robot's credentials: token, ca.pem (authority that signed the cloud's certificate, "
+            "if it is not one of this system), robot.pem and robot.key (the robot's certificate).",
         ),
     ] = None  # fmt: skip
-    certificate: Annotated[
-        Path | None,
-        typer.Option(help="The robot's certificate (PEM), which replaces the token.", rich_help_panel=NETWORK),
-    ] = None
-    key: Annotated[Path | None, typer.Option(help="Private key of --certificate (PEM).", rich_help_panel=NETWORK)] = (
-        None
-    )
 
     def access(self) -> "Server | None":
         """The service; None if none is named.
 
         Raises:
-            InputError: the token cannot be read, or the certificate or its key is missing.
+            InputError: the credentials cannot be read.
         """
-        from fcslam.errors import InputError
         from fcslam.wire.http_transport import Server
-        from fcslam.wire.keys import read_token
+        from fcslam.wire.keys import Credentials, read_credentials
 
-        if (self.certificate is None) != (self.key is None):
-            raise InputError("--certificate and --key belong together; give both or neither")
-        own = None if self.certificate is None or self.key is None else (self.certificate, self.key)
-        token = None if self.token_file is None else read_token(self.token_file)
-        return None if self.server is None else Server(self.server, token, self.ca, own)
+        found = Credentials() if self.credentials is None else read_credentials(self.credentials)
+        if self.server is None:
+            return None
+        own = found.own if self.server.startswith("https:") else None  # a certificate is shown in TLS only
+        return Server(self.server, found.token, found.ca, own)
 
 
 @dataclass(frozen=True)

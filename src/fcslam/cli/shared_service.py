@@ -7,11 +7,11 @@ import socket
 import time
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cluster.workers import Workers
-from fcslam.errors import PacketError, ServiceError
+from fcslam.errors import ServiceError
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.http.events import EventStreams
 from fcslam.service.http.limits import RateLimit
@@ -25,34 +25,33 @@ from fcslam.service.shared.schema import prepare
 from fcslam.service.shared.spares import Spares
 from fcslam.service.supervisor import RunningWorker, Supervisor
 from fcslam.storage.postgres import Postgres, is_server, take_password
-from fcslam.wire.checks import check_name
 
 if TYPE_CHECKING:
     from fcslam.service.http.authentication import Authenticator
 
 
-class Shared(NamedTuple):
-    """The options of an instance."""
-
-    store: str
-    instance: str | None
-    max_missions: int
-    max_robots: int
+MAX_MISSIONS, MAX_ROBOTS = 20, 200
+"""Workers that an instance runs, and robots that may send to it, unless the environment says more."""
+LONGEST_HOST = 58
+"""Characters of the host in an instance's name, which has 64 at most."""
 
 
 def shared_state(
-    shared: Shared, data: Path, authenticator: "Authenticator", config: CloudConfig, workers: Workers
+    store: str, port: int, data: Path, authenticator: "Authenticator", config: CloudConfig, workers: Workers
 ) -> ServiceState:
-    """The state of an instance; who closes its missions closes all that it holds.
+    """The state of an instance of the store; who closes its missions closes all that it holds.
+
+    Host and port name the instance; FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit it.
 
     Raises:
-        ServiceError: the store's address or the instance's name cannot be used.
+        ServiceError: the store's address or a limit cannot be used.
         StoreError: the store cannot be used, or is of a newer version.
     """
-    name = _name(shared.instance)
-    if not is_server(shared.store):
+    name = f"{socket.gethostname()[:LONGEST_HOST]}-{port}"
+    admission = Admission(_limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS), _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS))
+    if not is_server(store):
         raise ServiceError("--store: this is not an address of a database; write postgresql://USER@HOST:PORT/DATABASE")
-    url = take_password(shared.store)
+    url = take_password(store)
     with ExitStack() as opened:
         server = opened.enter_context(closing(Postgres(url, name)))
         prepare(server)
@@ -68,7 +67,7 @@ def shared_state(
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)
         missions = SharedMissions(
-            data, config, server, name, secrets.token_hex(8), Admission(shared.max_missions, shared.max_robots),
+            data, config, server, name, secrets.token_hex(8), admission,
             time.monotonic, time.time, launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM),
         )  # fmt: skip
         log = AuditLog(audit, time.time)
@@ -76,18 +75,16 @@ def shared_state(
         return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log)
 
 
-def _name(given: str | None) -> str:
-    """The instance's name.
+def _limit(variable: str, least: int, otherwise: int) -> int:
+    """A limit that the environment gives.
 
     Raises:
-        ServiceError: it is not a name.
+        ServiceError: it is not a number, or too small.
     """
-    name = socket.gethostname() if given is None else given
-    try:
-        check_name(name, "--instance")
-    except PacketError as error:
-        raise ServiceError(str(error)) from error
-    return name
+    text = os.environ.get(variable) or str(otherwise)
+    if not (text.isdecimal() and int(text) >= least):
+        raise ServiceError(f"{variable}={text}: is not a number from {least} on")
+    return int(text)
 
 
 def _ignore(event: str, number: int) -> None:

@@ -3,51 +3,65 @@
 ca.pem, ca.key          the authority; robots and viewers get ca.pem
 cloud.pem, cloud.key    the cloud's certificate
 tokens.yaml             name, role and SHA-256 of every token: for the cloud
-tokens/<name>           the token itself: for its holder
-robots/<name>.pem, .key a robot's certificate, instead of a token
+robots/<name>/          what a robot gets: ca.pem, its token, and a certificate that a service may take instead
+users/<name>/           what a viewer or admin gets: ca.pem and a token
 cluster/                an authority of its own, and the certificate of a cluster's scheduler, workers and clients
 """
 
 import datetime
+import hashlib
 import ipaddress
+import secrets
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import yaml
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fcslam.errors import OutputError
-from fcslam.service.http.authentication import Role, read_tokens
-from fcslam.service.token_file import TokenHolder, add_token
+from fcslam.service.http.authentication import Role, TokenEntry, TokensFile, read_tokens
 from fcslam.storage.files import write_file
+from fcslam.wire.keys import AUTHORITY, CERTIFICATE, TOKEN
 
 AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
 """Longest validity of a server certificate that clients accept."""
+TOKEN_BYTES = 32
 
 Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 
 def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Role], now: datetime.datetime) -> None:
-    """Make what is missing: the authority and tokens that are there stay; certificates of the cloud and of the robots
-    in ``names`` are replaced.
+    """Make what is missing: the authority and tokens that are there stay; certificates of the robots in ``names``, and
+    with ``hosts`` that of the cloud, are replaced.
 
     Raises:
-        OutputError: the folder cannot be used, or what is in it cannot be read.
+        OutputError: the folder cannot be used, what is in it cannot be read, or a token has no entry.
         ConfigError: the tokens file in it is broken.
     """
     try:
-        for part in ("tokens", "robots"):
-            (folder / part).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         authority = _authority(folder, now)
         served = [_host(host) for host in dict.fromkeys([*hosts, "localhost", "127.0.0.1", "::1"])]
-        _make_leaf(folder / "cloud", "fcslam cloud", [ExtendedKeyUsageOID.SERVER_AUTH], served, authority, now)
-        for name in (name for name, role in names.items() if role is Role.ROBOT):
-            _make_leaf(folder / "robots" / name, name, [ExtendedKeyUsageOID.CLIENT_AUTH], (), authority, now)
+        if hosts or not (folder / "cloud.pem").exists():
+            _make_leaf(folder / "cloud", "fcslam cloud", [ExtendedKeyUsageOID.SERVER_AUTH], served, authority, now)
+        for name, role in names.items():
+            own = folder_of(folder, name, role)
+            own.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(folder / "ca.pem", own / AUTHORITY)
+            if role is Role.ROBOT:
+                _make_leaf(own / Path(CERTIFICATE).stem, name, [ExtendedKeyUsageOID.CLIENT_AUTH], (), authority, now)
         _add_tokens(folder, names)
     except (OSError, ValueError) as error:
         raise OutputError(f"{folder}: cannot write credentials ({error}); name a new folder") from error
+
+
+def folder_of(folder: Path, name: str, role: Role) -> Path:
+    """What a robot or a user gets of a folder of credentials."""
+    return folder / ("robots" if role is Role.ROBOT else "users") / name
 
 
 def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
@@ -128,11 +142,20 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
+    """Write the tokens that are missing, and their hashes."""
     path = folder / "tokens.yaml"
-    known = {entry.name for entry in read_tokens(path)} if path.exists() else set()
+    entries = list(read_tokens(path)) if path.exists() else []
+    known = {entry.name for entry in entries}
     for name, role in names.items():
         if name not in known:
-            add_token(path, TokenHolder(name, role), folder / "tokens" / name)
+            token = secrets.token_urlsafe(TOKEN_BYTES)
+            place = folder_of(folder, name, role) / TOKEN
+            if place.exists():
+                raise OutputError(f"{place}: tokens.yaml has no entry for this token; remove it, and a new one is made")
+            write_file(place, f"{token}\n", private=True)
+            entries.append(TokenEntry(name=name, role=role, sha256=hashlib.sha256(token.encode()).hexdigest()))
+    content = TokensFile(tokens=tuple(entries)).model_dump(mode="json", exclude_none=True)
+    write_file(path, yaml.safe_dump(content, sort_keys=False))
 
 
 def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

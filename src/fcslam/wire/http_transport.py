@@ -196,7 +196,7 @@ class HttpClient:
 
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase
-        remedy = "; give a valid token by --token-file" if response.status_code == 401 else ""
+        remedy = "; give a valid token in --credentials" if response.status_code == 401 else ""
         return f"{self._url}: {said} ({response.status_code}){remedy}"
 
 

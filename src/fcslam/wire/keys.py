@@ -1,9 +1,45 @@
 """Files with which a robot shows who it is: tokens, and keys of TLS."""
 
 import ssl
+from dataclasses import dataclass
 from pathlib import Path
 
 from fcslam.errors import InputError
+
+TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "robot.pem", "robot.key"
+"""Files in a robot's folder of credentials."""
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """What a robot shows a service, and how it knows the service."""
+
+    token: str | None = None
+    ca: Path | None = None
+    """PEM file of the authority that signed the service's certificate; None: the authorities of this system."""
+    own: tuple[Path, Path] | None = None
+    """PEM files of the robot's certificate and its key."""
+
+
+def read_credentials(folder: Path) -> Credentials:
+    """The credentials in a robot's folder, as `fcslam tools certificates` writes it; each file may be missing.
+
+    Raises:
+        InputError: there is no such file, the token cannot be read, or a certificate has no key.
+    """
+    there = {name for name in (TOKEN, AUTHORITY, CERTIFICATE, KEY) if (folder / name).exists()}
+    if not there:
+        raise InputError(
+            f"{folder}: holds no credentials ({TOKEN}, {AUTHORITY}, {CERTIFICATE} and {KEY}); give a folder in "
+            "credentials/robots, which `fcslam tools certificates` makes"
+        )
+    if (CERTIFICATE in there) != (KEY in there):
+        raise InputError(f"{folder}: {CERTIFICATE} and {KEY} belong together; add the other one, or remove this one")
+    return Credentials(
+        read_token(folder / TOKEN) if TOKEN in there else None,
+        folder / AUTHORITY if AUTHORITY in there else None,
+        (folder / CERTIFICATE, folder / KEY) if KEY in there else None,
+    )
 
 
 def no_passphrase() -> str:
@@ -25,7 +61,7 @@ def read_token(path: Path) -> str:
         token = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path}: no token can be read ({error}); give the file that `fcslam setup certificates` wrote"
+            f"{path}: no token can be read ({error}); give the file that `fcslam tools certificates` wrote"
         ) from error
     if not token or not token.isprintable() or " " in token:
         raise InputError(f"{path}: holds no token; it should be one word")

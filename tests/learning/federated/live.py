@@ -53,7 +53,7 @@ class LiveFleet:
         self.ca = self._keys / "ca.pem"
 
     def token(self, robot):
-        return (self._keys / "tokens" / robot).read_text().strip()
+        return (self._keys / "robots" / robot / "token").read_text().strip()
 
     @contextlib.contextmanager
     def server(self):

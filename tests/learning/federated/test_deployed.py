@@ -86,8 +86,7 @@ class Deployment:
     def robot(self, name, owner=None, keys=None, log=None):
         log, keys = log or name, keys or self.keys
         words = ["join", f"https://{self.where}", str(self._images / name), "-o", str(self.folder / f"home-{name}")]
-        words += ["--device", "cpu", "--ca", str(self.keys / "ca.pem")]
-        words += ["--token-file", str(keys / "tokens" / (owner or name))]
+        words += ["--device", "cpu", "--credentials", str(keys / "robots" / (owner or name))]
         return self._started(*words, log=log)
 
     def said(self, who):

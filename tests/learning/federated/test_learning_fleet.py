@@ -101,13 +101,11 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
     for robot in simulate_fleet(settings, 5).robots:
         record_robot(robot, tmp_path / "sim" / robot.name, resume=False)
     weak = weak_detector(tmp_path)
-    (tmp_path / "fleet.yaml").write_text(yaml.safe_dump(SETTINGS))
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "learning.yaml").write_text(yaml.safe_dump(SETTINGS))
     port = free_port()
     logs = [tmp_path / f"{name}.log" for name in ("service", *robots)]
-    service = started(
-        logs[0], "serve", "--data", tmp_path / "data", "--port", port, "--learn",
-        "--learn-config", tmp_path / "fleet.yaml",
-    )  # fmt: skip
+    service = started(logs[0], "serve", "--data", tmp_path / "data", "--port", port, "--learn")
     fleet = [
         started(log, "play", tmp_path / "sim" / robot, "--server", f"http://127.0.0.1:{port}", "--state",
                 tmp_path / f"state-{robot}", "--learn")

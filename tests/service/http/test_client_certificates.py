@@ -22,6 +22,10 @@ def pair(folder, name):
     return folder / f"{name}.pem", folder / f"{name}.key"
 
 
+def own_pair(folder, robot):
+    return pair(folder / "robots" / robot, "robot")
+
+
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory):
     make_credentials(folder := tmp_path_factory.mktemp("ours"), [], ROBOTS, NOW)
@@ -56,7 +60,7 @@ def stored(connect):
 
 
 def test_a_robot_with_its_certificate_needs_no_token(connect, authority):
-    robot = connect(pair(authority / "robots", "a"))
+    robot = connect(own_pair(authority, "a"))
     assert decode(robot.send(A[:3], -1).packets[0]).body == Acknowledgement("a", 0, 2)
     assert robot.state().expected == {0: 3}, "and again in the same connection"
 
@@ -65,14 +69,14 @@ def test_without_a_certificate_a_token_is_needed(connect, authority):
     with pytest.raises(CloudError, match=r"certificate.* \(401\)"):
         connect(None).send(A[:3], -1)
     assert stored(connect) == 0
-    token = (authority / "tokens" / "b").read_text().strip()
+    token = (authority / "robots" / "b" / "token").read_text().strip()
     assert connect(None, "b", token).send(B[:3], -1).packets
-    assert connect(pair(authority / "robots", "a"), "b", token).state().expected == {0: 3}, "what is said counts"
+    assert connect(own_pair(authority, "a"), "b", token).state().expected == {0: 3}, "what is said counts"
 
 
 def test_another_robots_certificate_is_not_good(connect, authority):
     with pytest.raises(CloudError, match=r"'b' does not speak for robot 'a' \(403\)"):
-        connect(pair(authority / "robots", "b")).send(A[:3], -1)
+        connect(own_pair(authority, "b")).send(A[:3], -1)
     assert stored(connect) == 0
 
 
@@ -81,12 +85,12 @@ def test_who_shows_a_certificate_that_is_not_good_is_hung_up_on(connect, authori
     own = pair(authority, "cloud")
     if made == "by others":
         make_credentials(tmp_path, [], ROBOTS, NOW)
-        own = pair(tmp_path / "robots", "a")
+        own = own_pair(tmp_path, "a")
     if made == "long ago":
         for name in ("ca.pem", "ca.key"):
             (tmp_path / name).write_bytes((authority / name).read_bytes())
         make_credentials(tmp_path, [], ROBOTS, NOW - datetime.timedelta(days=400))
-        own = pair(tmp_path / "robots", "a")
+        own = own_pair(tmp_path, "a")
     with pytest.raises(UnavailableError, match="does not trust this robot's certificate"):
         connect(own).send(A[:3], -1)
     assert stored(connect) == 0
@@ -94,7 +98,7 @@ def test_who_shows_a_certificate_that_is_not_good_is_hung_up_on(connect, authori
 
 def test_a_certificate_is_a_robots_whatever_it_is_called(connect, authority):
     """One of the authority's that names an administrator by a token opens nothing but a robot's own door."""
-    robot = connect(pair(authority / "robots", "boss"), "boss")
+    robot = connect(own_pair(authority, "boss"), "boss")
     assert robot.state().expected == {}
     assert robot._ask("GET", "fleet").status_code == 403
     assert robot._ask("POST", "finalize").status_code == 403
@@ -116,4 +120,4 @@ def test_a_certificate_that_cannot_be_used_is_told(authority, tmp_path):
     with pytest.raises(CloudError, match="cannot read the certificate and its key"):
         HttpTransport("https://cloud.example", "a", "ab" * 16, own=(authority / "ca.pem", tmp_path / "none"))
     with pytest.raises(CloudError, match="need https"):
-        HttpTransport("http://localhost", "a", "ab" * 16, own=pair(authority / "robots", "a"))
+        HttpTransport("http://localhost", "a", "ab" * 16, own=own_pair(authority, "a"))

@@ -22,13 +22,11 @@ def join(
         typer.Option(help="Name of the robot, as in its token.", show_default="that of the folder of images"),
     ] = None,
     device: Device = "auto",
-    token_file: Annotated[Path | None, typer.Option(help="File with the robot's token.", rich_help_panel="TLS")] = None,
-    ca: Annotated[
+    credentials: Annotated[
         Path | None,
         typer.Option(
-            help="Certificate of the authority that signed the server's certificate (PEM).",
-            show_default="the authorities of this system",
-            rich_help_panel="TLS",
+            metavar="FOLDER",
+            help="Folder with the robot's credentials: token, and ca.pem if it is needed to trust the server.",
         ),
     ] = None,
     quiet: Quiet = False,
@@ -43,7 +41,7 @@ def join(
     from fcslam.learning.federated.client import RobotClient, secret_noise
     from fcslam.learning.federated.fleet_robot import RobotLink
     from fcslam.wire.checks import check_name
-    from fcslam.wire.keys import read_token
+    from fcslam.wire.keys import Credentials, read_credentials
 
     if not images.is_dir():
         raise TrainingError(f"{images}: is not a folder; give the folder of the robot's images")
@@ -59,6 +57,7 @@ def join(
             printed.add(line)
             print_line(console, line)
 
-    link = RobotLink(server, robot, None if token_file is None else read_token(token_file), ca)
+    found = Credentials() if credentials is None else read_credentials(credentials)
+    link = RobotLink(server, robot, found.token, found.ca)
     client = RobotClient(robot, images, output / "labels", secret_noise, compute_budget(device).device)
     launch.join(link, client, print_once)

@@ -25,11 +25,8 @@ class RobotLearningPlan:
     settings: RobotLearningSettings
     state: Path
     """The robot's state folder, with its keyframes."""
-    token_file: Path | None = None
-    ca: Path | None = None
-    """PEM file of certificate authorities; None: the authorities of the system."""
-    own: tuple[Path, Path] | None = None
-    """PEM files of the robot's certificate and its key, in place of a token."""
+    credentials: Path | None = None
+    """Folder with the robot's credentials."""
 
 
 class LearningBeside:
@@ -37,9 +34,7 @@ class LearningBeside:
 
     def __init__(self, plan: RobotLearningPlan, robot: str, on_notice: Callable[[str], None]) -> None:
         """Start it. ``on_notice`` is called with lines for the user, in a thread of its own."""
-        certificate, key = plan.own or (None, None)
-        files = {"--token-file": plan.token_file, "--ca": plan.ca, "--certificate": certificate, "--key": key}
-        options = [word for name, file in files.items() if file is not None for word in (name, str(file))]
+        options = [] if plan.credentials is None else ["--credentials", str(plan.credentials)]
         keyframes, cache = plan.state / KEYFRAMES, plan.state / "learning"
         words = [str(keyframes), str(cache), plan.server, robot, plan.settings.model_dump_json()]
         command = [sys.executable, "-m", "fcslam.learning.federated.robot_learning", *words, *options]

@@ -26,7 +26,7 @@ from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
 from fcslam.learning.federated.live_settings import RobotLearningSettings
 from fcslam.learning.federated.own_examples import own_examples
-from fcslam.wire.keys import read_token
+from fcslam.wire.keys import Credentials, read_credentials
 
 NICENESS: Final = 19
 FRESH_S: Final = 20.0
@@ -160,8 +160,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("server")
     parser.add_argument("name")
     parser.add_argument("settings", type=RobotLearningSettings.model_validate_json)
-    for file in ("token-file", "ca", "certificate", "key"):
-        parser.add_argument(f"--{file}", type=Path)
+    parser.add_argument("--credentials", type=Path)
     given = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -170,12 +169,11 @@ def main(arguments: Sequence[str]) -> int:
     idle = threading.Event()
     threading.Thread(target=_listen, args=(idle,), daemon=True).start()
     try:
-        token = None if given.token_file is None else read_token(given.token_file)
-        own = None if given.certificate is None else (given.certificate, given.key)
+        shown = Credentials() if given.credentials is None else read_credentials(given.credentials)
         client = RobotClient(given.name, given.keyframes, given.cache, secret_noise)
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
-        link = partial(_IdleLink, robot, given.server, given.name, token, given.ca, own)
+        link = partial(_IdleLink, robot, given.server, given.name, shown.token, shown.ca, shown.own)
         tell(f"learning ends: {learn(link, client, idle)}")
     except (FcslamError, OSError) as error:
         tell(f"learning ends: {error}")

@@ -34,7 +34,7 @@ class RobotLimit:
                 self._heard = {who: heard for who, heard in self._heard.items() if now < heard + LEASE_S}
                 if len(self._heard) >= self._most:
                     raise BusyError(
-                        f"{robot}: this instance takes {self._most} robots (--max-robots); send to another one",
+                        f"{robot}: this instance takes {self._most} robots (FCSLAM_MAX_ROBOTS); send to another one",
                         ELSEWHERE_S,
                     )
             self._heard[mission, robot] = now

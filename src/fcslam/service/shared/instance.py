@@ -126,9 +126,7 @@ class Instance:
             if self._registry.register(self._most):
                 return
             self._closing.wait(LOOK_S)
-        raise ServiceError(
-            f"another instance is called '{self._name}'; stop it, or give this one another name: --instance NAME"
-        )
+        raise ServiceError(f"another instance is called '{self._name}'; stop it, or give this one another --port")
 
     def _run(self) -> None:
         is_gone = False
