@@ -75,7 +75,7 @@ def test_a_refused_packet_is_told_by_its_place(cloud, transport):
 
 def test_a_token_that_is_not_known_names_the_option(cloud, transport):
     cloud.canned.append(error(401))
-    with pytest.raises(CloudError, match=r"by --token-file$"):
+    with pytest.raises(CloudError, match=r"in --credentials$"):
         transport.state()
 
 

@@ -105,7 +105,7 @@ app.command(
     rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam robot ros2:/robot1 -o runs/robot1",
-        "fcslam robot ros2:/robot1 --server https://cloud:8340 --state s --credentials c",
+        "fcslam robot ros2:/robot1 --server https://hub --state s --credentials c",
         "fcslam robot anna=ros1:/robot1 --scan-topic /front/scan",
         "fcslam robot --explain-traffic",
     ),
