@@ -21,7 +21,7 @@ ENV NUMBA_CACHE_DIR=/var/cache/fcslam PATH=/opt/fcslam/bin:/usr/local/bin:/usr/s
 RUN useradd --uid 1000 --create-home fcslam \
     && install --directory --owner fcslam /data /var/cache/fcslam
 USER fcslam
-RUN fcslam setup warm-up
+RUN fcslam tools warm-up
 
 WORKDIR /data
 VOLUME /data

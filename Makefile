@@ -67,7 +67,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV) || { echo "Install Python 3.11, 3.12 or 3.13 with its venv, or name one: make install PYTHON=..."; exit 1; }
 	@$(PIP) -e ".[$(EXTRAS)]"
 	@find src -name '*.nb[ic]' -delete  # compiled code that names classes by where they were
-	@$(BIN)/fcslam setup warm-up
+	@$(BIN)/fcslam tools warm-up
 	@touch $@
 
 # Never fails: without a GL library there are LiDARs.

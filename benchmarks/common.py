@@ -101,10 +101,10 @@ def run_fcslam_cold(*arguments: object) -> Cost:
 
 
 def simulated(folder: Path, *arguments: object) -> Path:
-    """A fleet that `fcslam simulate` records into ``folder``; one that is there already is taken as it is."""
+    """A fleet that `fcslam tools simulate` records into ``folder``; one that is there already is taken as it is."""
     # The true map is written last.
     if not (folder / "ground_truth" / "map.yaml").exists():
-        run_fcslam("simulate", *arguments, "--resume", "--output", folder)
+        run_fcslam("tools", "simulate", *arguments, "--resume", "--output", folder)
     return folder
 
 

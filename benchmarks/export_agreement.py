@@ -2,7 +2,7 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/export_agreement.py --training FOLDER
 
-FOLDER is what `fcslam learn train` wrote: its two ONNX files, and the checkpoint that they were made from, for which
+FOLDER is what `fcslam tools train` wrote: its two ONNX files, and the checkpoint that they were made from, for which
 torch is needed (`fcslam[train]`). Images: those of the scenes of `benchmarks/homography.py` at 640 x 480. Bits are
 compared at the 1000 strongest keypoints of the float32 file, the same positions for all, so that only the logits
 differ. Then both files on the pairs of the scenes; intervals are 95 % by paired bootstrap over pairs.

@@ -140,7 +140,7 @@ def study(vision: Path, folder: Path, until: str | None) -> "StudyResults":
     if not (folder / "start" / "detector.onnx").exists():
         (folder / "start.yaml").write_text(json.dumps(START), encoding="utf-8")
         common.run_fcslam(
-            "learn", "train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start"
+            "tools", "train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start"
         )
     names = list(arms())
     wanted = names[: names.index(until) + 1] if until else names

@@ -62,7 +62,7 @@ def drawn(folder: Path, count: int, seed: int, side: tuple[int, int] = (320, 240
 @contextmanager
 def federate(*words: object, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A command in the background, interrupted at the end of the block."""
-    command = [sys.executable, "-m", "fcslam.cli", "learn", "federate", *map(str, words)]
+    command = [sys.executable, "-m", "fcslam.cli", "tools", "federate", *map(str, words)]
     with log.open("wb") as file:
         process = subprocess.Popen(
             command,
@@ -136,9 +136,9 @@ def compare(report: common.Report, folder: Path) -> None:
     for seed, robot in enumerate(ROBOTS):
         drawn(folder / robot, 3, seed)
     (folder / "tiny.yaml").write_text(TINY)
-    options = ["--config", folder / "tiny.yaml", "--public", drawn(folder / "public", 4, 99), "--device", "cpu"]
+    options = ["--config", folder / "tiny.yaml", "--public", drawn(folder / "public", 4, 99)]
     embedded, rest = folder / "embedded", [folder / robot for robot in ROBOTS if robot != KILLED]
-    common.run_fcslam("learn", "federate", "local", *rest, "-o", embedded, *options)
+    common.run_fcslam("tools", "federate", "local", *rest, "-o", embedded, *options)
     began = time.perf_counter()
     deployed = deploy(folder, options)
     wall_s = time.perf_counter() - began

@@ -72,7 +72,7 @@ def fleet(seed: int, building: Building, no_camera: bool) -> list[Outcome]:
     """Record one fleet, and map it with every strategy."""
     with tempfile.TemporaryDirectory() as place:
         recordings = Path(place) / "recordings"
-        arguments = ["simulate", "--building", building, "--seed", seed, "--output", recordings]
+        arguments = ["tools", "simulate", "--building", building, "--seed", seed, "--output", recordings]
         common.run_fcslam(*arguments, *(["--no-camera"] if no_camera else []))
         return [outcome(seed, strategy, recordings) for strategy in FusionStrategy]
 
@@ -82,7 +82,7 @@ def outcome(seed: int, strategy: FusionStrategy, recordings: Path) -> Outcome:
     robots = sorted(recordings.glob("robot_*"))
     config = recordings.parent / f"{strategy}.yaml"
     config.write_text(f"fleet: {{fusion: {strategy}}}")
-    cost = common.run_fcslam("map", *robots, "--output", run, "--config", config, "--seed", seed)
+    cost = common.run_fcslam("map", *robots, "--output", run, "--config", config, "--config", f"seed={seed}")
     used = common.metrics(run)["inter_robot_closures_accepted"]
     return Outcome(seed, strategy, evaluate_fleet(run, recordings), used, cost.wall_s)
 

@@ -8,7 +8,7 @@ made and blended in at its keypoint; what no patch covers becomes the mean grey 
 patch: that of the photographs' keypoint with the nearest code, and ridge regression from the bits to pixels, fitted
 to the photographs. Nothing is trained beyond that; a deep network could be expected to bring back more.
 
-Targets: frames of IE tower (four floors) and images of FLEET, a folder that `fcslam simulate` recorded, at 320 x 240.
+Targets: frames of IE tower (four floors) and images of FLEET, which `fcslam tools simulate` recorded, at 320 x 240.
 PSNR and SSIM are against the true image, over all pixels and over those within a patch. "Baseline" is a grey image of
 the photographs' mean; "told the mean" one of the target's own mean, which the attacker does not know. Recognised: the
 true image is, of all targets of its kind, the one whose picture of 32 x 24 pixels correlates most with that of the
@@ -58,7 +58,7 @@ class Seen:
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--fleet", type=Path, required=True, help="a folder that `fcslam simulate` recorded")
+    parser.add_argument("--fleet", type=Path, required=True, help="a folder that `fcslam tools simulate` recorded")
     parser.add_argument("--photographs", type=int, default=150, help="that the attacker has, of each collection")
     parser.add_argument("--targets", type=int, default=40, help="images of each kind")
     chosen = parser.parse_args()

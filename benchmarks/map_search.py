@@ -200,7 +200,7 @@ def map_together(logs: Sequence[Path]) -> Together:
     with tempfile.TemporaryDirectory() as place:
         joint, alone = Path(place) / "joint", Path(place) / "alone"
         cost = common.run_fcslam("map", *logs, "--output", joint)
-        common.run_fcslam("map", *logs, "--no-fuse", "--output", alone)
+        common.run_fcslam("map", *logs, "--config", "fleet.join_maps=false", "--output", alone)
         run = open_run(joint)
         return Together(run, placed(open_run(alone), run, alone), own_plan(joint, 0), cost)
 

@@ -7,8 +7,8 @@ benchmarks/places.py. `trained there`: the same tree grown from the set's own ga
 of 400 pixels. Both ways to score: eq. (4), and the index's default, whose words only propose. `regained`: by how much
 the recall at 1 is above that of the tree trained there, query by query, with 95 % by bootstrap.
 
-`simulation`: every camera place of every fleet in FOLDER (`fcslam simulate --seed 101 --output FOLDER/default-101` and
-so on), a metre or half a radian apart. Without --fleets these moves are left out.
+`simulation`: every camera place of every fleet in FOLDER (`fcslam tools simulate --seed 101 --output
+FOLDER/default-101` and so on), a metre or half a radian apart. Without --fleets these moves are left out.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,7 +42,7 @@ class School(NamedTuple):
 
 def main() -> None:
     parser = common.options(__doc__ or "")
-    parser.add_argument("--fleets", type=Path, help="folder of fleets that fcslam simulate recorded")
+    parser.add_argument("--fleets", type=Path, help="folder of fleets that fcslam tools simulate recorded")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
     images, features = common.recordings(*SETS, kind="vision"), choose_features("orb")

@@ -9,7 +9,7 @@ keypoints of the detector that comes with fcslam and Harris's corners. Each trai
 one thread; with the paper's losses, --collapsing-minutes may be fewer, as its codes collapse soon. The folder
 --training keeps what is done; the same command continues.
 
-Validation: pairs of held-out images, as at the end of `fcslam learn train`. `benchmarks/homography.py` evaluates the
+Validation: pairs of held-out images, as at the end of `fcslam tools train`. `benchmarks/homography.py` evaluates the
 networks on other scenes.
 """
 
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def label(roots: Iterable[Path], teacher: Path) -> None:
-    """Write the keypoints of the bundled detector for each image, as `fcslam learn train --teacher` reads them."""
+    """Write the keypoints of the bundled detector for each image, as `fcslam tools train --teacher` reads them."""
     detector = OnnxDetector(OnnxConfig())
     for file in find_images(list(roots)):
         target = teacher / f"{file.name}.npz"
@@ -97,8 +97,8 @@ def train(
     settings = folder / f"{run.name}.yaml"
     settings.write_text(yaml.safe_dump({"loss": LOSSES[losses]}), encoding="utf-8")
     cost = common.run_fcslam(
-        "learn", "train", *roots, "--encoder", encoder, "--steps", steps, "--config", settings, "--teacher", teacher,
-        "--device", "cpu", "--output", run, environment={"OMP_NUM_THREADS": "1"},
+        "tools", "train", *roots, "--config", settings, "--config", f"encoder={encoder}", "--config", f"steps={steps}",
+        "--teacher", teacher, "--output", run, environment={"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
     )  # fmt: skip
     last: dict[str, float] = {}
     with (run / "joint" / "progress.csv").open(encoding="utf-8") as file:

@@ -3,7 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/place_bytes.py
 
 Packets of two split logs, of the five runs of Wean Hall and of two simulated fleets with cameras (seeds 101 and 105; it
-needs a GL library, or FLEETS that `fcslam simulate` recorded), none of which the weights of
+needs a GL library, or FLEETS that `fcslam tools simulate` recorded), none of which the weights of
 `src/fcslam/wire/predictors` were fitted to.
 "Plain" is the same packet with 2 bytes a range, 2 a coordinate and 32 a descriptor; "deflated" is that with each of
 the three fields deflated by zlib at level 9. "A place with 300 descriptors" is every place that has as many, cut to
@@ -72,7 +72,7 @@ def recordings(folder: Path, fleets: Sequence[Path], place: Path) -> Iterator[tu
         yield name, split(open_source(common.log_path(folder, name)), robots)
     yield "wean-hall", [open_source(folder / run) for run in WEAN_HALL]
     for seed in SEEDS if not fleets else ():
-        common.run_fcslam("simulate", "--robots", 3, "--seed", seed, "--output", place / f"seed-{seed}")
+        common.run_fcslam("tools", "simulate", "--robots", 3, "--seed", seed, "--output", place / f"seed-{seed}")
     for fleet in fleets or sorted(place.iterdir()):
         yield f"simulated, {fleet.name}", [open_source(robot) for robot in sorted(fleet.glob("robot_*"))]
 

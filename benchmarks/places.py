@@ -8,7 +8,7 @@ judged on floors 11 to 15 only, and ORB there as well. Places look alike from fl
 one among all, which appearance cannot tell. Verified: the 50 most similar places of each query, ranked by how many
 matches one fundamental matrix explains. rebuild is left out: it would take hours; benchmarks/figure4.py
 has it. In brackets: 95 % by bootstrap over queries. LiDAR: places of one robot against those at least 60 s older, 1 m
-or less away by its own corrected poses; different is more than 10 m away. FLEET: folders that `fcslam simulate`
+or less away by its own corrected poses; different is more than 10 m away. FLEET: folders that `fcslam tools simulate`
 recorded, places of each robot against those of robots before it, by how much their views overlap; left out if none is
 given.
 """
@@ -37,7 +37,7 @@ SEED = 1
 def main() -> None:
     parser = common.options(__doc__ or "")
     parser.add_argument("--features", nargs="+", default=["orb", "onnx"], help="orb, onnx, .onnx files, folders")
-    parser.add_argument("--fleets", nargs="*", type=Path, default=[], help="recorded by fcslam simulate")
+    parser.add_argument("--fleets", nargs="*", type=Path, default=[], help="recorded by fcslam tools simulate")
     parser.add_argument("--no-lidar", action="store_true", help="images only")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)

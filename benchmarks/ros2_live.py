@@ -82,7 +82,7 @@ def drive(speed, mounting, folder):
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
     }
     command = [sys.executable, "-c", common._COMMAND, "robot", "ros2:/robot1", "-o", output, "-q"]
-    command.append("--laser-pose=" + ",".join(map(str, mounting)))
+    command.append("--sensors=laser-pose=" + ",".join(map(str, mounting)))
     package = str(Path(common.fcslam.__file__).parents[1])
     arrivals = heard_transforms(environment)
     with (

@@ -3,7 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/served.py
 
 Three logs cut into robots, the five runs of Wean Hall, and a simulated fleet with cameras (seed 101; it needs a GL
-library, or FLEET that `fcslam simulate` recorded). Each is mapped twice by `fcslam serve` and one `fcslam robot` a
+library, or FLEET of `fcslam tools simulate`). Each is mapped twice by `fcslam serve` and one `fcslam robot` a
 robot: all of it as fast as robots can, and then its first seconds at the speed at which they were recorded, all fleets
 at the same time. What comes out is compared with what `fcslam map` makes of the same files in one process: packets,
 closures (all lines of closures.csv), pose graph, bytes of the maps, poses at keyscans. No tolerance.
@@ -108,7 +108,7 @@ def recorded(name: str, place: Path, fleet: Path | None) -> Iterator[Source]:
     else:
         if fleet is None:
             fleet = place / "fleet"
-            common.run_fcslam("simulate", "--robots", 3, "--seed", SEED, "--output", fleet)
+            common.run_fcslam("tools", "simulate", "--robots", 3, "--seed", SEED, "--output", fleet)
         yield from map(open_source, sorted(fleet.glob("robot_*")))
 
 

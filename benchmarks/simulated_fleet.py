@@ -27,7 +27,7 @@ import common
 
 ROBOTS = 3
 SEEDS = tuple(range(101, 111))
-DIM = ("--lighting", "day", "--lighting", "evening", "--lighting", "lamp-off", "--moved-furniture", "0.5")
+DIM = ("--lighting", "day", "--lighting", "evening", "--lighting", "lamp-off", "--config", "moved_furniture=0.5")
 CHANNELS = {"both": ("lidar", "camera"), "lidar": ("lidar",), "camera": ("camera",)}
 CASES = {
     "default": ((), ("both",)),
@@ -71,7 +71,7 @@ def fleet_rows(case: str, seed: int) -> Iterable[tuple]:
     simulated, places = CASES[case]
     with tempfile.TemporaryDirectory() as place:
         fleet = Path(place) / "fleet"
-        common.run_fcslam("simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet)
+        common.run_fcslam("tools", "simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet)
         for name in places:
             settings, run, result = Path(place) / f"{name}.yaml", Path(place) / name, Path(place) / f"{name}.json"
             settings.write_text(f"robot: {{channels: [{', '.join(CHANNELS[name])}]}}\n", encoding="utf-8")

@@ -37,7 +37,7 @@ def main() -> None:
 def row(building: Building, seed: int, cameras: bool) -> tuple:
     fleet = simulate_fleet(SimulationSettings(building=building), seed)
     with tempfile.TemporaryDirectory() as place:
-        arguments = ["simulate", "--building", building, "--seed", seed, "--output", Path(place) / "fleet"]
+        arguments = ["tools", "simulate", "--building", building, "--seed", seed, "--output", Path(place) / "fleet"]
         cost = common.run_fcslam(*arguments, *([] if cameras else ["--no-camera"]))
     driven_s = max(robot.duration_s for robot in fleet.robots)
     scans = sum(len(robot.stamps) for robot in fleet.robots)

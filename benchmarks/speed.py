@@ -5,7 +5,7 @@
 The two checkouts take turns, so that both see the same machine. A figure is the least of its repetitions, a ratio is
 ours to theirs. Both run with the interpreter that runs this script. CPU seconds are user and system, all threads and
 children, imports included, with compiled code in the cache. "Until the first scan": from the start of the process, with
-an empty cache, as after an installation without `fcslam setup warm-up`. With one repetition it takes four minutes.
+an empty cache, as after an installation without `fcslam tools warm-up`. With one repetition it takes four minutes.
 """
 
 import math

@@ -3,7 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/spinning.py
     python benchmarks/spinning.py --logs --seeds 1 --path-length 10
 
-One simulated robot drives in a building of each seed (`fcslam simulate --scanner --turn-rate --odometry`). Scanners
+One simulated robot drives in a building of each seed (`fcslam tools simulate`). Scanners
 that spin measure each beam at its own time. The drive is written as a ROS 2 bag and mapped as `fcslam map` does. The
 error is that of the positions at all scans after a rigid alignment.
 

@@ -46,7 +46,7 @@ def main() -> None:
             for seed in chosen.seeds:
                 out = Path(place) / f"{number}-{seed}"
                 paths = [folder / log for log in logs]
-                cost = common.run_fcslam("map", *paths, "--output", out, "--seed", seed)
+                cost = common.run_fcslam("map", *paths, "--output", out, "--config", f"seed={seed}")
                 run = open_run(out)
                 rows.append((group, seed, *verdict(run, cost)))
                 close += [(group, seed, *row) for row in verified_pairs(run)]

@@ -27,7 +27,7 @@ GAPS = {"arm": "s", "seeds": "d", "mean": ".1f", "gap": "s", "closed": ".2f", "o
 def robots(vision: Path, folder: Path) -> dict[str, Path]:
     """Each robot's folder of images; the simulated ones drive first, unless they have."""
     if not (folder / "fleet" / "simulation.yaml").exists():
-        common.run_fcslam("simulate", "--output", folder / "fleet", *SIMULATION)
+        common.run_fcslam("tools", "simulate", "--output", folder / "fleet", *SIMULATION)
     real = {name: vision / place for name, place in VISION.items()}
     return real | {name: folder / "fleet" / robot for name, robot in SIMULATED.items()}
 

@@ -50,7 +50,7 @@ def vocabulary(folder: Path, fleets: Path) -> Path:
     fleet = common.simulated(fleets / "other", "--robots", simulated_fleet.ROBOTS, "--seed", OTHER_SEED)
     run, words = folder / "other-run", folder / "shared.words"
     common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--output", run)
-    common.run_fcslam("learn", "vocabulary", run, "--output", words)
+    common.run_fcslam("tools", "vocabulary", run, "--output", words)
     return words
 
 

@@ -166,8 +166,7 @@ def test_the_commands_run_in_the_order_of_the_list(name, logs, desk, capsys):
     for alias, log in BAGS.items():
         if any(alias in command for command in EXECUTED[name]):
             (desk / alias).parent.mkdir(exist_ok=True)
-            assert main(["convert", str(logs / log), alias]) == 0
-    (desk / "vetoes.csv").write_text("robot_i,stamp_i,robot_j,stamp_j\nrobot1,,robot3,\n")
+            assert main(["record", str(logs / log), "-o", alias]) == 0
     for command in map(as_here, EXECUTED[name]):
         for made, make in MADE.items():
             if made in command and not (desk / made).exists():
@@ -183,7 +182,6 @@ def overwritten(folder: Path, command: str) -> list[str]:
     """Outputs of a command that an earlier command of the list has written."""
     words = shlex.split(command)
     outputs = [words[i + 1] for i, word in enumerate(words) if word == "-o"]
-    outputs += words[-1:] if words[1] == "convert" else []
     return [output for output in outputs if (folder / output).exists()]
 
 

@@ -211,12 +211,12 @@ def test_the_documented_example_writes_a_log_that_can_be_read(tmp_path, monkeypa
         ("fcslam map --config", False, True),
         ("fcslam map --pieces 3", False, False),
         ("fcslam map a.clf -o out --split none", True, False),
-        ("fcslam setup config > mission.yaml", True, True),
+        ("fcslam tools config > mission.yaml", True, True),
         ("fcslam config print", False, False),
         ("fcslam fly", False, False),
         ("fcslam --version", True, True),
         ("fcslam --install-completion", False, True),
-        ("fcslam learn federate --local", False, False),
+        ("fcslam tools federate --local", False, False),
     ],
 )
 def test_the_rule_for_commands(line, complete, fine):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam.errors import ConfigError, EvaluationError, OutputError
+from fcslam.errors import EvaluationError, OutputError
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import (
@@ -20,7 +20,6 @@ from fcslam.runs import (
     folder,
     open_run,
     prepare_output,
-    read_vetoes,
 )
 from fcslam.runs.map_files import OccupancyMap, map_yaml, parse_map, pgm_bytes
 from fcslam.storage import files
@@ -241,44 +240,6 @@ def test_a_broken_run_folder_is_refused_in_one_line(tmp_path, run, file, content
     with pytest.raises(EvaluationError, match=message) as caught:
         open_run(tmp_path / "run")
     assert "\n" not in str(caught.value)
-
-
-def test_lines_of_closures_csv_are_vetoes(tmp_path, run):
-    run.save(tmp_path / "run")
-    (veto, *_) = read_vetoes(tmp_path / "run" / "closures.csv")
-    row = run.closures[0]
-    ends = (row.robot_i, row.stamp_i), (row.robot_j, row.stamp_j)
-    assert veto.forbids(*ends[0], *ends[1])
-    assert veto.forbids(*ends[1], *ends[0]), "whichever end is told first"
-    assert not veto.forbids(row.robot_i, row.stamp_i, row.robot_j, row.stamp_j + 0.001)
-    assert not veto.forbids("somebody", row.stamp_i, row.robot_j, row.stamp_j)
-
-
-def test_a_veto_without_stamps_speaks_of_two_robots(tmp_path):
-    (path := tmp_path / "vetoes.csv").write_text("robot_i,stamp_i,robot_j,stamp_j\na,,b,\n")
-    (veto,) = read_vetoes(path)
-    assert veto.forbids("b", 7.0, "a", 1.0)
-    assert not veto.forbids("b", 7.0, "c", 1.0)
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        ("robot_i,robot_j\na,b\n", "expected the columns robot_i, stamp_i"),
-        ("robot_i,stamp_i,robot_j,stamp_j\na,1.0,b,\n", "line 2: two stamps or none"),
-        ("robot_i,stamp_i,robot_j,stamp_j\na,1.0,b,x\n", "line 2: two stamps or none"),
-        ("robot_i,stamp_i,robot_j,stamp_j\na,1.0,b,nan\n", "line 2: two stamps or none"),
-        ("", "expected the columns"),
-        ("foo,bar\n", "expected the columns"),
-        (None, "No such file"),
-    ],
-)
-def test_what_is_no_list_of_vetoes_is_refused(tmp_path, content, reason):
-    path = tmp_path / "vetoes.csv"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(ConfigError, match=reason):
-        read_vetoes(path)
 
 
 MAP = OccupancyMap(np.random.default_rng(0).integers(0, 3, (7, 4)).astype(np.uint8), 0.05, (-1.25, 3.5))

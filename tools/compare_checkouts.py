@@ -66,12 +66,13 @@ def cases(data: Path, work: Path) -> Iterator[Case]:
     yield Case("intel-3", ("map", str(logs / "intel.clf.xz"), "--split", "3", "--output", "{output}"))
     runs = [str(data / "lidar" / "wean-hall" / f"robotdata{number}.log.gz") for number in range(1, 6)]
     yield Case("wean-hall", ("map", *runs, "--output", "{output}"))
-    simulate = ("simulate", "--robots", "3", "--seed", "101", "--path-length", "40", "--output", "{output}")
+    simulate = ("tools", "simulate", "--robots", "3", "--seed", "101", "--path-length", "40", "--output", "{output}")
     yield Case("simulate", simulate)
     fleet = [str(work / "before" / "simulate" / f"robot_{number}") for number in range(1, 4)]
     yield Case("cameras", ("map", *fleet, "--output", "{output}"))
     robots = [str(data / "vision" / name) for name in ("kodak24", "sun_hays80")]
-    yield Case("federated", ("learn", "federate", "local", *robots, "--quick", "--rounds", "2", "--output", "{output}"))
+    federate = ("tools", "federate", "local", *robots, "--quick", "--config", "rounds=2", "--output", "{output}")
+    yield Case("federated", federate)
 
 
 def run(case: Case, checkout: Path, place: Path) -> None:

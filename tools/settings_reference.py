@@ -60,7 +60,7 @@ the code.
 Write the complete default configuration to a file, change it, and give it to a command:
 
 ```sh
-fcslam setup config > mission.yaml
+fcslam tools config > mission.yaml
 fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 ```
 
@@ -110,7 +110,7 @@ Training on one machine and on several robots has configuration files of its own
 
 ## Training
 
-`fcslam learn train --config` reads these keys from a YAML file.
+`fcslam tools train --config` reads these keys from a YAML file.
 """
 
 FEDERATED = """\

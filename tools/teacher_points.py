@@ -1,4 +1,4 @@
-"""Keypoints and descriptors of a teacher, for `fcslam learn train --teacher`: ALIKED (Zhao et al. 2023) by kornia.
+"""Keypoints and descriptors of a teacher, for `fcslam tools train --teacher`: ALIKED (Zhao et al. 2023) by kornia.
 
     python tools/teacher_points.py WEIGHTS IMAGES... --output TEACHER
 

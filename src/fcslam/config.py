@@ -42,7 +42,7 @@ def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None)
     if content is None:
         content = {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: expected a mapping of keys; `fcslam setup config` prints a complete one")
+        raise ConfigError(f"{path}: expected a mapping of keys; `fcslam tools config` prints a complete one")
     return parse(kind, content, str(path)) if over is None else changed(over, content, str(path))
 
 

@@ -283,7 +283,7 @@ def test_the_page_recovers_when_the_service_is_killed_and_comes_back(page, packe
 @pytest.fixture(scope="module")
 def credentials(tmp_path_factory):
     folder = tmp_path_factory.mktemp("credentials")
-    assert main(["setup", "certificates", "-o", str(folder), "--robot=robot_1", "--robot=robot_2", "--viewer=eye"]) == 0
+    assert main(["tools", "certificates", "-o", str(folder), "--robot=robot_1", "--robot=robot_2", "--viewer=eye"]) == 0
     return folder
 
 
@@ -292,7 +292,8 @@ def test_a_viewer_sees_and_may_not_veto(page, packets, credentials, tmp_path):
         (place,) = credentials.glob(f"*/{name}/token")
         return place.read_text().strip()
 
-    with closing(Service(tmp_path / "data", "--tokens", str(credentials / "tokens.yaml"))) as service:
+    (tmp_path / "tokens.yaml").write_bytes((credentials / "tokens.yaml").read_bytes())
+    with closing(Service(tmp_path / "data", "--credentials", str(tmp_path))) as service:
         for robot in ("robot_1", "robot_2"):
             play(service.url, packets, (robot,), Authorization=f"Bearer {token(robot)}")
         page.goto(service.url)
@@ -321,7 +322,7 @@ def test_a_token_that_expires_is_asked_for_again_and_nothing_is_lost(page, packe
     tokens.write_bytes((credentials / "tokens.yaml").read_bytes())
     eye = (credentials / "users" / "eye" / "token").read_text().strip()
     robot = {"Authorization": f"Bearer {(credentials / 'robots' / 'robot_1' / 'token').read_text().strip()}"}
-    with closing(Service(tmp_path / "data", "--tokens", str(tokens))) as service:
+    with closing(Service(tmp_path / "data", "--credentials", str(tokens.parent))) as service:
         play(service.url, packets, ("robot_1",), **robot)
         page.goto(service.url)
         page.get_by_label("Token").fill(eye)

@@ -1,4 +1,4 @@
-"""`fcslam map` on bags, names for robots, and `fcslam convert`."""
+"""`fcslam map` on bags, names for robots, and `fcslam record`."""
 
 import csv
 from dataclasses import replace
@@ -57,7 +57,7 @@ def from_log(logs, tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3", "run"])
 def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path, name):
-    assert run("convert", logs[0], tmp_path / name) == 0
+    assert run("record", logs[0], "-o", tmp_path / name) == 0
     assert run("map", f"robot={tmp_path / name}", "-o", tmp_path / "out") == 0
     stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
     np.testing.assert_allclose(stamps, from_log[0], atol=1e-9)
@@ -66,7 +66,7 @@ def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path,
 
 @pytest.mark.slow
 def test_a_recording_made_of_a_log_gives_the_same_trajectory_to_the_bit(logs, from_log, tmp_path):
-    assert run("convert", logs[0], tmp_path / "robot.fcslam") == 0
+    assert run("record", logs[0], "-o", tmp_path / "robot.fcslam") == 0
     assert run("map", tmp_path / "robot.fcslam", "-o", tmp_path / "out") == 0
     stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
     np.testing.assert_array_equal(stamps, from_log[0])
@@ -96,10 +96,10 @@ def test_a_copy_of_a_recording_under_another_name_is_refused(tmp_path, capsys, c
 def test_choices_and_faults_are_said(tmp_path, capsys):
     said = [*drive(40), *(odom(100 + k, (9, 9, 0), topic="/filtered") for k in range(9))]
     bag = save(tmp_path / "run.bag", said[1:])
-    assert run("map", bag, "--laser-pose", "-0.1,0,0", "-o", tmp_path / "out") == 0
+    assert run("map", bag, "--sensors", "laser-pose=-0.1,0,0", "-o", tmp_path / "out") == 0
     error = capsys.readouterr().err
-    assert f"{bag}: reads odometry from /odom, not from /filtered (--odom-topic chooses)\n" in error
-    assert run("map", bag, "--laser-pose", "0,0,0", "--split", 2, "-o", tmp_path / "two") == 0
+    assert f"{bag}: reads odometry from /odom, not from /filtered (--sensors odom-topic chooses)\n" in error
+    assert run("map", bag, "--sensors", "laser-pose=0,0,0", "--split", 2, "-o", tmp_path / "two") == 0
     assert capsys.readouterr().err.count("reads odometry from") == 1
 
 
@@ -142,40 +142,53 @@ def test_a_name_without_a_file(tmp_path, capsys):
 # Refusals
 
 
-@pytest.mark.parametrize("options", [("--scan-topic", "/scan"), ("--odom-topic", "/odom"), ("--laser-pose", "0,0,0")])
-def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, options):
+@pytest.mark.parametrize("given", ["scan-topic=/scan", "odom-topic=/odom", "laser-pose=0,0,0"])
+def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, given):
     log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40))
-    assert "a.log: a CARMEN log" in refused(capsys, "map", bag, log, *options, "-o", tmp_path / "out")
-    assert "a.log: a CARMEN log" in refused(capsys, "convert", log, tmp_path / "a.bag", *options)
+    assert "a.log: a CARMEN log" in refused(capsys, "map", bag, log, "--sensors", given, "-o", tmp_path / "out")
+    assert "a.log: a CARMEN log" in refused(capsys, "record", log, "-o", tmp_path / "a.bag", "--sensors", given)
 
 
-@pytest.mark.parametrize("pose", ["1,2", "1,2,3,4", "a,b,c", "nan,0,0", "inf,0,0", ""])
+@pytest.mark.parametrize("pose", ["1,2", "1,2,3,4", "a,b,c", "nan,0,0", "inf,0,0"])
 def test_a_pose_that_is_none(tmp_path, bag, capsys, pose):
     assert "is not a pose; give X,Y,THETA in metres" in refused(
-        capsys, "map", bag, "--laser-pose", pose, "-o", tmp_path / "out"
+        capsys, "map", bag, "--sensors", f"laser-pose={pose}", "-o", tmp_path / "out"
     )
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        (["scan=/scan"], "expected KEY=VALUE with a key of scan-topic, odom-topic"),
+        (["scan-topic="], "expected KEY=VALUE"),
+        (["odom-topic=/odom", "odom-topic=none"], "--sensors odom-topic: is given twice"),
+    ],
+)
+def test_a_key_of_the_sensors_that_is_none(tmp_path, bag, capsys, given, reason):
+    options = [word for value in given for word in ("--sensors", value)]
+    assert reason in refused(capsys, "map", bag, *options, "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize("band", ["0.6,0.1", "0.1", "low,high", "0.1,0.6,-1", "0.1,nan", "0.1,0.6,0.4,2"])
 def test_a_band_of_heights_that_is_none(tmp_path, bag, capsys, band):
-    said = refused(capsys, "map", bag, "--cloud-band", band, "-o", tmp_path / "run")
-    assert f"--cloud-band '{band}' is not a band of heights" in said
+    said = refused(capsys, "map", bag, "--sensors", f"cloud-band={band}", "-o", tmp_path / "run")
+    assert f"--sensors cloud-band={band}: is not a band of heights" in said
 
 
 def test_bad_bags_leave_nothing(tmp_path, capsys):
     (tmp_path / "unindexed.bag").write_bytes(b"#ROSBAG V2.0\n")
     bad = {
         save(tmp_path / "nothing.bag", [text(1.0)]): "no laser scans",
-        save(tmp_path / "no_tf.mcap", drive(20)[1:]): "--laser-pose",
+        save(tmp_path / "no_tf.mcap", drive(20)[1:]): "--sensors laser-pose",
         tmp_path / "unindexed.bag": "rosbag reindex",
     }
     for path, reason in bad.items():
         assert reason in refused(capsys, "map", path, "-o", tmp_path / "out")
-        assert reason in refused(capsys, "convert", path, tmp_path / "out.clf")
+        assert reason in refused(capsys, "record", path, "-o", tmp_path / "out.clf")
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in bad}
 
 
-# fcslam convert
+# fcslam record, of a recording
 
 
 @pytest.mark.slow
@@ -184,7 +197,7 @@ def test_bad_bags_leave_nothing(tmp_path, capsys):
 )
 def test_every_format_can_be_written_and_read(tmp_path, bag, name, capsys):
     output = tmp_path / "deep" / name
-    assert run("convert", bag, output) == 0
+    assert run("record", bag, "-o", output) == 0
     assert capsys.readouterr().out == f"40 scans: {output}\n"
     assert open_source(output).survey().scan_count == 40
     assert [path.name for path in output.parent.iterdir()] == [name]
@@ -193,8 +206,8 @@ def test_every_format_can_be_written_and_read(tmp_path, bag, name, capsys):
 def test_options_choose_what_is_converted(tmp_path):
     said = [*drive(40), *(scan(100 + k, topic="/other") for k in range(7))]
     bag = save(tmp_path / "run.bag", said)
-    options = ("--scan-topic", "/other", "--laser-pose", "1,0,0")
-    assert run("convert", bag, tmp_path / "other.clf", *options) == 0
+    options = ("--sensors", "scan-topic=/other", "--sensors", "laser-pose=1,0,0")
+    assert run("record", bag, "-o", tmp_path / "other.clf", *options) == 0
     assert open_source(tmp_path / "other.clf").survey().scan_count == 7
 
 
@@ -202,12 +215,12 @@ def test_options_choose_what_is_converted(tmp_path):
 @pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder", "a.fcslam"])
 def test_only_force_replaces(tmp_path, bag, capsys, name):
     output = tmp_path / name
-    assert run("convert", bag, output) == 0
-    assert "--force" in refused(capsys, "convert", bag, output)
+    assert run("record", bag, "-o", output) == 0
+    assert "--force" in refused(capsys, "record", bag, "-o", output)
     shorter = save(tmp_path / "short.mcap", drive(12))
-    assert run("convert", shorter, output, "--force") == 0
+    assert run("record", shorter, "-o", output, "--force") == 0
     assert open_source(output).survey().scan_count == 12
-    assert run("convert", output, output, "--force") == 0
+    assert run("record", output, "-o", output, "--force") == 0
     assert open_source(output).survey().scan_count == 12
 
 
@@ -216,42 +229,42 @@ def test_the_times_of_beams_are_lost_in_a_carmen_log_alone(tmp_path, capsys):
     write_recording(tmp_path / "run.fcslam", (LASER,), CAMERA, spun)
     said = "run.clf: a CARMEN log has no place for the times of beams, they are lost"
     for name, is_told in (("run.mcap", False), ("run.clf", True)):
-        assert run("convert", tmp_path / "run.fcslam", tmp_path / name) == 0
+        assert run("record", tmp_path / "run.fcslam", "-o", tmp_path / name) == 0
         assert (said in capsys.readouterr().err) is is_told
     assert all(item.sweep for item in open_source(tmp_path / "run.mcap").records() if isinstance(item, LaserScan))
-    assert run("convert", tmp_path / "run.clf", tmp_path / "again.clf") == 0
+    assert run("record", tmp_path / "run.clf", "-o", tmp_path / "again.clf") == 0
     assert "times of beams" not in capsys.readouterr().err
 
 
 def test_images_go_where_there_is_a_place_for_them(tmp_path, capsys):
     write_recording(tmp_path / "run.fcslam", (LASER,), CAMERA, camera_drive())
-    assert run("convert", tmp_path / "run.fcslam", tmp_path / "run.mcap") == 0
+    assert run("record", tmp_path / "run.fcslam", "-o", tmp_path / "run.mcap") == 0
     assert "images" not in capsys.readouterr().err
     assert open_source(tmp_path / "run.mcap").survey().camera == CAMERA
-    assert run("convert", tmp_path / "run.mcap", tmp_path / "run.clf") == 0
+    assert run("record", tmp_path / "run.mcap", "-o", tmp_path / "run.clf") == 0
     assert "run.clf: a CARMEN log has no place for images, they are left out" in capsys.readouterr().err
     assert open_source(tmp_path / "run.clf").survey().scan_count == 20
 
 
 def test_what_convert_refuses(tmp_path, bag, capsys):
-    assert "a.zip: unknown format" in refused(capsys, "convert", bag, tmp_path / "a.zip")
+    assert "a.zip: unknown format" in refused(capsys, "record", bag, "-o", tmp_path / "a.zip")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
-    assert "no recording" in refused(capsys, "convert", bag, tmp_path / "thesis", "--force")
+    assert "no recording" in refused(capsys, "record", bag, "-o", tmp_path / "thesis", "--force")
     assert (tmp_path / "thesis" / "main.tex").exists()
     (tmp_path / "dir.bag").mkdir()
-    assert "is a folder" in refused(capsys, "convert", bag, tmp_path / "dir.bag", "--force")
-    assert "cannot be written" in refused(capsys, "convert", bag, bag / "a.clf")
-    assert "no such file" in refused(capsys, "convert", tmp_path / "none.bag", tmp_path / "a.clf")
+    assert "is a folder" in refused(capsys, "record", bag, "-o", tmp_path / "dir.bag", "--force")
+    assert "cannot be written" in refused(capsys, "record", bag, "-o", bag / "a.clf")
+    assert "no such file" in refused(capsys, "record", tmp_path / "none.bag", "-o", tmp_path / "a.clf")
 
 
 def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
     log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40, start_stamp=-5.0))
-    assert "ROS counts from 0 s" in refused(capsys, "convert", log, tmp_path / "a.bag")
+    assert "ROS counts from 0 s" in refused(capsys, "record", log, "-o", tmp_path / "a.bag")
     assert {path.name for path in tmp_path.iterdir()} == {"a.log"}
 
 
 def test_a_name_that_is_too_long_is_one_line(logs, tmp_path, capsys):
     long = "a" * 300
-    assert "name too long" in refused(capsys, "convert", f"robot={long}.bag", tmp_path / "out.clf")
-    assert "name too long" in refused(capsys, "convert", logs[0], tmp_path / f"{long}.bag")
+    assert "name too long" in refused(capsys, "record", f"robot={long}.bag", "-o", tmp_path / "out.clf")
+    assert "name too long" in refused(capsys, "record", logs[0], "-o", tmp_path / f"{long}.bag")

@@ -194,7 +194,7 @@ def area(run):
 
 
 def place(run):
-    assert edit(run, "place", "--rotate", 90, "--shift", "10,-3") == 0
+    assert edit(run, "place", "--match", "0,0=10,-3", "--match", "1,0=10,-2") == 0
 
     def check(after):
         T = np.array((10.0, -3.0, np.pi / 2))
@@ -287,16 +287,15 @@ BAD = {
     "an area with a line break in its name": ("area", "a\nb", "1,2 3,4"),
     "an area without a name": ("area", "", "1,2 3,4"),
     "nothing to do": ("place",),
-    "a pose without its moment": ("place", "--pose", "1,2,3"),
-    "two ways to place": ("place", "--to-walls", "--at", "robot1,1", "--pose", "1,2,3"),
+    "a moment without its pose": ("place", "--at", "robot1,1"),
+    "a pose without its moment": ("place", "--at", "=1,2,3"),
+    "two ways to place": ("place", "--to-walls", "--at", "robot1,1=1,2,3"),
     "one point": ("place", "--match", "1,2=3,4"),
     "the same point twice": ("place", "--match", "1,2=3,4", "--match", "1,2=3,4"),
     "a point without its target": ("place", "--match", "1,2", "--match", "3,4=5,6"),
     "a point that is not a number": ("place", "--match", "1,nan=0,0", "--match", "3,4=5,6"),
     "a far target": ("place", "--match", "1,2=1e9,0", "--match", "3,4=1e9,6"),
-    "two ways to place at once": ("place", "--rotate", "1", "--match", "1,2=3,4", "--match", "3,2=5,4"),
-    "no shift": ("place", "--shift", "1"),
-    "a turn that is not a number": ("place", "--rotate", "nan"),
+    "two ways to place at once": ("place", "--to-walls", "--match", "1,2=3,4", "--match", "3,2=5,4"),
     "no tolerance": ("close", "robot1", "1", "robot2", "1", "--pose", "0,0,0", "--tolerance", "0,0.1"),
     "a closure with itself": ("close", "robot1", "1", "robot1", "1", "--pose", "0,0,0"),
     "no pose": ("close", "robot1", "1", "robot2", "1", "--pose", "0,0"),

@@ -1,4 +1,4 @@
-"""`fcslam learn federate`: a whole run of real robots, its resuming, and what bad input is answered."""
+"""`fcslam tools federate`: a whole run of real robots, its resuming, and what bad input is answered."""
 
 import contextlib
 import csv
@@ -21,8 +21,7 @@ TINY = {
     "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
 }
 pytestmark = pytest.mark.usefixtures("brief_validation")
-SERVE_FILES = ("--tls-certificate", "{fleet}/tiny.yaml", "--tls-key", "{fleet}/tiny.yaml")
-TOKENS = ("--tokens", "{fleet}/tiny.yaml")
+TLS_ONLY, ALL = ("--credentials", "{fleet}/tls"), ("--credentials", "{fleet}/all")
 
 
 @pytest.fixture(scope="module")
@@ -36,20 +35,28 @@ def fleet(tmp_path_factory):
     (made / "public").mkdir()
     cv2.imwrite(str(made / "public" / "9.png"), textured(9))
     (made / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    for folder, names in {
+        "tls": ("cloud.pem", "cloud.key"),
+        "all": ("cloud.pem", "cloud.key", "tokens.yaml"),
+        "mine": ("ca.pem",),
+    }.items():
+        (made / folder).mkdir()
+        for name in names:
+            (made / folder / name).write_text("x")
     return made
 
 
 def federate(fleet, output, *more, robots=("one", "two", "bare")):
     folders = [str(fleet / robot) for robot in robots]
-    settings = ["--config", str(fleet / "tiny.yaml"), "--device", "cpu"]
-    return main(["learn", "federate", "local", *folders, "--output", str(output), *settings, *more])
+    settings = ["--config", str(fleet / "tiny.yaml")]
+    return main(["tools", "federate", "local", *folders, "--output", str(output), *settings, *more])
 
 
 @pytest.fixture(scope="module")
 def run(fleet, tmp_path_factory, brief_validation):
     """The folder of one round, in which the same command with two rounds went on, and what that command said."""
     output, public = tmp_path_factory.mktemp("run") / "fleet", ("--public", str(fleet / "public"))
-    assert federate(fleet, output, *public, "--rounds", "1") == 0
+    assert federate(fleet, output, *public, "--config", "rounds=1") == 0
     with contextlib.redirect_stderr(io.StringIO()) as said:
         assert federate(fleet, output, *public) == 0
     return output, said.getvalue()
@@ -76,7 +83,7 @@ def test_a_run_folder_holds_everything(run, fleet):
 def test_the_delivered_detectors_run(run, fleet, tmp_path):
     run, _ = run
     for name in ("detector.onnx", "detector-int8.onnx"):
-        arguments = ["learn", "extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
+        arguments = ["tools", "extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
         assert main([*arguments, "--weights", str(run / name)]) == 0
         assert len(list((tmp_path / name).rglob("*.npz"))) == 3
 
@@ -96,7 +103,7 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
     assert "round 1/2" not in said.partition("round 2/2")[2]
     assert [row["round"] for row in rows_of(run)] == ["1", "2"]
     begun = tmp_path / "begun"
-    start = ("--start", str(run / "checkpoint.npz"), "--rounds", "1")
+    start = ("--start", str(run / "checkpoint.npz"), "--config", "rounds=1")
     assert federate(fleet, begun, *start, robots=("one", "two")) == 0
     assert not (begun / "shapes").exists()
 
@@ -106,7 +113,7 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
     [
         (["local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
         (["local", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
-        (["local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
+        (["local", "{fleet}/one", "-o", "{out}", "--config", "strategy=best"], "strategy"),
         (["local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
         (
             ["local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"],
@@ -117,14 +124,14 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
             "is not a checkpoint",
         ),
         (["serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is not a HOST:PORT"),
-        (["serve", "a:1", "-o", "{out}"], "give --tokens"),
-        (["serve", "a:1", "-o", "{out}", *SERVE_FILES], "give --tokens"),
-        (["serve", "a:1", "-o", "{out}", "--insecure", *TOKENS, *SERVE_FILES], "or --insecure"),
-        (["serve", "a:1", "-o", "{out}", *TOKENS, *SERVE_FILES], "no certificate with its key"),
+        (["serve", "a:1", "-o", "{out}"], "give --credentials"),
+        (["serve", "a:1", "-o", "{out}", *TLS_ONLY], "give --credentials"),
+        (["serve", "a:1", "-o", "{out}", "--insecure", *ALL], "or --insecure"),
+        (["serve", "a:1", "-o", "{out}", *ALL], "no certificate with its key"),
         (["join", "http://a:1", "{fleet}/nobody", "-o", "{out}"], "nobody: is not a folder"),
         (["join", "a", "{fleet}/one", "-o", "{out}"], "is not the address of a cloud"),
         (
-            ["join", "https://a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"],
+            ["join", "https://a:1", "{fleet}/one", "-o", "{out}", "--credentials", "{fleet}/mine"],
             "give a PEM",
         ),
         (
@@ -132,14 +139,14 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
             "give another --name",
         ),
         (
-            ["join", "http://a:1", "{fleet}/one", "-o", "{out}", "--token-file", "{fleet}/no"],
-            "no token",
+            ["join", "http://a:1", "{fleet}/one", "-o", "{out}", "--credentials", "{fleet}/no"],
+            "holds no credentials",
         ),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
     given = [word.format(fleet=fleet, out=tmp_path / "out") for word in arguments]
-    assert main(["learn", "federate", *given]) == BAD_INPUT
+    assert main(["tools", "federate", *given]) == BAD_INPUT
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
     assert words in said[0]
@@ -155,16 +162,16 @@ def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
         ["serve", "a:1", "--name", "one"],
         ["join", "a:1"],
         ["join", "a:1", "{fleet}/one", "{fleet}/two", "-o", "{out}"],
-        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--rounds", "3"],
-        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--tokens", "tokens.yaml"],
+        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/public"],
+        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--config", "rounds=3"],
         ["--local", "{fleet}/one"],
     ],
 )
 def test_each_subcommand_has_its_own_options_only(arguments, fleet, tmp_path, capsys):
     given = [word.format(fleet=fleet, out=tmp_path / "out") for word in arguments]
-    assert main(["learn", "federate", *given]) == BAD_INPUT
+    assert main(["tools", "federate", *given]) == BAD_INPUT
     error = capsys.readouterr().err
-    assert "Usage: fcslam learn federate" in error
+    assert "Usage: fcslam tools federate" in error
     assert "Traceback" not in error
 
 

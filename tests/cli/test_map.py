@@ -4,7 +4,6 @@ import csv
 import gzip
 import json
 import lzma
-from itertools import combinations
 
 import cv2
 import numpy as np
@@ -48,7 +47,7 @@ def names_in(folder):
 def run(logs, tmp_path_factory):
     """The three robots' run folder."""
     folder = tmp_path_factory.mktemp("runs") / "deep" / "run"
-    assert run_map(*logs, "--output", folder, "--seed", 5) == 0
+    assert run_map(*logs, "--output", folder, "--config", "seed=5") == 0
     return folder
 
 
@@ -129,7 +128,7 @@ def test_one_recording_split_into_robots(logs, tmp_path, drawn):
 @pytest.mark.slow
 def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsys):
     run = tmp_path / "run"
-    assert run_map(*logs, "--no-fuse", "--output", run) == 0
+    assert run_map(*logs, "--config", "fleet.join_maps=false", "--output", run) == 0
     assert maps_of(run) == {robot.name: k for k, robot in enumerate(drawn.robots)}
     assert {f"map{tail}.{kind}" for tail in ("", "_1", "_2") for kind in ("pgm", "png", "yaml")} <= names_in(run)
     assert yaml.safe_load((run / "map_2.yaml").read_text())["image"] == "map_2.pgm"
@@ -141,7 +140,7 @@ def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsy
 @pytest.mark.slow
 def test_the_configuration_goes_round(logs, run, tmp_path, capsys):
     """A dumped configuration is a valid one, and the run's own gives the run again, byte for byte."""
-    assert main(["setup", "config"]) == 0
+    assert main(["tools", "config"]) == 0
     (tmp_path / "dumped.yaml").write_text(capsys.readouterr().out)
     assert run_map(logs[0], "--config", tmp_path / "dumped.yaml", "--output", tmp_path / "one") == 0
     assert (tmp_path / "one" / "config.yaml").read_text() == dump(MissionConfig())
@@ -159,7 +158,7 @@ def test_an_empty_folder_takes_a_run_and_force_replaces_one(log, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     assert run_map(log, "--output", run) == 0
-    assert run_map(log, "--output", run, "--force", "--seed", 9) == 0
+    assert run_map(log, "--output", run, "--force", "--config", "seed=9") == 0
     assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == 9
     assert names_in(tmp_path) == {"healthy.log", "run"}
 
@@ -299,29 +298,22 @@ def test_a_bad_configuration_is_refused(tmp_path, log, capsys, content, reason):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ("seed=-1", "--config: seed: Input should be greater than or equal to 0"),
+        ("fleet.join_map=false", "did you mean 'join_maps'?"),
+        ("fleet.join_maps=[", "--config fleet.join_maps: not valid YAML"),
+        ("seed", "seed: cannot read the configuration"),
+    ],
+)
+def test_a_key_that_is_wrong_is_refused(tmp_path, log, capsys, given, reason):
+    assert reason in refused(capsys, tmp_path, log, "--config", given, "--output", tmp_path / "run")
+
+
 def test_a_missing_configuration_is_refused(tmp_path, log, capsys):
     arguments = (log, "--config", tmp_path / "none.yaml", "--output", tmp_path / "run")
     assert "cannot read the configuration" in refused(capsys, tmp_path, *arguments)
-
-
-@pytest.mark.slow
-def test_a_veto_parts_the_maps(run, logs, tmp_path, capsys):
-    """A user looks at the run, does not believe two robots' closures, and maps again without them."""
-    names = [path.stem.split(".")[0] for path in logs]
-    vetoes = tmp_path / "vetoes.csv"
-    pairs = [f"{a},,{b}," for a, b in combinations(names, 2)]
-    vetoes.write_text("\n".join(["robot_i,stamp_i,robot_j,stamp_j", *pairs]))
-    assert run_map(*logs, "--output", tmp_path / "run", "--veto", vetoes) == 0
-    assert sorted(maps_of(tmp_path / "run").values()) == list(range(len(logs)))
-    assert maps_of(run) == dict.fromkeys(names, 0)
-    assert "vetoed" in {row["reason"] for row in rows_of(tmp_path / "run" / "closures.csv")}
-    capsys.readouterr()
-
-
-def test_a_veto_of_robots_that_are_not_there_is_refused(tmp_path, log, capsys):
-    vetoes = tmp_path / "vetoes.csv"
-    vetoes.write_text("robot_i,stamp_i,robot_j,stamp_j\nnobody,,robot_1,\n")
-    assert "a veto names 'nobody'" in refused(capsys, tmp_path, log, "--veto", vetoes, "--output", tmp_path / "run")
 
 
 @pytest.mark.parametrize(("force", "reason"), [((), "not a run folder"), (("--force",), "not a run folder")])
@@ -396,7 +388,7 @@ def test_relations_that_match_nothing_are_refused(run, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("usage", [("--split", "0"), ("--split", "x"), ("--seed", "-1"), ("--nonsense",)])
+@pytest.mark.parametrize("usage", [("--split", "0"), ("--split", "x"), ("--nonsense",)])
 def test_wrong_usage_is_exit_code_2(tmp_path, log, capsys, usage):
     assert run_map(log, "--output", tmp_path / "run", *usage) == 2
     assert "Traceback" not in capsys.readouterr().err

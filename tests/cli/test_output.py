@@ -60,7 +60,7 @@ def test_a_bad_recording_leaves_no_folder(tmp_path, monkeypatch, capsys):
 
 def test_resuming_needs_the_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["simulate", "--no-camera", "--resume"]) == 2
+    assert main(["tools", "simulate", "--no-camera", "--resume"]) == 2
     assert "give --output" in capsys.readouterr().err
 
 
@@ -73,5 +73,5 @@ def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, 
     pictures = sorted((tmp_path / "run").glob("map*.png"))  # a map of few keyscans gets none
     assert pictures
     assert after[1:] == [f"map: {path}" for path in pictures]
-    assert main(["map", *logs, "-o", str(tmp_path / "alone"), "--quiet", "--no-fuse"]) == 0
+    assert main(["map", *logs, "-o", str(tmp_path / "alone"), "--quiet", "-c", "fleet.join_maps=false"]) == 0
     assert "2 maps: one for each robot" in capsys.readouterr().out

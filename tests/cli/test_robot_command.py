@@ -85,9 +85,9 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         (["--speed", "nan"], "is not a speed"),
         (["--credentials", "nowhere"], "holds no credentials"),
         (["--credentials", "{token: two words}"], "holds no token"),
-        (["--credentials", "{robot.pem: x}"], "robot.pem and robot.key belong together"),
+        (["--credentials", "{client.pem: x}"], "client.pem and client.key belong together"),
         (
-            ["--server", "https://localhost", "--credentials", "{robot.pem: x, robot.key: x}"],
+            ["--server", "https://localhost", "--credentials", "{client.pem: x, client.key: x}"],
             "cannot read the certificate and its key",
         ),
         (["--state", "/dev/null/state"], "cannot be made"),

@@ -1,4 +1,4 @@
-"""`fcslam serve` and `fcslam setup certificates`: what is refused at once, and a real service behind TLS."""
+"""`fcslam serve` and `fcslam tools certificates`: what is refused at once, and a real service behind TLS."""
 
 import json
 import os
@@ -39,7 +39,7 @@ API = "/api/v1"
 def credentials(tmp_path_factory):
     folder = tmp_path_factory.mktemp("credentials")
     names = [f"--robot=robot_{k}" for k in (1, 2, 3)]
-    assert main(["setup", "certificates", "-o", str(folder), "--host", "cloud.test", *names, "--admin", "boss"]) == 0
+    assert main(["tools", "certificates", "-o", str(folder), "--host", "cloud.test", *names, "--admin", "boss"]) == 0
     return folder
 
 
@@ -48,7 +48,7 @@ def token(folder, name):
 
 
 def test_secrets_are_their_owners_alone_and_the_cloud_knows_hashes_only(credentials):
-    for name in ("ca.key", "cloud.key", "robots/robot_1/robot.key", "robots/robot_1/token", "users/boss/token"):
+    for name in ("ca.key", "cloud.key", "robots/robot_1/client.key", "robots/robot_1/token", "users/boss/token"):
         assert stat.S_IMODE((credentials / name).stat().st_mode) == 0o600
     text = (credentials / "tokens.yaml").read_text()
     assert token(credentials, "robot_1") not in text
@@ -56,7 +56,7 @@ def test_secrets_are_their_owners_alone_and_the_cloud_knows_hashes_only(credenti
 
 
 def test_only_robots_have_certificates_of_their_own(credentials):
-    found = {path.parent.name for path in credentials.rglob("robot.pem")}
+    found = {path.parent.name for path in credentials.rglob("client.pem")}
     assert found == {"robot_1", "robot_2", "robot_3"}
 
 
@@ -66,7 +66,7 @@ def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials, tmp_pat
         name: (mine / name).read_bytes()
         for name in ("ca.pem", "ca.key", "cloud.pem", "users/boss/token", "robots/robot_1/token")
     }
-    assert main(["setup", "certificates", "-o", str(mine), "--robot", "new", "--robot", "robot_1"]) == 0
+    assert main(["tools", "certificates", "-o", str(mine), "--robot", "new", "--robot", "robot_1"]) == 0
     assert {name: (mine / name).read_bytes() for name in before} == before
     names = [entry["name"] for entry in yaml.safe_load((mine / "tokens.yaml").read_text())["tokens"]]
     assert names == ["robot_1", "robot_2", "robot_3", "boss", "new"]
@@ -74,7 +74,7 @@ def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials, tmp_pat
 
 @pytest.mark.parametrize("wrong", [["--robot", "a", "--viewer", "a"], ["--robot", "a+1"], ["--robot", "../a"]])
 def test_names_that_cannot_be_are_refused(tmp_path, wrong, capsys):
-    assert main(["setup", "certificates", "-o", str(tmp_path / "out"), *wrong]) == 2
+    assert main(["tools", "certificates", "-o", str(tmp_path / "out"), *wrong]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
@@ -82,18 +82,22 @@ def test_names_that_cannot_be_are_refused(tmp_path, wrong, capsys):
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        (["--host", "0.0.0.0"], "--tokens"),
+        (["--host", "0.0.0.0"], "--credentials"),
         (["--host", "::"], "--insecure"),
-        (["--tls-key", "k.pem"], "belong together"),
-        (["--tls-key", "no.pem", "--tls-certificate", "no.pem"], "no.pem"),
-        (["--client-ca", "ca.pem"], "--tls-certificate"),
-        (["--tokens", "no.yaml"], "no.yaml"),
+        (["--credentials", "nowhere"], "holds neither tokens.yaml nor cloud.pem"),
+        (["--credentials", "half"], "belong together"),
+        (["--credentials", "bad"], "cloud.pem"),
+        (["--client-ca", "ca.pem"], "--credentials with cloud.pem"),
+        (["--credentials", "tokens"], "tokens.yaml"),
         (["--config", "no.yaml"], "no.yaml"),
         (["--host", "256.1.1.1", "--insecure"], "256.1.1.1"),
     ],
 )
 def test_a_service_that_cannot_run_as_told_says_so_in_one_line(tmp_path, wrong, says, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for place in ("half/cloud.key", "bad/cloud.key", "bad/cloud.pem", "tokens/tokens.yaml"):
+        Path(place).parent.mkdir(exist_ok=True)
+        Path(place).write_text("x")
     assert main(["serve", "--data", "data", "--port", "0", *wrong]) == 2
     line = capsys.readouterr().err
     assert line.count("\n") == 1
@@ -102,13 +106,15 @@ def test_a_service_that_cannot_run_as_told_says_so_in_one_line(tmp_path, wrong, 
 
 def test_an_encrypted_key_is_told_and_no_passphrase_asked_for(credentials, tmp_path, capsys):
     key = load_pem_private_key((credentials / "cloud.key").read_bytes(), None)
-    sealed = tmp_path / "sealed.key"
+    (tmp_path / "sealed").mkdir()
+    shutil.copy(credentials / "cloud.pem", tmp_path / "sealed")
+    sealed = tmp_path / "sealed" / "cloud.key"
     sealed.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
-    words = ["--tls-certificate", str(credentials / "cloud.pem"), "--tls-key", str(sealed)]
-    assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0", *words]) == 2
+    words = ["serve", "--data", str(tmp_path / "data"), "--port", "0", "--credentials", str(sealed.parent)]
+    assert main(words) == 2
     line = capsys.readouterr().err
     assert line.count("\n") == 1
-    assert "sealed.key" in line
+    assert "cloud.key" in line
     assert "encrypted" in line
     with pytest.raises(CloudError, match="encrypted"):
         HttpTransport("https://cloud.test", "robot_1", "agent", own=(credentials / "cloud.pem", sealed))
@@ -270,9 +276,8 @@ def test_a_service_without_tokens_answers_to_no_other_name(tmp_path, options):
 @pytest.mark.system
 def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, credentials):
     mine = in_order(p for p in packets if p.robot == "robot_1")[:40]
-    tls = ["--tls-certificate", str(credentials / "cloud.pem"), "--tls-key", str(credentials / "cloud.key")]
-    asked = ["--tokens", str(credentials / "tokens.yaml"), "--client-ca", str(credentials / "ca.pem")]
-    service = Service(tmp_path / "data", *asked, *tls)
+    asked = ["--credentials", str(credentials), "--client-ca", str(credentials / "ca.pem")]
+    service = Service(tmp_path / "data", *asked)
     trusted = ssl.create_default_context(cafile=str(credentials / "ca.pem"))
     bearer = {"Authorization": f"Bearer {token(credentials, 'robot_1')}"}
     with httpx.Client(base_url=service.url, verify=trusted, timeout=60.0) as client:
@@ -283,7 +288,7 @@ def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, crede
         boss = {"Authorization": f"Bearer {token(credentials, 'boss')}"}
         assert client.get(f"{API}/fleet", headers=boss).json()["packets"] == 40
     own = credentials / "robots" / "robot_2"
-    trusted.load_cert_chain(own / "robot.pem", own / "robot.key")
+    trusted.load_cert_chain(own / "client.pem", own / "client.key")
     with httpx.Client(base_url=service.url, verify=trusted, timeout=60.0) as client:
         assert client.get(f"{API}/robots/robot_2/state").status_code == 200, "it has shown its certificate"
         assert client.get(f"{API}/robots/robot_1/state").status_code == 403
@@ -296,7 +301,7 @@ def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, crede
 def test_tokens_are_read_again_at_sighup(credentials, tmp_path):
     tokens = tmp_path / "tokens.yaml"
     tokens.write_text((credentials / "tokens.yaml").read_text())
-    service = Service(tmp_path / "data", "--tokens", str(tokens))
+    service = Service(tmp_path / "data", "--credentials", str(tokens.parent))
     as_boss = {"Authorization": f"Bearer {token(credentials, 'boss')}"}
 
     def hang_up(text):

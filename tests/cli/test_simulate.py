@@ -1,4 +1,4 @@
-"""`fcslam simulate`: recordings that the other commands read, and one clear line for what cannot be."""
+"""`fcslam tools simulate`: recordings that the other commands read, and one clear line for what cannot be."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ from tests.lab.simulation.gl import require_gl
 
 pytestmark = pytest.mark.slow
 
-TINY = ["simulate", "--building", "flat", "--path-length", "6", "--seed", "3"]
+TINY = ["tools", "simulate", "--building", "flat", "--path-length", "6", "--seed", "3"]
 
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    """Two robots without cameras, as recordings and as bags."""
+    """Two robots without cameras."""
     output = tmp_path_factory.mktemp("simulated") / "fleet"
-    assert main([*TINY, "--robots", "2", "--no-camera", "--bag", "--output", str(output)]) == 0
+    assert main([*TINY, "--robots", "2", "--no-camera", "--output", str(output)]) == 0
     return output
 
 
@@ -33,10 +33,11 @@ def test_recordings_can_be_read_and_the_truth_lies_beside_them(simulated):
     assert sorted(path.name for path in (simulated / "ground_truth").iterdir()) == ["map.pgm", "map.yaml", "relations"]
 
 
-def test_bags_hold_the_same_scans(simulated):
+def test_a_bag_holds_the_same_scans(simulated, tmp_path):
+    assert main(["record", str(simulated / "robot_1"), "-o", str(tmp_path / "robot_1.mcap")]) == 0
     recorded, bagged = (
-        [record for record in open_source(simulated / name).records() if isinstance(record, LaserScan)]
-        for name in ("robot_1", "robot_1.mcap")
+        [record for record in open_source(place).records() if isinstance(record, LaserScan)]
+        for place in (simulated / "robot_1", tmp_path / "robot_1.mcap")
     )
     assert len(recorded) == len(bagged) > 50
     np.testing.assert_allclose([scan.stamp for scan in recorded], [scan.stamp for scan in bagged], atol=1e-6)
@@ -50,7 +51,7 @@ def test_the_robot_of_a_yard_is_as_asked(tmp_path):
     file = tmp_path / "sick.yaml"
     file.write_text(f"lidar: {{beams: 91, field_of_view_rad: {np.pi}, max_range_m: 81.9, rate_hz: 2}}")
     asked = ["--config", str(file), "--odometry", "good"]
-    tiny = ["simulate", "--building", "yard", "--no-camera", "--robots", "1", "--path-length", "5"]
+    tiny = ["tools", "simulate", "--building", "yard", "--no-camera", "--robots", "1", "--path-length", "5"]
     assert main([*tiny, *asked, "--output", str(tmp_path / "yard")]) == 0
     scans = [record for record in open_source(tmp_path / "yard" / "robot_1").records() if isinstance(record, LaserScan)]
     laser = scans[0].laser
@@ -68,7 +69,7 @@ def test_a_scanner_is_as_asked_and_a_file_overrides_it(tmp_path):
     file = tmp_path / "other.yaml"
     file.write_text("{lidar: {beams: 100, rate_hz: 5, max_range_m: 8}, turn_rate_rad_s: 1}")
     tiny = [*TINY, "--path-length", "2", "--robots", "1", "--no-camera", "--scanner", "ld19"]
-    changes = ["--config", str(file), "--turn-rate", "2", "--odometry", "none"]
+    changes = ["--config", str(file), "--config", "turn_rate_rad_s=2", "--odometry", "none"]
     for name, options, expected in (("ld19", [], (450, 12.0, 0.1)), ("other", changes, (100, 8.0, 0.2))):
         assert main([*tiny, *options, "--output", str(tmp_path / name)]) == 0
         records = list(open_source(tmp_path / name / "robot_1").records())
@@ -125,12 +126,13 @@ def test_without_a_gl_library_one_line_says_so(tmp_path, capsys, monkeypatch):
 def test_cameras_are_recorded(tmp_path):
     require_gl()
     output = tmp_path / "fleet"
-    arguments = [*TINY, "--robots", "1", "--lighting", "evening", "--bag", "--output", str(output)]
+    arguments = [*TINY, "--robots", "1", "--lighting", "evening", "--output", str(output)]
     assert main(arguments) == 0
     records = list(open_source(output / "robot_1").records())
     images = [record for record in records if isinstance(record, CameraImage)]
     assert len(images) > 20
     assert images[0].camera.width == 320
     assert not any(isinstance(record, GroundTruth) for record in records)
-    bagged = [item for item in open_source(output / "robot_1.mcap").records() if isinstance(item, CameraImage)]
+    assert main(["record", str(output / "robot_1"), "-o", str(tmp_path / "robot_1.mcap")]) == 0
+    bagged = [item for item in open_source(tmp_path / "robot_1.mcap").records() if isinstance(item, CameraImage)]
     assert [image.encoded for image in bagged] == [image.encoded for image in images]

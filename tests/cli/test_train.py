@@ -1,4 +1,4 @@
-"""`fcslam learn train`: one small run from images to files, and what it says of bad input."""
+"""`fcslam tools train`: one small run from images to files, and what it says of bad input."""
 
 import shutil
 
@@ -9,7 +9,6 @@ import pytest
 from fcslam.cli import BAD_INPUT, main
 from tests.learning.textures import textured
 
-OPTIONS = ["--device", "cpu"]
 pytestmark = pytest.mark.usefixtures("brief_validation")
 
 
@@ -41,13 +40,13 @@ def first(some_photos, tmp_path_factory, brief_validation):
     (folder / "settings.yaml").write_text(
         f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1, learning_rate: {LAST_RATE}}}"
     )
-    command = ["learn", "train", str(some_photos), "--config", str(folder / "settings.yaml"), *OPTIONS, "--output"]
+    command = ["tools", "train", str(some_photos), "--config", str(folder / "settings.yaml"), "--output"]
     assert main([*command, str(folder / "first")]) == 0
     return command, folder / "first"
 
 
 def complaint(capsys, *arguments):
-    assert main(["learn", "train", *map(str, arguments), *OPTIONS, "--quiet"]) == BAD_INPUT
+    assert main(["tools", "train", *map(str, arguments)]) == BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
     return line
 
@@ -58,7 +57,7 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
     settings = tmp_path / "settings.yaml"
     settings.write_text("{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1}")
     output = photos / "out"  # what is in there is no image to train on
-    arguments = ["learn", "train", str(photos), "-o", str(output), "--config", str(settings), *OPTIONS]
+    arguments = ["tools", "train", str(photos), "-o", str(output), "--config", str(settings)]
     assert main(arguments) == 0
     captured = capsys.readouterr()
     made = ["detector.onnx", "detector-int8.onnx", "training.png", "card.md"]
@@ -73,13 +72,13 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
     assert "an image that was trained on" in card
     assert "0 held out" in captured.err
     assert "5 images" in capsys.readouterr().err
-    assert main([*arguments, "--steps", "3"]) == 0
+    assert main([*arguments, "--config", "steps=3"]) == 0
     assert (output / "detector.onnx").read_bytes() != first
     kept = (output / "detector.onnx").read_bytes(), (output / "card.md").read_text()
     capsys.readouterr()
     assert "has 3 steps already, more than 2" in complaint(capsys, photos, "-o", output, "--config", settings)
     cv2.imwrite(str(photos / "later.png"), textured(9))
-    more = [photos, "-o", output, "--config", settings, "--steps", "3"]
+    more = [photos, "-o", output, "--config", settings, "--config", "steps=3"]
     assert "was trained on other images" in complaint(capsys, *more)
     assert kept == ((output / "detector.onnx").read_bytes(), (output / "card.md").read_text())
 
@@ -114,7 +113,7 @@ def test_bad_input_is_one_line(photos, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     assert "is not a folder" in complaint(capsys, tmp_path / "nowhere", "-o", output)
     assert "holds no image" in complaint(capsys, tmp_path / "empty", "-o", output)
-    assert "encoder" in complaint(capsys, photos, "-o", output, "--encoder", "huge")
+    assert "encoder" in complaint(capsys, photos, "-o", output, "--config", "encoder=huge")
     assert "x.npz" not in complaint(capsys, photos, "-o", output, "--teacher", tmp_path / "empty")
     assert not (output / "joint" / "checkpoint.npz").exists()
 

@@ -1,4 +1,4 @@
-"""`fcslam learn vocabulary`, and robots that send its words: a mission without a range or a descriptor on the wire."""
+"""`fcslam tools vocabulary`, and robots that send its words: a mission without a range or a descriptor on the wire."""
 
 import json
 import shutil
@@ -42,7 +42,7 @@ def with_descriptors(logs, folder):
 @pytest.fixture(scope="module")
 def vocabulary(with_descriptors, folder):
     path = folder / "building.words"
-    assert main(["learn", "vocabulary", str(with_descriptors), "--output", str(path), "--words", "1024"]) == 0
+    assert main(["tools", "vocabulary", str(with_descriptors), "--output", str(path), "--words", "1024"]) == 0
     return path
 
 
@@ -115,16 +115,16 @@ def test_a_cloud_without_the_vocabulary_refuses_it_by_name(logs, folder, vocabul
 
 @pytest.mark.parametrize("words", ["1", "65537"])
 def test_a_number_of_words_beyond_the_format_is_refused(words, tmp_path, capsys):
-    assert main(["learn", "vocabulary", str(tmp_path), "-o", str(tmp_path / "x"), "--words", words]) == 2
+    assert main(["tools", "vocabulary", str(tmp_path), "-o", str(tmp_path / "x"), "--words", words]) == 2
 
 
 def test_a_run_without_places_is_one_line(with_words, tmp_path, capsys):
-    assert main(["learn", "vocabulary", str(with_words), "-o", str(tmp_path / "x")]) == 2
+    assert main(["tools", "vocabulary", str(with_words), "-o", str(tmp_path / "x")]) == 2
     assert "no place with descriptors" in capsys.readouterr().err
 
 
 def test_changes_are_not_found_where_robots_send_words(with_words, tmp_path, capsys):
-    assert main(["changes", str(with_words), "--output", str(tmp_path / "changes")]) == 2
+    assert main(["tools", "changes", str(with_words), "--output", str(tmp_path / "changes")]) == 2
     assert "sent ranges (robot.sends: words)" in " ".join(capsys.readouterr().err.split())
 
 
@@ -147,10 +147,10 @@ def test_regions_count_in_a_map_of_words_and_a_removed_stretch_stays_in_it(with_
 def test_a_file_of_another_kind_is_not_replaced(with_descriptors, tmp_path, capsys):
     recording = tmp_path / "robot1.bag"
     recording.write_bytes(b"a recording")
-    assert main(["learn", "vocabulary", str(with_descriptors), "-o", str(recording)]) == 2
+    assert main(["tools", "vocabulary", str(with_descriptors), "-o", str(recording)]) == 2
     assert recording.read_bytes() == b"a recording"
     assert "is not a vocabulary, so it stays" in capsys.readouterr().err
     words = tmp_path / "building.words"
     assert [
-        main(["learn", "vocabulary", str(with_descriptors), "-o", str(words), "--words", "16"]) for _ in range(2)
+        main(["tools", "vocabulary", str(with_descriptors), "-o", str(words), "--words", "16"]) for _ in range(2)
     ] == [0, 0]

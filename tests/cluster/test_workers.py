@@ -76,11 +76,11 @@ def test_the_proof_depends_on_every_bit(monkeypatch):
 
 
 def test_the_authority_of_a_cluster_signs_no_robots_certificate(tmp_path):
-    assert main(["setup", "certificates", "--output", str(tmp_path), "--robot", "anna", "--cluster"]) == 0
+    assert main(["tools", "certificates", "--output", str(tmp_path), "--robot", "anna", "--cluster"]) == 0
     authority = x509.load_pem_x509_certificate((tmp_path / "cluster" / "ca.pem").read_bytes())
     member = x509.load_pem_x509_certificate((tmp_path / "cluster" / "member.pem").read_bytes())
     member.verify_directly_issued_by(authority)
-    for name in ("robots/anna/robot.pem", "cloud.pem"):
+    for name in ("robots/anna/client.pem", "cloud.pem"):
         other = x509.load_pem_x509_certificate((tmp_path / name).read_bytes())
         with pytest.raises(InvalidSignature):
             other.verify_directly_issued_by(authority)

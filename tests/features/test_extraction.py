@@ -46,7 +46,7 @@ def images(tmp_path, image):
 
 def test_every_sort_of_image_gives_the_same_features(images, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["learn", "extract", str(images), "-o", str(out), "--detector", "orb", "--keypoints", "200"]) == 0
+    assert main(["tools", "extract", str(images), "-o", str(out), "--detector", "orb", "--keypoints", "200"]) == 0
     shown = capsys.readouterr()
     assert "features of 8 images, 2 of them without a keypoint, 3 files skipped" in shown.out
     assert shown.err.count("skipped: ") == 3
@@ -63,7 +63,7 @@ def test_every_sort_of_image_gives_the_same_features(images, tmp_path, capsys):
 
 
 def test_the_file_is_as_documented(images, tmp_path):
-    main(["learn", "extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb"])
+    main(["tools", "extract", str(images / "grey.png"), "-o", str(tmp_path), "--detector", "orb"])
     with np.load(tmp_path / "grey.npz", allow_pickle=False) as archive:
         assert {name: (archive[name].dtype.str, archive[name].ndim) for name in archive.files} == {
             "keypoints": ("<f4", 2),
@@ -87,9 +87,8 @@ def test_larger_images_are_shrunk_and_keypoints_are_in_their_own_pixels(image):
 def test_networks_extract_as_well(images, tmp_path, capsys):
     pytest.importorskip("onnxruntime")
     tiny_network(tmp_path / "n.onnx")
-    assert (
-        main(["learn", "extract", str(images), "-o", str(tmp_path / "out"), "--weights", str(tmp_path / "n.onnx")]) == 0
-    )
+    detector = ("--detector", str(tmp_path / "n.onnx"))
+    assert main(["tools", "extract", str(images), "-o", str(tmp_path / "out"), *detector]) == 0
     assert "tiny-1: features of 8 images, 3 files skipped" in capsys.readouterr().out
 
 
@@ -99,21 +98,20 @@ def test_networks_extract_as_well(images, tmp_path, capsys):
         (["{folder}/missing", "-o", "{folder}/out"], "no file there"),
         (["{folder}/images/notes.txt", "-o", "{folder}/out"], "no usable image there"),
         (["{folder}/images", "-o", "{folder}/images/notes.txt"], "cannot be"),
-        (["{folder}/images", "-o", "{folder}/out", "--detector", "orb", "--weights", "n.onnx"], "orb has no weights"),
-        (["{folder}/images", "-o", "{folder}/out", "--weights", "missing.onnx"], "cannot read the network weights"),
+        (["{folder}/images", "-o", "{folder}/out", "--detector", "missing.onnx"], "cannot read the network weights"),
     ],
 )
 def test_mistakes_are_told(images, tmp_path, capsys, arguments, message):
-    assert main(["learn", "extract", *(word.format(folder=tmp_path) for word in arguments)]) == 2
+    assert main(["tools", "extract", *(word.format(folder=tmp_path) for word in arguments)]) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_two_images_of_one_name_are_told_apart(tmp_path, image, capsys):
     for name in ("a.png", "a.jpg"):
         cv2.imwrite(str(tmp_path / name), image)
-    assert main(["learn", "extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
+    assert main(["tools", "extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
     assert "a.png: has the features' name in common with" in capsys.readouterr().err
-    assert main(["learn", "extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
+    assert main(["tools", "extract", str(tmp_path), "-o", str(tmp_path / "out"), "--detector", "orb"]) == 0
     assert "features of 1 images, 1 files skipped" in capsys.readouterr().out  # its own output is no input
 
 
@@ -188,10 +186,10 @@ def test_taking_some_takes_all_that_is_known_of_them(image):
 def test_scales_of_the_command_line(images, tmp_path, capsys):
     tiny_network(tmp_path / "n.onnx")
     given = [
-        "learn",
+        "tools",
         "extract",
         str(images / "grey.png"),
-        "--weights",
+        "--detector",
         str(tmp_path / "n.onnx"),
         "--keypoints",
         "50",

@@ -134,7 +134,7 @@ def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg
     x, y, theta = NARROW.T_base_laser
     given = BagOptions(laser_poses=((x, y, theta - math.radians(turned_deg)),))
     kept = calibrated(open_source(path, given), LidarConfig())
-    assert "--laser-pose is kept" in " ".join(kept.survey().notes)
+    assert "--sensors laser-pose is kept" in " ".join(kept.survey().notes)
     assert kept.survey().lasers[0].T_base_laser == given.laser_poses[0]
 
 

@@ -1,4 +1,4 @@
-"""`fcslam changes`: a run folder of two days in, what changed out; and what it refuses."""
+"""`fcslam tools changes`: a run folder of two days in, what changed out; and what it refuses."""
 
 import csv
 from datetime import UTC, datetime
@@ -81,7 +81,7 @@ def test_until_leaves_later_sessions_out(three_days):
 
 
 def test_the_command_writes_grids_a_picture_and_a_table(three_days, tmp_path, capsys):
-    assert main(["changes", str(three_days), "-o", str(tmp_path / "week")]) == 0
+    assert main(["tools", "changes", str(three_days), "-o", str(tmp_path / "week")]) == 0
     out = capsys.readouterr().out
     assert "appeared: 2 regions" in out
     assert "disappeared: 1 region," in out
@@ -135,4 +135,4 @@ def test_a_run_of_one_day_or_without_a_mission_is_refused(tmp_path):
     (tmp_path / "one" / "mission.fcslam").unlink()
     with pytest.raises(SourceError, match="no mission file"):
         fcslam.changes(tmp_path / "one")
-    assert main(["changes", str(tmp_path / "nowhere")]) == 2
+    assert main(["tools", "changes", str(tmp_path / "nowhere")]) == 2

@@ -68,7 +68,7 @@ def test_a_known_cell_outlasts_an_unknown_one_and_a_wall_free_space():
 
 
 def test_words_need_a_vocabulary_and_a_cloud_without_geometry():
-    with pytest.raises(ConfigError, match="fcslam learn vocabulary"):
+    with pytest.raises(ConfigError, match="fcslam tools vocabulary"):
         parse(RobotConfig, {"sends": "words"}, "test")
     words = {"robot": {"sends": "words", "words": {"vocabulary": "x"}}}
     with pytest.raises(ConfigError, match="similarity"):
@@ -111,7 +111,7 @@ def test_a_detector_without_words_is_refused(drawn, config):
     sender = WordSender(config.words)
     sender.check({Channel.LIDAR: DETECTOR_VERSION})
     for versions in ({Channel.LIDAR: "other-1"}, {Channel.CAMERA: "cnn-1"}):
-        with pytest.raises(FeatureError, match="fcslam learn vocabulary"):
+        with pytest.raises(FeatureError, match="fcslam tools vocabulary"):
             sender.check(versions)
 
 

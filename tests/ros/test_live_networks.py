@@ -128,7 +128,7 @@ def ros2(domain):
 
 
 def mounting(scans):
-    return "--laser-pose=" + ",".join(map(str, scans[0].laser.T_base_laser))
+    return "--sensors=laser-pose=" + ",".join(map(str, scans[0].laser.T_base_laser))
 
 
 def until_there(port):

@@ -32,7 +32,9 @@ def test_topics_are_found_by_type_in_the_namespace():
     assert found.odometry == "/robot1/wheels"
     assert found.transforms == ("/tf", "/tf_static")
     assert found.camera is None
-    assert found.notes == ("reads laser scans from /robot1/front/scan, not from /robot1/a (--scan-topic chooses)",)
+    assert found.notes == (
+        "reads laser scans from /robot1/front/scan, not from /robot1/a (--sensors scan-topic chooses)",
+    )
 
 
 def test_laser_scans_go_before_point_clouds_and_these_before_depth_images():
@@ -74,8 +76,11 @@ def test_named_topics_may_be_relative_or_of_tf():
     ("options", "said"),
     [
         ({}, r"no laser scans \(sensor_msgs/LaserScan\).* in /robot1; .* the topics are /robot1/odom \(nav_msgs/Odom"),
-        ({"scan_topics": ("scan",)}, r"topic /robot1/scan is not there; --scan-topic needs sensor_msgs/LaserScan or"),
-        ({"scan_topics": ("odom",)}, r"topic /robot1/odom has the type nav_msgs/Odometry; --scan-topic needs"),
+        (
+            {"scan_topics": ("scan",)},
+            r"topic /robot1/scan is not there; --sensors scan-topic needs sensor_msgs/LaserScan or",
+        ),
+        ({"scan_topics": ("odom",)}, r"topic /robot1/odom has the type nav_msgs/Odometry; --sensors scan-topic needs"),
     ],
 )
 def test_a_missing_topic_is_told_with_those_that_are_there(options, said):

@@ -1,4 +1,4 @@
-"""The table of rounds that `fcslam learn federate` writes, read for the page."""
+"""The table of rounds that `fcslam tools federate` writes, read for the page."""
 
 import pytest
 

@@ -65,7 +65,7 @@ def test_the_service_of_the_unit_runs_under_its_restrictions(tmp_path):
     state, cache, etc = (tmp_path / name for name in ("state", "cache", "etc"))
     state.mkdir()
     cache.mkdir()
-    assert main(["setup", "certificates", "--host", "localhost", "--viewer", "lab", "-o", str(etc)]) == 0
+    assert main(["tools", "certificates", "--host", "localhost", "--viewer", "lab", "-o", str(etc)]) == 0
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     places = {"/var/lib/fcslam": state, "/etc/fcslam": etc, "0.0.0.0": "127.0.0.1"}

@@ -212,11 +212,11 @@ def test_the_camera_heard_most_is_chosen_and_said_and_the_user_may_choose(tmp_pa
     source = open_source(bag)
     (note,) = source.survey().notes
     assert "reads images from /camera/image_raw/compressed, not from /rear/image_raw/compressed" in note
-    assert "--camera-topic" in note
+    assert "--sensors camera-topic" in note
     assert len(images(source)) == 3
     rear = open_source(bag, BagOptions(camera_topic="/rear/image_raw/compressed"))
     assert len(images(rear)) == 2
-    with pytest.raises(SourceError, match="--camera-topic needs sensor_msgs/CompressedImage"):
+    with pytest.raises(SourceError, match="--sensors camera-topic needs sensor_msgs/CompressedImage"):
         open_source(bag, BagOptions(camera_topic="/scan")).survey()
 
 

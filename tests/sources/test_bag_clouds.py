@@ -130,7 +130,7 @@ def test_a_robot_may_carry_one_of_each(tmp_path):
 
 def test_a_cloud_without_a_mounting_is_refused_in_one_line(tmp_path):
     path = save(tmp_path / "bare.mcap", [each for each in drive() if each.topic != "/tf_static"])
-    with pytest.raises(SourceError, match=r"no transform from 'base_link' to 'lidar'.*--laser-pose") as refused:
+    with pytest.raises(SourceError, match=r"no transform from 'base_link' to 'lidar'.*--sensors laser-pose") as refused:
         open_source(path).survey()
     assert "\n" not in str(refused.value)
     by_hand = open_source(path, BagOptions(laser_poses=((0.1, 0.05, 0.3),)))

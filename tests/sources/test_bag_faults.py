@@ -102,9 +102,12 @@ def test_odometry_may_be_left_out(tmp_path):
     [
         (
             BagOptions(scan_topics=("/lidar",)),
-            ["topic /lidar is not there", "--scan-topic", "/scan (sensor_msgs/Laser"],
+            ["topic /lidar is not there", "--sensors scan-topic", "/scan (sensor_msgs/Laser"],
         ),
-        (BagOptions(odom_topic="/lidar"), ["topic /lidar is not there", "--odom-topic", "/odom (nav_msgs/Odometry"]),
+        (
+            BagOptions(odom_topic="/lidar"),
+            ["topic /lidar is not there", "--sensors odom-topic", "/odom (nav_msgs/Odometry"],
+        ),
         (
             BagOptions(scan_topics=("/odom",)),
             ["/odom has 42 messages of type nav_msgs/Odometry", "needs sensor_msgs/LaserScan"],
@@ -128,7 +131,7 @@ def test_many_topics_are_not_all_named(tmp_path):
 def test_a_missing_transform_is_named_with_the_way_out(tmp_path):
     message = refusal(save(tmp_path / "run.bag", drive(20)[1:]))
     assert "no transform from 'base_link' to 'laser'" in message
-    assert "--laser-pose" in message
+    assert "--sensors laser-pose" in message
 
 
 def test_a_laser_that_moves_on_the_robot(tmp_path):

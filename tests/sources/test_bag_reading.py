@@ -276,8 +276,8 @@ def test_the_widest_laser_is_chosen_and_said(tmp_path):
     source = open_source(bag)
     assert source.survey().scan_count == 20
     first, second = source.survey().notes
-    assert "from /scan, not from /narrow (--scan-topic" in first
-    assert "from /odom, not from /filtered (--odom-topic" in second
+    assert "from /scan, not from /narrow (--sensors scan-topic" in first
+    assert "from /odom, not from /filtered (--sensors odom-topic" in second
     assert str(bag) in first
 
 

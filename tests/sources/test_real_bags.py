@@ -58,7 +58,7 @@ def test_a_log_and_its_bag_give_the_same_trajectory(tmp_path):
     for name in ("log", "run.bag", "run.mcap", "run.db3"):
         recording = log if name == "log" else tmp_path / name
         if name != "log":
-            assert main(["convert", str(log), str(recording)]) == 0
+            assert main(["record", str(log), "-o", str(recording)]) == 0
         output = tmp_path / f"from_{name}"
         assert main(["map", f"robot={recording}", "--output", str(output)]) == 0
         trajectories[name] = read_tum(output / "trajectories" / "robot.tum")

@@ -199,9 +199,17 @@ def test_a_laser_that_falls_silent_does_not_hold_up_the_other(tmp_path):
     ("said", "options", "words"),
     [
         (front_and_rear("laser"), BOTH, "/scan and /rear have one frame, 'laser'"),
-        (front_and_rear(rear_pose=False), BOTH, "where the laser of /rear sits; say it by --laser-pose X,Y,THETA "),
-        (front_and_rear(), BagOptions(("/scan", "/rear"), laser_poses=((0.0, 0.0, 0.0),)), "1 --laser-pose for 2 --sc"),
-        (front_and_rear(), BagOptions(("/scan", "/scan")), "--scan-topic /scan is given twice"),
+        (
+            front_and_rear(rear_pose=False),
+            BOTH,
+            "where the laser of /rear sits; say it by --sensors laser-pose=X,Y,THETA ",
+        ),
+        (
+            front_and_rear(),
+            BagOptions(("/scan", "/rear"), laser_poses=((0.0, 0.0, 0.0),)),
+            "1 laser-pose for 2 scan-topic of --sensors",
+        ),
+        (front_and_rear(), BagOptions(("/scan", "/scan")), "--sensors scan-topic=/scan is given twice"),
     ],
 )
 def test_lasers_that_cannot_be_told_apart_are_refused_in_one_line(tmp_path, said, options, words):
@@ -254,7 +262,9 @@ def test_a_fleet_is_read_from_the_topics_that_all_bags_have(tmp_path):
     sources = open_fleet(bags)
     notes = [note for source in sources for note in source.survey().notes]
     assert [len(scans_of(source)) for source in sources] == [60, 60]
-    assert notes == ["all bags: reads laser scans from /stable_scan, not from /lidar, /scan (--scan-topic chooses)"]
+    assert notes == [
+        "all bags: reads laser scans from /stable_scan, not from /lidar, /scan (--sensors scan-topic chooses)"
+    ]
     assert len(scans_of(open_source(bags[0][0]))) == 20, "alone, the name decides"
 
 

@@ -21,7 +21,7 @@ from fcslam.cli import (
     extract,
     federate,
     info,
-    live,
+    record,
     serve,
     show,
     simulate,
@@ -29,13 +29,13 @@ from fcslam.cli import (
     vocabulary,
 )
 from fcslam.cli import changes as changed
-from fcslam.cli import convert as conversion
 from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
 from fcslam.cli import play as playback
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
 from fcslam.cli.examples import examples
+from fcslam.cli.recordings import SENSOR_KEYS
 from fcslam.errors import FcslamError, InputError, printable
 
 BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
@@ -43,8 +43,9 @@ BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
 OF_THE_SERVICE = {"cryptography", "fastapi", "httpx", "prometheus_client", "starlette", "uvicorn"}
 """Packages of the extra ``service``: mapping recordings needs none of them."""
 PROGRAM = "fcslam"
-MAPS, ROBOTS, STUDY, MORE = "Maps", "Robots and service", "Simulation and measurements", "More"
-"""Groups of the commands in `fcslam --help`."""
+MAPS, ROBOTS, STUDY = "Maps", "Robots and service", "Measurements and tools"
+RECORDINGS, LEARNING, SETUP = "Simulation and comparison", "Learning", "Setup"
+"""Groups of the commands in `fcslam --help` and `fcslam tools --help`."""
 COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
 
@@ -85,28 +86,12 @@ app.command(
 )(show.show)
 app.add_typer(edit.app, name="edit", rich_help_panel=MAPS)
 app.command(
-    "changes",
-    rich_help_panel=MAPS,
-    epilog=examples(
-        "fcslam changes runs/building",
-        "fcslam changes runs/building --since 2026-11-20 -o changes/week",
-    ),
-)(changed.changes)
-app.command(
-    "convert",
-    rich_help_panel=MAPS,
-    epilog=examples(
-        "fcslam convert robot1.clf.gz robot1.bag",
-        "fcslam convert robot2.mcap robot2.clf.gz --scan-topic /front/scan",
-    ),
-)(conversion.convert)
-app.command(
     "robot",
     rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam robot ros2:/robot1 -o runs/robot1",
         "fcslam robot ros2:/robot1 --server https://hub --state s --credentials c",
-        "fcslam robot anna=ros1:/robot1 --scan-topic /front/scan",
+        "fcslam robot anna=ros1:/robot1 --sensors scan-topic=/front/scan",
         "fcslam robot --explain-traffic",
     ),
 )(robots.robot)
@@ -133,14 +118,16 @@ app.command(
     epilog=examples(
         "fcslam record ros2:/robot1 -o day.mcap",
         "fcslam record ros1:/ -o day.bag --duration 600",
+        "fcslam record robot1.clf.gz -o robot1.bag",
+        "fcslam record robot2.mcap -o robot2.clf.gz --sensors scan-topic=/front/scan",
     ),
-)(live.record)
+)(record.record)
 app.command(
     "serve",
     rich_help_panel=ROBOTS,
     epilog=examples(
         "fcslam serve --data cloud",
-        "fcslam serve --data cloud --host 0.0.0.0 --tokens tokens.yaml",
+        "fcslam serve --data cloud --host 0.0.0.0 --credentials credentials",
     ),
 )(serve.serve)
 app.command(
@@ -151,68 +138,76 @@ app.command(
         "fcslam demo --robots 4 --no-camera -o demo4",
     ),
 )(demo.demo)
-app.command(
+app.add_typer(evaluate.app, name="evaluate", rich_help_panel=STUDY)
+tools = typer.Typer(
+    no_args_is_help=True,
+    help="Simulate recordings, compare dates, train the cameras' detector, and set up a fleet.",
+    epilog=examples("fcslam tools simulate --building office", "fcslam tools config > mission.yaml"),
+)
+tools.command(
     "simulate",
-    rich_help_panel=STUDY,
+    rich_help_panel=RECORDINGS,
     epilog=examples(
-        "fcslam simulate --building office --no-camera",
-        "fcslam simulate --lighting day --lighting evening --moved-furniture 0.3",
-        "fcslam simulate --robots 20 --building office -o office --resume",
+        "fcslam tools simulate --building office --no-camera",
+        "fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3",
+        "fcslam tools simulate --robots 20 --building office -o office --resume",
     ),
 )(simulate.simulate)
-app.add_typer(evaluate.app, name="evaluate", rich_help_panel=STUDY)
-learn = typer.Typer(
-    no_args_is_help=True,
-    help="Train the detector of the cameras, alone or together, and use it.",
-    epilog=examples("fcslam learn train photos -o detector"),
-)
-learn.command(
-    "train",
+tools.command(
+    "changes",
+    rich_help_panel=RECORDINGS,
     epilog=examples(
-        "fcslam learn train photos -o detector",
-        "fcslam learn train photos --quick",
+        "fcslam tools changes runs/building",
+        "fcslam tools changes runs/building --since 2026-11-20 -o changes/week",
     ),
-)(train.train)
-learn.add_typer(federate.app, name="federate")
-learn.command(
-    "extract",
-    epilog=examples(
-        "fcslam learn extract photos -o features --keypoints 1000",
-    ),
-)(extract.extract)
-learn.command(
-    "vocabulary",
-    epilog=examples(
-        "fcslam learn vocabulary runs/building -o building.words",
-    ),
-)(vocabulary.vocabulary)
-app.add_typer(learn, name="learn", rich_help_panel=MORE)
-setup = typer.Typer(
-    no_args_is_help=True,
-    help="Configuration, credentials, and compiling ahead of the first run.",
-    epilog=examples("fcslam setup config > mission.yaml"),
-)
-setup.command(
+)(changed.changes)
+tools.command(
     "config",
+    rich_help_panel=SETUP,
     epilog=examples(
-        "fcslam setup config > mission.yaml",
+        "fcslam tools config > mission.yaml",
         "fcslam map robot1.bag robot2.bag --config mission.yaml",
-        "fcslam setup config paper > paper.yaml",
+        "fcslam tools config paper > paper.yaml",
     ),
 )(config.config)
-setup.command(
+tools.command(
     "certificates",
+    rich_help_panel=SETUP,
     epilog=examples(
-        "fcslam setup certificates --host cloud.local --robot robot1 --admin boss",
+        "fcslam tools certificates --host cloud.local --robot robot1 --admin boss",
     ),
 )(certificates.certificates)
-setup.command(
+tools.command(
     "warm-up",
+    rich_help_panel=SETUP,
     epilog=examples(
-        "fcslam setup warm-up",
+        "fcslam tools warm-up",
     ),
 )(warming.warm_up)
-app.add_typer(setup, name="setup", rich_help_panel=MORE)
+tools.command(
+    "train",
+    rich_help_panel=LEARNING,
+    epilog=examples(
+        "fcslam tools train photos -o detector",
+        "fcslam tools train photos --quick",
+    ),
+)(train.train)
+tools.add_typer(federate.app, name="federate", rich_help_panel=LEARNING)
+tools.command(
+    "extract",
+    rich_help_panel=LEARNING,
+    epilog=examples(
+        "fcslam tools extract photos -o features --keypoints 1000",
+    ),
+)(extract.extract)
+tools.command(
+    "vocabulary",
+    rich_help_panel=LEARNING,
+    epilog=examples(
+        "fcslam tools vocabulary runs/building -o building.words",
+    ),
+)(vocabulary.vocabulary)
+app.add_typer(tools, name="tools", rich_help_panel=STUDY)
 
 
 def _finite(text: str) -> float:
@@ -258,6 +253,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return READER_GONE
         return _fail(f"standard output cannot be written ({error.strerror}); make room", BAD_INPUT)
     except click.ClickException as error:
+        if isinstance(error, click.NoSuchOption) and (key := error.option_name.lstrip("-")) in SENSOR_KEYS:
+            error.possibilities = [f"--sensors {key}=..."]
         error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""`fcslam setup certificates`: credentials for a service with TLS, for development and closed networks."""
+"""`fcslam tools certificates`: credentials for a service with TLS, for development and closed networks."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`fcslam changes`: a run folder in, what changed in the building between two times out."""
+"""`fcslam tools changes`: a run folder in, what changed in the building between two times out."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`fcslam setup config`: the configuration as a file."""
+"""`fcslam tools config`: the configuration as a file."""
 
 from typing import Annotated
 

@@ -69,14 +69,14 @@ def demo(
     console = notices(quiet)
     stages = _Stages(console, 5 if learn else 4)
     stages.begin(f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
-    recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
+    recordings = record_fleet(fleet, output / RECORDINGS, seed, console)
     sources = [open_source(place) for place in recordings]
     config = MissionConfig(seed=seed)
     if learn:
         stages.begin("learn: the robots train the detector together, and no image leaves its robot")
         config = _with_detector(config, learn_together(sources, config, output / LEARNING, console))
     stages.begin("map each robot, recognise places, fuse the maps")
-    with live_page(output / RUN, 0) if live else nullcontext() as page:
+    with live_page(output / RUN) if live else nullcontext() as page:
         map_sources(sources, config, output / RUN, console, force=True, page=page)
         stages.begin("evaluate: compare with the truth")
         _evaluate(output, console)

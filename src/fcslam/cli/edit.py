@@ -218,8 +218,7 @@ def area(
 @app.command(
     epilog=examples(
         "fcslam edit place runs/building --to-walls",
-        "fcslam edit place runs/building --rotate 90 --shift 10,0",
-        "fcslam edit place runs/building --at anna,1000.5 --pose 3,4,1.57",
+        "fcslam edit place runs/building --at anna,1000.5=3,4,1.57",
         "fcslam edit place runs/building --match 1.5,2=0,0 --match 9,2.5=7.5,0",
     )
 )
@@ -229,14 +228,12 @@ def place(
     to_walls: Annotated[
         bool, typer.Option("--to-walls", help="Turn the map so that its walls run along x and y.")
     ] = False,
-    rotate: Annotated[float, typer.Option(metavar="DEGREES", help="Turn the map about its origin.")] = 0.0,
-    shift: Annotated[str, typer.Option(metavar="X,Y", help="Then move it (metres).")] = "0,0",
     at: Annotated[
-        str | None, typer.Option(metavar="SESSION,STAMP", help="A moment of a session whose pose you know.")
-    ] = None,
-    pose: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,THETA", help="That pose, as in a floor plan or a georeference (metres, radians)."),
+        typer.Option(
+            metavar="SESSION,STAMP=X,Y,THETA",
+            help="A moment of a session and its pose in a floor plan or a georeference (metres, radians).",
+        ),
     ] = None,
     match: Annotated[
         list[str] | None,
@@ -244,31 +241,31 @@ def place(
     ] = None,
     map_index: MapIndex = 0,
 ) -> None:
-    """Choose the map's coordinate frame: by walls or a motion, by a pose, or by points, for example of a floor plan."""
+    """Choose the map's coordinate frame: by walls, by a pose, or by points, for example of a floor plan."""
+    import numpy as np
+
+    from fcslam.anchoring.walls import wall_direction
     from fcslam.cli.recordings import pose as read_pose
     from fcslam.errors import InputError
     from fcslam.mission.map_edits import moved_map
     from fcslam.records import Placement
 
-    if (at is None) != (pose is None):
-        raise InputError("--at and --pose belong together: --at anna,1000.5 --pose 3,4,1.57")
-    by_motion = to_walls or rotate != 0.0 or shift != "0,0"
-    if by_motion + (at is not None) + bool(match) != 1:
-        raise InputError(
-            "give one of: --to-walls, --rotate and --shift together; --at and --pose; --match twice or more often"
-        )
-    if at is not None and pose is not None:
-        session, _, stamp = at.rpartition(",")
-        _append(run, Placement(session, _number(stamp), read_pose("--pose", pose)))
+    if to_walls + (at is not None) + bool(match) != 1:
+        raise InputError("give one of: --to-walls; --at anna,1000.5=3,4,1.57; --match twice or more often")
+    if at is not None:
+        moment, _, pose = at.partition("=")
+        session, _, stamp = moment.rpartition(",")
+        _append(run, Placement(session, _number(stamp), read_pose(f"--at {moment}=", pose)))
         return
     opened, mission = _opened(run)
-    if not match:
-        T_new_map = _turned(opened, map_index, to_walls, rotate, _point("--shift", shift))
-        _append(run, moved_map(opened, mission, map_index, T_new_map))
-        return
-    T_new_map, off_m = _matched(match)
+    if match:
+        T_new_map, off_m = _matched(match)
+    else:
+        walls_rad = wall_direction(opened.maps[map_index]) if map_index in opened.maps else 0.0
+        T_new_map, off_m = np.array((0.0, 0.0, -walls_rad)), 0.0
     _append(run, moved_map(opened, mission, map_index, T_new_map))
-    typer.echo(f"the points fit to {off_m:.3f} m", err=True)
+    if match:
+        typer.echo(f"the points fit to {off_m:.3f} m", err=True)
 
 
 def _matched(pairs: list[str]) -> tuple["FloatArray", float]:
@@ -283,15 +280,6 @@ def _matched(pairs: list[str]) -> tuple["FloatArray", float]:
     T_new_map = motion_to_points(points, targets)
     off_m = np.hypot(*(se2.transform(T_new_map, np.array(points)) - targets).T)
     return T_new_map, float(off_m.max())
-
-
-def _turned(run: "Run", map_index: int, to_walls: bool, degrees: float, shift: tuple[float, float]) -> "FloatArray":
-    import numpy as np
-
-    from fcslam.anchoring.walls import wall_direction
-
-    walls_rad = wall_direction(run.maps[map_index]) if to_walls and map_index in run.maps else 0.0
-    return np.array((*shift, math.radians(degrees) - walls_rad))
 
 
 def _decide(mission: Path, decision: "Veto | Pin") -> None:

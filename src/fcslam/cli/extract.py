@@ -1,13 +1,16 @@
-"""`fcslam learn extract`: keypoints and descriptors of images."""
+"""`fcslam tools extract`: keypoints and descriptors of images."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.options import output_option
 from fcslam.cli.output import FEATURES, answers, new_folder, notices, print_line
 from fcslam.features.detector_kinds import DetectorKind
+
+LONGEST_SIDE_PX = 2048
+"""Larger images are shrunk to this longest side."""
 
 
 def extract(
@@ -17,45 +20,35 @@ def extract(
         Path | None, output_option("Folder for the features, one .npz file for each image.", FEATURES)
     ] = None,
     detector: Annotated[
-        DetectorKind | None,
-        typer.Option(help="Detector of keypoints.", show_default="onnx with a bundled or given network, else orb"),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(help="Network weights (.onnx) of detector onnx.", show_default="the bundled network"),
-    ] = None,
+        str,
+        typer.Option(metavar="orb|onnx|FILE", help="orb, onnx (the bundled network), or the .onnx file of a network."),
+    ] = "onnx",
     keypoints: Annotated[
         int, typer.Option(min=1, max=2000, help="Number of keypoints to keep of each image, strongest first.")
     ] = 1000,
     scales: Annotated[
         str, typer.Option(metavar="S,S,...", help="Scales of the image pyramid of a network.")
     ] = "1,0.71,0.5",
-    longest_side: Annotated[
-        int, typer.Option(min=16, max=16384, help="Shrink larger images to this longest side, in pixels.")
-    ] = 2048,
-    quiet: Quiet = False,
 ) -> None:
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import changed
     from fcslam.errors import FeatureError
     from fcslam.features.classical import OrbConfig
-    from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
+    from fcslam.features.detector import OnnxConfig
     from fcslam.features.extraction import extract_all, find_files
     from fcslam.features.factory import make_detector
 
-    is_network = weights is not None or BUNDLED_NETWORK.is_file() if detector is None else detector is DetectorKind.ONNX
-    kind = DetectorKind.ONNX if is_network else DetectorKind.ORB
-    if weights is not None and not is_network:
-        raise FeatureError(f"{weights}: detector orb has no weights; leave --weights out, or --detector")
-    onnx = OnnxConfig(weights=weights, most_features=keypoints)
+    named = detector in list(DetectorKind)
+    kind = DetectorKind(detector) if named else DetectorKind.ONNX
+    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints)
     onnx = changed(onnx, {"scales": scales.split(",")}, "the command line")
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images
     output = output or new_folder(FEATURES)
-    console, done, empty = notices(quiet), 0, 0
-    outcomes = extract_all(files, root, output, finder, longest_side)
+    console, done, empty = notices(), 0, 0
+    outcomes = extract_all(files, root, output, finder, LONGEST_SIDE_PX)
     with ProgressDisplay(console) as display:
         extracted_one = display.start("extracting", len(files))
         for outcome in outcomes:

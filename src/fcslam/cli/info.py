@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.groups import with_groups
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
-    BagFlags,
+    Sensors,
+    bag_options,
 )
 from fcslam.errors import printable
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 GAPS_SHOWN = 3
 
 
-@with_groups
 def info(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
     *,
@@ -38,12 +37,12 @@ def info(
             "a bag.",
         ),
     ] = False,
-    bags: BagFlags,
+    sensors: Sensors = None,
 ) -> None:
     """Say what is in a recording, and whether it can be mapped; if not, why, and the exit code is 1."""
     from fcslam.sources.inspection import inspect
 
-    options = bags.options()
+    options = bag_options(sensors)
     found = _with_contradictions(inspect(recording, options), options)
     console = answers()
     if as_json:
@@ -81,7 +80,7 @@ def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str
     if not isinstance(source, RosBag):
         yield "calibration: of ROS bags only"
         return
-    with compiled(notices(quiet=False)):
+    with compiled(notices()):
         found = calibrate_bag(source, LidarConfig())
     estimated = found.calibration
     mounting = estimated.mounting or (None, None, None)

@@ -2,7 +2,9 @@
 
 import ipaddress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
 
 if TYPE_CHECKING:
     import socket
@@ -33,6 +35,41 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+Credentials = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        rich_help_panel="Credentials",
+        help="Folder with the file of tokens, tokens.yaml, and for TLS cloud.pem and cloud.key; `fcslam tools "
+        "certificates` makes one.",
+    ),
+]
+
+
+class ServiceFiles(NamedTuple):
+    """The files of a service in its folder of credentials."""
+
+    tokens: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+
+
+def find_files(folder: Path | None) -> ServiceFiles:
+    """The files that are there.
+
+    Raises:
+        ServiceError: there is none.
+    """
+    from fcslam.errors import ServiceError
+
+    if folder is None:
+        return ServiceFiles()
+    found = [folder / name if (folder / name).exists() else None for name in ("tokens.yaml", "cloud.pem", "cloud.key")]
+    if not any(found):
+        raise ServiceError(f"{folder}: holds neither tokens.yaml nor cloud.pem; `fcslam tools certificates` makes them")
+    return ServiceFiles(*found)
+
+
 def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None = None) -> None:
     """Check the certificate of a service and its key, and the authority of its clients' certificates.
 
@@ -45,10 +82,10 @@ def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None
     from fcslam.wire.keys import no_passphrase
 
     if (certificate is None) != (key is None):
-        raise ServiceError("--tls-certificate and --tls-key belong together; give both or neither")
+        raise ServiceError("--credentials: cloud.pem and cloud.key belong together; add the other one")
     if certificate is None or key is None:
         if client_ca is not None:
-            raise ServiceError("--client-ca needs TLS; give --tls-certificate and --tls-key")
+            raise ServiceError("--client-ca needs TLS; give --credentials with cloud.pem and cloud.key")
         return
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:

@@ -1,20 +1,14 @@
-"""A live robot on a ROS network, for `fcslam robot`, `fcslam localize` and `fcslam record`."""
+"""A live robot on a ROS network, for `fcslam robot` and `fcslam localize`."""
 
 import logging
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from threading import Event
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from fcslam.cli.groups import with_groups
-from fcslam.cli.options import Force, Quiet
-from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
-from fcslam.cli.recordings import TopicFlags, print_faults
+from fcslam.cli.output import RUNS, answers, new_folder, print_line
+from fcslam.cli.recordings import print_faults
 from fcslam.cli.ros_options import stopping
 from fcslam.cli.warm_up import compiled
 
@@ -40,21 +34,23 @@ SWITCH_INTERVAL_S = 0.001
 """Time after which a thread that publishes yields to the one that maps; Python's own is 5 ms."""
 
 
-def named_address(argument: str, otherwise: str) -> "tuple[str, RosAddress]":
+def is_live(source: str) -> bool:
+    """Whether ADDRESS or NAME=ADDRESS is the address of a live robot."""
+    from fcslam.ros.addresses import is_address
+
+    return is_address(source.rpartition("=")[2])
+
+
+def named_address(argument: str) -> "tuple[str, RosAddress]":
     """Name and address of a live robot, given as ADDRESS or NAME=ADDRESS.
 
     Raises:
-        InputError: it is not an address; the error says ``otherwise``.
         NetworkError: its namespace cannot be used.
     """
-    from fcslam.errors import InputError
-    from fcslam.ros.addresses import is_address, parse_address
+    from fcslam.ros.addresses import parse_address
 
     name, equals, address = argument.partition("=")
-    address = address if equals else name
-    if not is_address(address):
-        raise InputError(f"{argument}: is not the address of a live robot, as ros2:/robot1 is; {otherwise}")
-    place = parse_address(address)
+    place = parse_address(address if equals else argument)
     return name if equals else place.robot, place
 
 
@@ -180,69 +176,3 @@ def _watch(
             notify(f"{scans} scans")
 
     return watch
-
-
-@with_groups
-def record(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="ADDRESS", help="The robot: ros2:/NAMESPACE, zenoh:/NAMESPACE or ros1:/NAMESPACE; ros2:/ has none."
-        ),
-    ],
-    *,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="File to write: .mcap from ROS 2, .bag from ROS 1.")
-    ],
-    duration: Annotated[
-        float | None, typer.Option(min=0.1, help="Time to record, in seconds.", show_default="until Ctrl-C")
-    ] = None,
-    topics: TopicFlags,
-    force: Force = False,
-    quiet: Quiet = False,
-) -> None:
-    """Record the sensors of a live robot: everything that `fcslam map` needs."""
-    from threading import Timer
-
-    from fcslam.ros.addresses import open_network
-    from fcslam.ros.node import await_sensors
-    from fcslam.ros.parameters import NodeParameters
-    from fcslam.ros.record import record as record_messages
-    from fcslam.sources import BagOptions
-
-    console = notices(quiet)
-    _, place = named_address(source, otherwise="a recording is there already")
-    _prepare(output, place.network, force)
-    options = topics.options() or BagOptions()
-    stop = Event()
-    with closing(open_network(place)) as network:
-        found = await_sensors(network, place.namespace, options, NodeParameters().topic_timeout)
-        print_line(console, f"records {', '.join(found.kinds)}; Ctrl-C ends the recording")
-        timer = Timer(duration or 0.0, stop.set)
-        timer.daemon = True
-        with stopping(stop.set):
-            if duration is not None:
-                timer.start()
-            counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
-        timer.cancel()
-    print_line(answers(), f"{_listed(counts)}: {output}")
-
-
-def _prepare(output: Path, network: str, force: bool) -> None:
-    """Check before the recording that it can be written."""
-    from fcslam.errors import OutputError
-
-    suffix = ".bag" if network == "ros1" else ".mcap"
-    if output.suffix != suffix:
-        raise OutputError(f"{output}: a recording of {network} is a {suffix} file; choose such a name")
-    try:
-        if output.exists() and not force:
-            raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
-        if not output.parent.is_dir():
-            raise OutputError(f"{output}: there is no folder {output.parent}; make it first")
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"

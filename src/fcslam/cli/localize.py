@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.groups import with_groups
+from fcslam.cli.live import is_live
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
-from fcslam.cli.recordings import BagFlags, open_recording, pose, print_faults, print_notes
+from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
 from fcslam.cli.ros_options import RosFlags
 from fcslam.cli.server_options import AccessFlags
 from fcslam.cli.warm_up import compiled
@@ -67,7 +68,7 @@ def localize(
     ] = False,
     config: ConfigFiles = None,
     access: AccessFlags,
-    bags: BagFlags,
+    sensors: Sensors = None,
     ros: RosFlags,
     force: Force = False,
     quiet: Quiet = False,
@@ -84,24 +85,24 @@ def localize(
 
     settings, console = mission_config(config), notices(quiet)
     initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
-    server, is_live = access.access(), _is_live(source)
-    if is_live and update:
+    server, live = access.access(), is_live(source)
+    if live and update:
         raise InputError("--update draws what a recording saw; record the drive, and localise the recording")
     if server is not None:
         keep_private()
         _fetch(map_path, server, console)
-    if is_live:
+    if live:
         from fcslam.cli.live import drive_live, named_address
         from fcslam.live.localized_robot import LocalizedRobot
         from fcslam.sources import BagOptions
 
-        name, place = named_address(source, otherwise="")
+        name, place = named_address(source)
         start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
-        drive_live(name, place, start, bags.options() or BagOptions(), ros.parameters(), output, console)
+        drive_live(name, place, start, bag_options(sensors) or BagOptions(), ros.parameters(), output, console)
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)
-    recording = open_recording(source, bags.options())
+    recording = open_recording(source, bag_options(sensors))
     survey = recording.survey()
     print_notes(console, survey.notes)
     with compiled(console), ProgressDisplay(console) as display:
@@ -112,12 +113,6 @@ def localize(
         run.save(output, force)
     print_faults(console, {recording.name: recording.faults})
     _report(run, recording.name, output)
-
-
-def _is_live(source: str) -> bool:
-    from fcslam.ros.addresses import is_address
-
-    return is_address(source.rpartition("=")[2])
 
 
 def _fetch(folder: Path, server: "Server", console: "Console") -> None:

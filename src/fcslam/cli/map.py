@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.groups import with_groups
-from fcslam.cli.mission_options import MissionFlags
+from fcslam.cli.mission_options import ConfigFiles, mission_config, with_starts
 from fcslam.cli.options import (
     Force,
     Quiet,
@@ -22,12 +21,13 @@ from fcslam.cli.options import (
 )
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
-    BagFlags,
+    Sensors,
+    bag_options,
     open_recordings,
     print_faults,
     print_notes,
 )
-from fcslam.cli.show import Live, Port, live_page
+from fcslam.cli.show import Live, live_page
 from fcslam.cli.warm_up import compiled, cores
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from fcslam.mission.mission import MissionConfig, Progress
     from fcslam.mission.mission_file import SavedMission
     from fcslam.page.live_map import LiveMap
-    from fcslam.records import Veto
     from fcslam.runs import Run
     from fcslam.sources import Source
     from fcslam.sources.faults import Faults
@@ -51,7 +50,6 @@ class AlignTo(StrEnum):
     WALLS = "walls"
 
 
-@with_groups
 def map_recordings(
     logs: Annotated[
         list[str] | None,
@@ -81,13 +79,6 @@ def map_recordings(
             "repeated.",
         ),
     ] = None,
-    veto: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV file of closures to reject, with lines of a run's closures.csv. A line without stamps rejects "
-            "all closures between two robots."
-        ),
-    ] = None,
     plan: Annotated[
         Path | None,
         typer.Option(
@@ -107,10 +98,25 @@ def map_recordings(
         AlignTo | None,
         typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y."),
     ] = None,
-    mission: MissionFlags,
-    bags: BagFlags,
+    config: ConfigFiles = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=X,Y,THETA",
+            help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
+            "forces nothing. Can be repeated.",
+        ),
+    ] = None,
+    start_sigma: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M,RAD",
+            help="Standard deviations of the starts: of x and y, and of the heading.",
+            show_default="that of the configuration",
+        ),
+    ] = None,
+    sensors: Sensors = None,
     live: Live = False,
-    port: Port = 0,
     force: Force = False,
     quiet: Quiet = False,
     workers: WorkersOption = "1",
@@ -124,15 +130,14 @@ def map_recordings(
         from fcslam.mission.mission import continued_config
         from fcslam.mission.mission_file import read_mission
         from fcslam.robot.calibrating import calibrated
-        from fcslam.runs import prepare_output, read_vetoes
+        from fcslam.runs import prepare_output
 
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = None if onto is None else read_mission(onto)
-        settings = mission.settings(continued_config(earlier))
-        vetoes = read_vetoes(veto) if veto else ()
+        settings = with_starts(mission_config(config, continued_config(earlier)), start, start_sigma)
         anchors = _anchors(plan, plan_scale, align, tags)
-        options = bags.options()
+        options = bag_options(sensors)
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
@@ -140,8 +145,8 @@ def map_recordings(
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers)
-    with verifying(chosen) as verify, live_page(output, port) if live else nullcontext() as page:
-        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors, verify, anchors)
+    with verifying(chosen) as verify, live_page(output) if live else nullcontext() as page:
+        map_sources(sources, settings, output, notices(quiet), force, earlier, page, floors, verify, anchors)
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
@@ -166,7 +171,6 @@ def map_sources(
     output: Path,
     console: "Console",
     force: bool = False,
-    vetoes: "Sequence[Veto]" = (),
     earlier: "SavedMission | None" = None,
     page: "LiveMap | None" = None,
     floors: "Mapping[str, str]" = MappingProxyType({}),
@@ -193,7 +197,7 @@ def map_sources(
         known = 0 if earlier is None else sum(len(track.stamps) for track in earlier.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
         run = api.map_recordings(
-            sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier,
+            sources, config=settings, progress=progress, processes=cores(), onto=earlier,
             live=None if page is None else page.look, floors=floors,
             verify_pairs=verify_pairs or verify_here, anchors=anchors or NOTHING_KNOWN,
         )  # fmt: skip

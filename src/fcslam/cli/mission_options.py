@@ -1,90 +1,103 @@
-"""Options that choose the configuration of a mission, and the configuration that follows from them."""
+"""Options that choose settings, and the settings that follow from them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
+    from fcslam.config import SettingsType
     from fcslam.mission.mission import MissionConfig
 
-_FROM_CONFIG = "that of the configuration"
+_ONE_KEY = re.compile(r"([a-z][a-z0-9_.]*)=(.*)", re.DOTALL)
 
 ConfigFiles = Annotated[
     list[str] | None,
     typer.Option(
         "--config",
         "-c",
-        metavar="FILE|PRESET",
-        help="Configuration file (YAML; `fcslam setup config` prints the default one) or the preset `paper`: FC-SLAM "
-        "to the letter. Can be repeated; a later one overrides keys of an earlier one.",
+        metavar="FILE|KEY=VALUE",
+        help="Configuration file (YAML; `fcslam tools config` prints the default one), one key of it, such as "
+        "fleet.join_maps=false, or the preset `paper`: FC-SLAM to the letter. Can be repeated; a later one overrides "
+        "keys of an earlier one.",
     ),
 ]
+SettingsFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--config", "-c", metavar="FILE|KEY=VALUE", help="File of settings (YAML), or one of its keys. Can be repeated."
+    ),
+]
+NO_FILES: Mapping[str, Path] = {}
 
 
-@dataclass(frozen=True)
-class MissionFlags:
-    """The configuration of a mission, and what is often changed in it."""
+def chosen_settings(
+    settings: "SettingsType", chosen: Sequence[str] | None, presets: Mapping[str, Path] = NO_FILES
+) -> "SettingsType":
+    """The settings with the changes of files, presets and single keys, in this order.
 
-    config: ConfigFiles = None
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all random draws.", show_default=_FROM_CONFIG)] = None
-    no_fuse: Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone and fuse no maps.")] = False
-    start: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=X,Y,THETA",
-            help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
-            "forces nothing. Can be repeated.",
-        ),
-    ] = None
-    start_sigma: Annotated[
-        str | None,
-        typer.Option(
-            metavar="M,RAD",
-            help="Standard deviations of the starts: of x and y, and of the heading.",
-            show_default=_FROM_CONFIG,
-        ),
-    ] = None
+    Raises:
+        ConfigError: a file cannot be read, or a key or a value is invalid.
+    """
+    from fcslam.config import changed, load, parse_yaml
+    from fcslam.errors import ConfigError
 
-    def settings(self, default: "MissionConfig | None") -> "MissionConfig":
-        """The configuration; without a file or preset, ``default`` with the changes of the command line.
+    for one in chosen or ():
+        single = _single_key(one)
+        if single is None:
+            settings = load(type(settings), presets.get(one, Path(one)), over=settings)
+            continue
+        key, text = single.groups()
+        try:
+            content: Any = parse_yaml(text)
+        except ValueError as error:
+            raise ConfigError(f"--config {key}: {error}") from error
+        for part in reversed(key.split(".")):
+            content = {part: content}
+        settings = changed(settings, content, "--config")
+    return settings
 
-        Raises:
-            ConfigError: a file cannot be used, a robot is given two starts, or a number cannot be used.
-            InputError: a start is not a pose.
-        """
-        from fcslam.cli.recordings import pose
-        from fcslam.config import changed
-        from fcslam.errors import ConfigError
 
-        named = [start.partition("=")[::2] for start in self.start or ()]
-        if len(dict(named)) < len(named):
-            raise ConfigError("--start: a robot is given two starts; give one for each")
-        fleet: dict[str, object] = {"join_maps": False} if self.no_fuse else {}
-        if named:
-            fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
-        if self.start_sigma is not None:
-            fleet["start_sigma"] = self.start_sigma.split(",")
-        changes: dict[str, object] = {"fleet": fleet} if fleet else {}
-        changes |= {} if self.seed is None else {"seed": self.seed}
-        return changed(mission_config(self.config, default), changes, "the command line")
+def _single_key(text: str) -> "re.Match[str] | None":
+    return None if os.path.exists(text) else _ONE_KEY.fullmatch(text)
 
 
 def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None" = None) -> "MissionConfig":
-    """The configuration of files and presets, the first one over the default; without any, ``default`` if it is given.
+    """The configuration of a mission that the command line chooses.
+
+    Files and presets change the defaults. Without any, single keys change ``default``.
 
     Raises:
         ConfigError: a file cannot be read or is invalid.
     """
-    from fcslam.config import load
     from fcslam.mission.mission import MissionConfig
 
-    config = default if default is not None and not chosen else MissionConfig()
-    presets = {preset.value: preset.file for preset in Preset}
-    for one in chosen or ():
-        config = load(MissionConfig, presets.get(one, Path(one)), over=config)
-    return config
+    base = default if default is not None and all(map(_single_key, chosen or ())) else MissionConfig()
+    return chosen_settings(base, chosen, {preset.value: preset.file for preset in Preset})
+
+
+def with_starts(config: "MissionConfig", starts: Sequence[str] | None, sigma: str | None) -> "MissionConfig":
+    """The configuration with the starts of ``--start NAME=X,Y,THETA`` and their standard deviations.
+
+    Raises:
+        ConfigError: a robot is given two starts, or a name or a number cannot be used.
+        InputError: a start is not a pose.
+    """
+    from fcslam.cli.recordings import pose
+    from fcslam.config import changed
+    from fcslam.errors import ConfigError
+
+    named = [start.partition("=")[::2] for start in starts or ()]
+    if len(dict(named)) < len(named):
+        raise ConfigError("--start: a robot is given two starts; give one for each")
+    fleet: dict[str, object] = {}
+    if named:
+        fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+    if sigma is not None:
+        fleet["start_sigma"] = sigma.split(",")
+    return changed(config, {"fleet": fleet}, "the command line") if fleet else config

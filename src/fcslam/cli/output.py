@@ -23,7 +23,7 @@ def new_folder(parent: str, now: datetime | None = None) -> Path:
     return next(later_one for later_one in later if not later_one.exists()) if first.exists() else first
 
 
-def notices(quiet: bool) -> "Console":
+def notices(quiet: bool = False) -> "Console":
     """The console for progress and notices: stderr, or nothing if ``quiet``."""
     from rich.console import Console
 

@@ -12,10 +12,11 @@ import typer
 
 from fcslam.cli.groups import with_groups
 from fcslam.cli.learning_options import LearningFlags
+from fcslam.cli.live import is_live
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet
 from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.recordings import BagFlags, open_recording, print_faults, print_notes
+from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.server_options import Floor, ServerFlags
 from fcslam.cli.warm_up import compiled
 
@@ -55,7 +56,7 @@ def play(
     ] = "max",
     floor: Floor = "",
     config: ConfigFiles = None,
-    bags: BagFlags,
+    sensors: Sensors = None,
     learning: LearningFlags,
     quiet: Quiet = False,
 ) -> None:
@@ -63,18 +64,17 @@ def play(
     from fcslam.errors import InputError
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
-    from fcslam.ros.addresses import is_address
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
     keep_private()
-    if is_address(recording):
+    if is_live(recording):
         raise InputError(f"{recording}: is a live robot; `fcslam robot {recording}` maps it")
     settings, cloud = mission_config(config), server.access()
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = _speed(speed)
-    opened = open_recording(recording, bags.options())
+    opened = open_recording(recording, bag_options(sensors))
     _check_name(opened.name)
     survey = opened.survey()
     console = notices(quiet)

@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,92 +19,54 @@ if TYPE_CHECKING:
     from fcslam.sources.faults import Faults
     from fcslam.sources.point_clouds import CloudBand
 
-_BAGS = "ROS bags"
+SENSOR_KEYS = ("scan-topic", "odom-topic", "camera-topic", "odom-frame", "base-frame", "laser-pose", "cloud-band")
+"""Keys of ``--sensors``; ``scan-topic`` and ``laser-pose`` may be given for each of several lasers."""
+
+Sensors = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KEY=VALUE",
+        help="What to read of ROS topics in place of what fcslam chooses; repeat it for each key. scan-topic (one for "
+        "each laser), odom-topic (/tf: from tf; none), camera-topic; odom-frame and base-frame of the odometry in tf; "
+        "laser-pose=X,Y,THETA[,upside-down] in the base frame (one for each scan-topic); cloud-band=LOW,HIGH[,BODY], "
+        "the heights of a 3D LiDAR or depth camera that count, and the radius of the robot. Metres, radians.",
+    ),
+]
 
 
-@dataclass(frozen=True)
-class TopicFlags:
-    """The topics of a robot."""
+def bag_options(given: list[str] | None) -> "BagOptions | None":
+    """The values of ``--sensors`` as the readers of bags take them; None if none is given.
 
-    scan_topic: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="TOPIC", rich_help_panel=_BAGS,
-            help="Topic of the laser scans; repeat it if the robot has several lasers.",
-        ),
-    ] = None  # fmt: skip
-    odom_topic: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC", rich_help_panel=_BAGS,
-            help="Topic of the odometry; /tf reads it from tf, none maps without it.",
-        ),
-    ] = None  # fmt: skip
-    camera_topic: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="Topic of the camera images.", rich_help_panel=_BAGS)
-    ] = None
+    Raises:
+        InputError: a key is unknown or there twice, a laser pose is not a pose, or the band is not a band.
+    """
+    from fcslam.sources import BagOptions
 
-    def options(self) -> "BagOptions | None":
-        """As the readers of bags take them; None if none is given."""
-        from fcslam.sources import BagOptions
-
-        options = BagOptions(tuple(self.scan_topic or ()), self.odom_topic, self.camera_topic)
-        return None if options == BagOptions() else options
-
-
-@dataclass(frozen=True)
-class BagFlags(TopicFlags):
-    """The topics, frames and mounting of the sensors of a robot."""
-
-    odom_frame: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FRAME", rich_help_panel=_BAGS,
-            help="Read the odometry from tf, where its parent frame has this name.",
-        ),
-    ] = None  # fmt: skip
-    base_frame: Annotated[
-        str | None,
-        typer.Option(metavar="FRAME", rich_help_panel=_BAGS, help="Frame of the robot whose pose the odometry is."),
-    ] = None
-    laser_pose: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="X,Y,THETA[,upside-down]", rich_help_panel=_BAGS,
-            help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf. Give one for "
-            "each --scan-topic, in the same order.",
-        ),
-    ] = None  # fmt: skip
-    cloud_band: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LOW,HIGH[,BODY]", rich_help_panel=_BAGS,
-            help="Heights above the floor (metres) of the points of a 3D LiDAR or depth camera that count; 0.1,0.6 if "
-            "not given. Points within BODY metres (0.4) of the base are of the robot.",
-        ),
-    ] = None  # fmt: skip
-
-    def options(self) -> "BagOptions | None":
-        """As the readers of bags take them; None if none is given.
-
-        Raises:
-            InputError: a laser pose is not a pose, or the band is not a band.
-        """
-        from fcslam.sources import BagOptions
-
-        options = replace(
-            super().options() or BagOptions(),
-            laser_poses=tuple(map(_laser_pose, self.laser_pose or ())),
-            odom_frame=self.odom_frame,
-            base_frame=self.base_frame,
-            cloud_band=_cloud_band(self.cloud_band),
-        )
-        return None if options == BagOptions() else options
+    if not given:
+        return None
+    values: dict[str, list[str]] = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if key not in SENSOR_KEYS or not (equals and value):
+            raise InputError(f"--sensors {text}: expected KEY=VALUE with a key of {', '.join(SENSOR_KEYS)}")
+        if key in values and key not in ("scan-topic", "laser-pose"):
+            raise InputError(f"--sensors {key}: is given twice; give it once")
+        values.setdefault(key, []).append(value)
+    last = {key: of[-1] for key, of in values.items()}
+    return BagOptions(
+        tuple(values.get("scan-topic", ())),
+        last.get("odom-topic"),
+        last.get("camera-topic"),
+        tuple(map(_laser_pose, values.get("laser-pose", ()))),
+        last.get("odom-frame"),
+        last.get("base-frame"),
+        cloud_band=_cloud_band(last.get("cloud-band")),
+    )
 
 
 def _laser_pose(text: str) -> "GivenPose":
     upright = text.removesuffix(",upside-down")
-    x, y, theta = pose("--laser-pose", upright)
+    x, y, theta = pose("--sensors laser-pose", upright)
     return (x, y, theta) if upright == text else (x, y, theta, True)
 
 
@@ -120,7 +81,9 @@ def _cloud_band(text: str | None) -> "CloudBand":
     except (TypeError, ValueError):
         band = CloudBand(math.nan)
     if not (band.low_m < band.high_m and 0.0 <= band.body_radius_m < math.inf):  # false for NaN
-        raise InputError(f"--cloud-band {text!r} is not a band of heights; give metres, as in --cloud-band 0.1,0.6")
+        raise InputError(
+            f"--sensors cloud-band={text}: is not a band of heights; give metres, as in cloud-band=0.1,0.6"
+        )
     return band
 
 

@@ -11,7 +11,7 @@ from fcslam.cli.learning_options import LearningFlags
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices
-from fcslam.cli.recordings import BagFlags
+from fcslam.cli.recordings import Sensors, bag_options
 from fcslam.cli.ros_options import RosFlags
 from fcslam.cli.server_options import NETWORK, Floor, ServerFlags
 
@@ -57,7 +57,7 @@ def robot(
     output: Annotated[Path | None, output_option("Run folder, with the robot's own map.", RUNS)] = None,
     floor: Floor = "",
     config: ConfigFiles = None,
-    bags: BagFlags,
+    sensors: Sensors = None,
     ros: RosFlags,
     learning: LearningFlags,
     quiet: Quiet = False,
@@ -73,14 +73,20 @@ def robot(
     ] = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
-    from fcslam.cli.live import drive_live, named_address
+    from fcslam.cli.live import drive_live, is_live, named_address
+    from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.sources import BagOptions
     from fcslam.storage.files import keep_private
 
     keep_private()
-    name, place = named_address(address, otherwise="`fcslam play` plays a recording to a service")
+    if not is_live(address):
+        raise InputError(
+            f"{address}: is not the address of a live robot, as ros2:/robot1 is; `fcslam play` plays a recording to a "
+            "service"
+        )
+    name, place = named_address(address)
     settings = mission_config(config)
     start = partial(
         Robot,
@@ -91,4 +97,4 @@ def robot(
         wiring=Wiring(keeps_keyframes=learning.learn),
     )
     plan = learning.plan(settings.robot, server, state)
-    drive_live(name, place, start, bags.options() or BagOptions(), ros.parameters(), output, notices(quiet), plan)
+    drive_live(name, place, start, bag_options(sensors) or BagOptions(), ros.parameters(), output, notices(quiet), plan)

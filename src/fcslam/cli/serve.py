@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.listening import check_tls, is_loopback, listen
+from fcslam.cli.listening import Credentials, check_tls, find_files, is_loopback, listen
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fcslam.service.http.authentication import Authenticator
     from fcslam.service.http.state import ServiceState
 
-_TLS = "TLS"
+_CREDENTIALS = "Credentials"
 _INSTANCES = "Several instances"
 _LEARNING = "Learning"
 
@@ -33,24 +33,21 @@ def serve(
     data: Annotated[Path, typer.Option("--data", help="Folder of the missions, created if it does not exist.")],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 chooses a free one.")] = 8340,
-    tokens: Annotated[
-        Path | None, typer.Option(help="File of tokens and roles; `fcslam setup certificates` makes one.")
-    ] = None,
+    credentials: Credentials = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Accept requests from other machines without authentication.")
+        bool,
+        typer.Option(
+            "--insecure",
+            help="Accept requests from other machines without authentication.",
+            rich_help_panel=_CREDENTIALS,
+        ),
     ] = False,
-    tls_certificate: Annotated[
-        Path | None, typer.Option(help="Certificate of this service (PEM).", rich_help_panel=_TLS)
-    ] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(help="Private key of --tls-certificate (PEM).", rich_help_panel=_TLS)
-    ] = None,
     client_ca: Annotated[
         Path | None,
         typer.Option(
             help="Certificate of the authority that signs robots' certificates (PEM). Robots with such a certificate "
             "need no token.",
-            rich_help_panel=_TLS,
+            rich_help_panel=_CREDENTIALS,
         ),
     ] = None,
     config: ConfigFiles = None,
@@ -91,10 +88,11 @@ def serve(
     from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
 
+    tokens, certificate, key = find_files(credentials)
     is_open = tokens is None and client_ca is None and not insecure
     if is_open and not is_loopback(host):
-        raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
-    check_tls(tls_certificate, tls_key, client_ca)
+        raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
+    check_tls(certificate, key, client_ca)
     chosen = Workers(workers)
     chosen.check()
     if chosen.is_cluster:
@@ -121,8 +119,8 @@ def serve(
         app = create_app(
             state, routers, local_names=tokens is None and client_ca is None, named=None if store is None else NAMED
         )
-        server = _server(app, tls_certificate, tls_key, client_ca, state.close)
-        scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
+        server = _server(app, certificate, key, client_ca, state.close)
+        scheme, (address, number) = "https" if certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address
         typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")

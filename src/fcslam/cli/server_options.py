@@ -31,7 +31,7 @@ class AccessFlags:
         typer.Option(
             metavar="FOLDER", rich_help_panel=NETWORK,
             help="Folder with the robot's credentials: token, ca.pem (authority that signed the cloud's certificate, "
-            "if it is not one of this system), robot.pem and robot.key (the robot's certificate).",
+            "if it is not one of this system), client.pem and client.key (the robot's certificate).",
         ),
     ] = None  # fmt: skip
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.listening import listen
-from fcslam.cli.options import Force, Quiet
+from fcslam.cli.options import Force
 from fcslam.cli.output import notices
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ LARGEST_BYTES = 2 * 2**30
 """Largest total size of the files of a run folder: the page's server holds most of them in memory."""
 HOST = "127.0.0.1"
 
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")]
 Live = Annotated[bool, typer.Option("--live", help="Show the map on a page while it grows, and after that the run.")]
 
 
@@ -39,7 +38,9 @@ def show(
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the page as one file to send, and serve nothing.")
     ] = None,
-    port: Port = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")
+    ] = 0,
     open_browser: Annotated[
         bool | None,
         typer.Option(
@@ -47,7 +48,6 @@ def show(
         ),
     ] = None,
     force: Force = False,
-    quiet: Quiet = False,
 ) -> None:
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
     from fcslam.errors import OutputError
@@ -55,7 +55,7 @@ def show(
 
     if html is not None and html.exists() and not (force and html.is_file()):
         raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
-    console = notices(quiet)
+    console = notices()
     with _run_folder(run, console) as folder, ShownRun(folder, folder.resolve().name) as shown:
         if html is not None:
             _write_report(shown, html, run)
@@ -115,15 +115,11 @@ def _check_size(run: Path) -> None:
 
 
 @contextmanager
-def live_page(run: Path, port: int) -> "Iterator[LiveMap]":
-    """Serve the page of a run while it is mapped, and in the end until Ctrl-C if there is a terminal for that.
-
-    Raises:
-        ServiceError: the port is in use.
-    """
+def live_page(run: Path) -> "Iterator[LiveMap]":
+    """Serve the page of a run while it is mapped, and in the end until Ctrl-C if there is a terminal for that."""
     from fcslam.page import live_map
 
-    with listen(HOST, port) as listening, live_map.live_page(listening, run.name) as live:
+    with listen(HOST, 0) as listening, live_map.live_page(listening, run.name) as live:
         _announce(f"fcslam shows the map of {run} while it grows", listening, None)
         yield live
         if sys.stdin.isatty():

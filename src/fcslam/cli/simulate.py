@@ -1,4 +1,4 @@
-"""`fcslam simulate`: recordings of a fleet that drives in a simulated building."""
+"""`fcslam tools simulate`: recordings of a fleet that drives in a simulated building."""
 
 import os
 import time
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet, output_option
+from fcslam.cli.mission_options import chosen_settings
+from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
@@ -41,13 +42,6 @@ def simulate(
             show_default="day",
         ),
     ] = None,
-    moved_furniture: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0, max=1.0, show_default="0",
-            help="Share of the furniture, or in a yard of the cars, that moves between drives.",
-        ),
-    ] = None,
     scanner: Annotated[
         Scanner | None,
         typer.Option(
@@ -55,31 +49,24 @@ def simulate(
             show_default="instant",
         ),
     ] = None,
-    turn_rate: Annotated[
-        float | None,
-        typer.Option(min=0.1, max=6.0, help="Rate at which the robots turn, in rad/s.", show_default="0.9"),
-    ] = None,
     odometry: Annotated[
         OdometryKind | None,
         typer.Option(help="Kind of wheel odometry, or what is wrong with it.", show_default="default"),
     ] = None,
     no_camera: NoCamera = False,
     config: Annotated[
-        Path | None,
+        list[str] | None,
         typer.Option(
-            "--config", "-c",
-            help="Settings of the simulation (YAML), such as range, rate and beams of the scanner, or the slope of a "
-            "yard, over those of --scanner; each simulation writes its own to simulation.yaml.",
+            "--config", "-c", metavar="FILE|KEY=VALUE",
+            help="Settings of the simulation (YAML), or one of its keys, such as moved_furniture=0.5, over those of "
+            "--scanner. Can be repeated. Each simulation writes its own to simulation.yaml.",
         ),
     ] = None,
-    bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted simulation in --output with the same settings.")
     ] = False,
-    quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
-    from fcslam.config import load
     from fcslam.errors import OutputError
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.odometry import KINDS
@@ -89,14 +76,12 @@ def simulate(
     if resume and output is None:
         raise OutputError("--resume continues a simulation in its folder; give --output")
     settings = SimulationSettings(lidar=SCANNERS[scanner or Scanner.INSTANT])
-    settings = settings if config is None else load(SimulationSettings, config, over=settings)
+    settings = chosen_settings(settings, config)
     given = {
         "robots": robots,
         "building": building,
         "path_length_m": path_length,
         "lighting": tuple(lighting) if lighting else None,
-        "moved_furniture": moved_furniture,
-        "turn_rate_rad_s": turn_rate,
     }
     settings = settings.model_copy(update={key: value for key, value in given.items() if value is not None})
     if odometry is not None:
@@ -110,13 +95,13 @@ def simulate(
     output = output or new_folder(RECORDINGS)
     prepare_fleet_folder(output, settings, seed, resume)
     try:
-        record_fleet(fleet, output, seed, bag, notices(quiet), resume)
+        record_fleet(fleet, output, seed, notices(), resume)
     except OutputError as error:
         raise OutputError(f"{error}; to continue, repeat the command with --resume --output {output}") from error
 
 
 def record_fleet(
-    fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, console: "Console", resume: bool = False
+    fleet: "SimulatedFleet", output: Path, seed: int, console: "Console", resume: bool = False
 ) -> list[Path]:
     """Write a recording of each robot and the truth into the folder ``output``; returns the recordings.
 
@@ -132,7 +117,6 @@ def record_fleet(
     from fcslam.errors import OutputError
     from fcslam.lab.simulation.ground_truth import write_ground_truth
     from fcslam.lab.simulation.recording import record_robot
-    from fcslam.sources import open_source, write_bag
 
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]
@@ -152,11 +136,6 @@ def record_fleet(
         display.start("writing")
         try:
             write_ground_truth(fleet, output, np.random.default_rng(seed))
-            if bag:
-                for place in recordings:
-                    # A bag is written under a temporary name first, so an existing one is complete.
-                    if not place.with_suffix(".mcap").exists():
-                        write_bag(place.with_suffix(".mcap"), open_source(place).records())
         except OSError as error:
             raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)

@@ -1,16 +1,16 @@
-"""`fcslam learn train`: train a detector on a folder of images."""
+"""`fcslam tools train`: train a detector on a folder of images."""
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.mission_options import SettingsFiles, chosen_settings
+from fcslam.cli.options import output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
 from fcslam.cli.training_options import (
     TRAINING_OUTPUT,
-    Device,
     Quick,
     Start,
     compute_budget,
@@ -37,42 +37,26 @@ def train(
     images: Annotated[list[Path], typer.Argument(help="Folders of images, searched with all their subfolders.")],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
-    encoder: Annotated[
-        str | None,
-        typer.Option(
-            help="Encoder of the network: light, or vgg as in the paper.", show_default="that of the settings"
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Steps of joint training. More steps than before continue a finished run.",
-            show_default="that of the settings",
-        ),
-    ] = None,
+    config: SettingsFiles = None,
     teacher: Annotated[
         Path | None, typer.Option(help="Folder with the keypoints of a teacher network, of tools/teacher_points.py.")
     ] = None,
     start: Start = None,
-    device: Device = "auto",
     quick: Quick = False,
-    quiet: Quiet = False,
 ) -> None:
     """Train a detector of keypoints with 256-bit descriptors on images without labels."""
     from fcslam.cli.progress import ProgressDisplay
 
-    settings = _settings(config, quick, {"encoder": encoder, "steps": steps})
+    settings = _settings(config, quick)
     require_training_libraries()
     from fcslam.learning.artifacts import write_training_artifacts
     from fcslam.learning.stages import train_detector
 
-    console = notices(quiet)
+    console = notices()
     output = output or new_folder(TRAINING)
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {output}") as display:
-        watch, options = _watch(display, console), compute_budget(device, quick)
+        watch, options = _watch(display, console), compute_budget(quick)
         network, found = train_detector(
             images,
             output,
@@ -91,13 +75,10 @@ def train(
     print_line(console, f"{seconds:.0f} s; {images_read} images, {held_out} held out, {found.skipped} left out")
 
 
-def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "TrainingSettings":
-    from fcslam.config import changed, load
+def _settings(chosen: list[str] | None, quick: bool) -> "TrainingSettings":
     from fcslam.learning.settings import TrainingSettings
 
-    base = TrainingSettings() if config is None else load(TrainingSettings, config)
-    changes = (QUICK if quick else {}) | {name: value for name, value in given.items() if value is not None}
-    return changed(base, changes, "the command line")
+    return chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), chosen)
 
 
 def _start_network(

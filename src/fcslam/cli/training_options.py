@@ -19,7 +19,6 @@ Start = Annotated[
         show_default="training on synthetic shapes",
     ),
 ]
-Device = Annotated[str, typer.Option(help="cpu or cuda; auto uses cuda if there is one.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to see that everything works.")]
 
 QUICK_VALIDATION_PAIRS = 2
@@ -35,23 +34,13 @@ def require_training_libraries(*others: str, extra: str = "train") -> None:
         raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
 
 
-def compute_budget(device: str, quick: bool = False) -> "ExecutionOptions":
-    """How to train on ``device``: threads, and how often to validate and log.
-
-    Raises:
-        TrainingError: the device cannot be used.
-    """
+def compute_budget(quick: bool = False) -> "ExecutionOptions":
+    """How to train here: on a GPU if CUDA shows one, the threads, and how often to validate and log."""
     import torch
 
-    from fcslam.errors import TrainingError
     from fcslam.learning.trainer import ExecutionOptions
 
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise TrainingError(f"--device {device}: cannot be used ({error}); give cpu") from error
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
     if quick:
         return ExecutionOptions(

@@ -1,11 +1,10 @@
-"""`fcslam learn vocabulary`: the words that robots and cloud share, and robots send in place of descriptors."""
+"""`fcslam tools vocabulary`: the words that robots and cloud share, and robots send in place of descriptors."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fcslam.cli.options import Quiet
 from fcslam.cli.output import answers, print_line
 
 MOST_WORDS = 4096
@@ -20,7 +19,6 @@ def vocabulary(
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File for the vocabulary.")],
     words: Annotated[int, typer.Option(min=2, max=65536, help="Most words of each channel.")] = MOST_WORDS,
-    quiet: Quiet = False,
 ) -> None:
     """Train the words that robots send in place of descriptors (robot.sends: words)."""
     import numpy as np
@@ -47,9 +45,7 @@ def vocabulary(
         ((version, descriptors),) = by_version.items()
         trained = train_words(channel, version, np.concatenate(descriptors), words, SEED)
         vocabularies.append(trained)
-        if not quiet:
-            count, where = len(trained.centres), f"{len(descriptors)} places of {version}"
-            print_line(answers(), f"{channel}: {count} words from {where}, version {short(trained.digest)}")
+        count, where = len(trained.centres), f"{len(descriptors)} places of {version}"
+        print_line(answers(), f"{channel}: {count} words from {where}, version {short(trained.digest)}")
     write_vocabularies(vocabularies, output)
-    if not quiet:
-        print_line(answers(), f"{output}")
+    print_line(answers(), f"{output}")

@@ -1,11 +1,10 @@
-"""`fcslam setup warm-up`, and how other commands wait for code that is not compiled yet."""
+"""`fcslam tools warm-up`, and how other commands wait for code that is not compiled yet."""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from fcslam.cli.options import Quiet
 from fcslam.cli.output import notices, print_line
 
 if TYPE_CHECKING:
@@ -15,11 +14,11 @@ FIRST_SCANS_S, EVERYTHING_S = 10, 45
 """About what compiling takes on a laptop: what first scans need, in two processes; everything, in one."""
 
 
-def warm_up(*, quiet: Quiet = False) -> None:
+def warm_up() -> None:
     """Compile the code of robots and cloud ahead, on all cores, so that the first run does not have to."""
     from fcslam.service.warmup import WARM_UPS, compiling
 
-    console = notices(quiet)
+    console = notices()
     if tell_uncached(console):
         return
     print_line(console, f"compiling, about {EVERYTHING_S} s on one core")

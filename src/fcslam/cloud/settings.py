@@ -56,7 +56,7 @@ class FleetConfig(Settings):
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     vocabularies: tuple[Path, ...] = Field(
         default=(),
-        description="files of the vocabularies that robots may send words of, as `fcslam learn vocabulary` writes "
+        description="files of the vocabularies that robots may send words of, as `fcslam tools vocabulary` writes "
         "them; others are refused",
     )
     consistency: ConsistencySettings = Field(

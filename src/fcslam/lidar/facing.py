@@ -111,7 +111,8 @@ class Contradiction(NamedTuple):
                 "beams, and that both are of one robot"
             )
         remedy = (
-            "correct the mounting in tf, or give --laser-pose X,Y,THETA[,upside-down], or correct the signs of the "
+            "correct the mounting in tf, or give --sensors laser-pose=X,Y,THETA[,upside-down], or correct the signs of "
+            "the "
             "odometry"
         )
         if upside_down:

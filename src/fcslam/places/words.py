@@ -119,7 +119,7 @@ def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
-            f"{path}: not a readable vocabulary ({reason}); `fcslam learn vocabulary RUN -o FILE` writes one"
+            f"{path}: not a readable vocabulary ({reason}); `fcslam tools vocabulary RUN -o FILE` writes one"
         ) from error
     return found
 

@@ -107,7 +107,7 @@ def _calibrate_facing(
     coarse = BagCorrection(mounting=(x, y, theta), upside_down=upside_down)
     fine = _calibrate_finely(bag.corrected(coarse, ()), config, is_bent)
     x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
-    done = "--laser-pose is kept" if bag.has_given_pose else "corrected"
+    done = "--sensors laser-pose is kept" if bag.has_given_pose else "corrected"
     correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
     return Calibrated(fine.calibration, correction, (f"{found}; {done}", *fine.lines))
 
@@ -216,11 +216,13 @@ def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
     if abs(scale.value + 1.0) < 0.3:
         return (
             "the scans turn against the odometry: the laser is mounted upside down, or the heading of the odometry has "
-            "the wrong sign; not corrected: correct the mounting in tf, or the driver, or give --odom-topic none",
+            "the wrong sign; not corrected: correct the mounting in tf, or the driver, or give --sensors "
+            "odom-topic=none",
         )
     return (
         f"the turns of the scans are {scale.value:.2f} (+- {scale.sigma:.2f}) of what odometry says: they are not of "
-        "one robot, or one of both is broken; not corrected: choose the topics by --scan-topic and --odom-topic, or "
+        "one robot, or one of both is broken; not corrected: choose the topics by --sensors scan-topic and odom-topic, "
+        "or "
         f"{turn_remedy(scale.value, beams)}",
     )
 

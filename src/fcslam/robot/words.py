@@ -52,7 +52,7 @@ class WordsConfig(Settings):
     """The words that robots and cloud share."""
 
     vocabulary: Path | None = Field(
-        default=None, description="file of the vocabularies of all channels, as `fcslam learn vocabulary` writes it"
+        default=None, description="file of the vocabularies of all channels, as `fcslam tools vocabulary` writes it"
     )
 
 
@@ -70,7 +70,7 @@ class SendingConfig(Settings):
     @model_validator(mode="after")
     def _words_need_a_vocabulary(self) -> Self:
         if self.sends is Sends.WORDS and self.words.vocabulary is None:
-            raise ValueError("sends words needs words.vocabulary, a file that `fcslam learn vocabulary` writes")
+            raise ValueError("sends words needs words.vocabulary, a file that `fcslam tools vocabulary` writes")
         return self
 
 
@@ -101,7 +101,7 @@ class WordSender:
                 there = "none" if known is None else f"words of detector {known.detector_version}"
                 raise FeatureError(
                     f"{self._path}: has {there} for {channel} places of detector {version}; write a vocabulary of this "
-                    "detector with `fcslam learn vocabulary`"
+                    "detector with `fcslam tools vocabulary`"
                 )
 
     def convert(self, bodies: Sequence[Body]) -> list[Body]:

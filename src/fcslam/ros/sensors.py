@@ -372,13 +372,14 @@ class LiveSensors:
             if self._topics.odometry is not None:
                 self._notify(
                     f"waits for odometry: {self._topics.odometry} is silent; the driver of the base publishes it; "
-                    "start it, or choose another topic by --odom-topic; --odom-topic none maps without odometry"
+                    "start it, or choose another topic by --sensors odom-topic=TOPIC; odom-topic=none maps without "
+                    "odometry"
                 )
             elif enough:
                 self.is_without_odometry = True
                 self._notify(
                     f"{WITHOUT_ODOMETRY}. To use odometry, start the driver of the base before the robot, or name its "
-                    "topic by --odom-topic"
+                    "topic by --sensors odom-topic"
                 )
         return enough and (self._has_odometry or self.is_without_odometry)
 
@@ -397,7 +398,7 @@ class LiveSensors:
         if len(set(frames)) < len(frames):
             raise NetworkError(
                 f"the scans of {' and '.join(self._topics.scans)} have one frame, so tf cannot say where each laser "
-                "sits; say it by --laser-pose X,Y,THETA for each"
+                "sits; say it by --sensors laser-pose=X,Y,THETA for each"
             )
         mountings = []
         for topic, scan in zip(self._topics.scans, first, strict=True):
@@ -407,7 +408,7 @@ class LiveSensors:
             except TiltedLaserError as error:
                 raise NetworkError(
                     f"the laser of {topic} is {error} and does not look along the floor; choose a level one by "
-                    "--scan-topic, or say its pose by --laser-pose"
+                    "--sensors scan-topic, or say its pose by --sensors laser-pose"
                 ) from error
         return mountings
 
@@ -508,5 +509,5 @@ class LiveSensors:
 def _missing_mounting(error: NoTransformError) -> str:
     return (
         f"waits for tf: it has {error}, so it does not say where a laser sits; start robot_state_publisher or "
-        "static_transform_publisher, or give --laser-pose X,Y,THETA (metres, radians)"
+        "static_transform_publisher, or give --sensors laser-pose=X,Y,THETA (metres, radians)"
     )

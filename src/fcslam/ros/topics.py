@@ -67,7 +67,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     inside = [topic for topic in known if topic.startswith(f"{namespace}/")]
     chosen = _Choice(endpoints, known, namespace)
     notes: list[str] = []
-    scans = [chosen.named(name, "--scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
+    scans = [chosen.named(name, "--sensors scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
     if not scans:
         depths = [
             topic for topic in inside if known[topic] == IMAGE and is_depth(topic) and info_beside(topic) in known
@@ -80,16 +80,16 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
             )
         rank = [*SCANS, IMAGE].index
         scans = [min(candidates, key=lambda topic: (rank(known[topic]), _basename(topic) != "scan", topic))]
-        notes += _note("laser scans", "--scan-topic", scans[0], candidates)
+        notes += _note("laser scans", "--sensors scan-topic", scans[0], candidates)
     odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
     if options.odom_topic == NO_ODOMETRY:
-        notes.append("reads no odometry, as --odom-topic none says")
+        notes.append("reads no odometry, as --sensors odom-topic=none says")
     elif odometry is None:
         candidates = [topic for topic in inside if known[topic] == ODOMETRY and not is_truth(topic)]
         odometry = min(candidates, key=lambda topic: (_basename(topic) != "odom", topic), default=None)
-        notes += _note("odometry", "--odom-topic", odometry, candidates)
+        notes += _note("odometry", "--sensors odom-topic", odometry, candidates)
     else:
-        chosen.named(odometry, "--odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+        chosen.named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
     transforms = _transforms(known, namespace)
     if odometry is not None and known[odometry] != ODOMETRY:
         transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
@@ -136,7 +136,7 @@ def _camera(
     """Topics of images and of their calibration; without a calibration there is no camera."""
     images = [topic for topic in inside if known[topic] in (COMPRESSED_IMAGE, IMAGE)]
     if wanted is not None:
-        images = [chosen.named(wanted, "--camera-topic", COMPRESSED_IMAGE, IMAGE)]
+        images = [chosen.named(wanted, "--sensors camera-topic", COMPRESSED_IMAGE, IMAGE)]
     infos = {topic: info_beside(topic) for topic in images if not is_depth(topic)}
     calibrated = {topic: info for topic, info in infos.items() if known.get(info) == CAMERA_INFO}
     camera = min(calibrated, key=lambda topic: (known[topic] != COMPRESSED_IMAGE, topic), default=None)

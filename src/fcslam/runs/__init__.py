@@ -15,7 +15,7 @@ from fcslam.runs.folder import (
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.separations import Separation, separations
-from fcslam.runs.tables import metrics_json, read_vetoes
+from fcslam.runs.tables import metrics_json
 from fcslam.runs.trajectories import read_tum, write_tum
 
 __all__ = [
@@ -39,7 +39,6 @@ __all__ = [
     "open_run",
     "prepare_output",
     "read_tum",
-    "read_vetoes",
     "separations",
     "write_tum",
 ]

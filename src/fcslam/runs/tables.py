@@ -1,4 +1,4 @@
-"""The tables of a run folder: robots, closures, metrics; and lists of vetoes, which are lines of a closure table."""
+"""The tables of a run folder: robots, closures, metrics."""
 
 import csv
 import io
@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fcslam.errors import ConfigError
-from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, Veto, frozen
+from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTrajectory
 from fcslam.untrusted import read_text
 
@@ -82,33 +81,6 @@ def read_localized(path: Path, within: Path | None = None) -> LocalizedPoses:
     ]
     table: FloatArray = frozen(np.array(rows, dtype=np.float64).reshape(-1, len(_LOCALIZED_COLUMNS)))
     return LocalizedPoses(path.stem, table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7])
-
-
-def read_vetoes(path: Path) -> tuple[Veto, ...]:
-    """Closures that must not count: lines of a run's closures.csv, of which only the two ends are read.
-
-    A line without stamps speaks of every closure between the two robots.
-
-    Raises:
-        ConfigError: the file cannot be read, a column is missing, or a stamp is not a number.
-    """
-    try:
-        return tuple(_read_veto(number, row) for number, row in enumerate(_read_csv(path, _CLOSURE_ENDS), start=2))
-    except (OSError, ValueError, csv.Error) as error:
-        raise ConfigError(f"{path}: no list of vetoes ({error}); copy lines of a run's closures.csv") from error
-
-
-def _read_veto(number: int, row: dict[str, str]) -> Veto:
-    stamps = [row["stamp_i"].strip(), row["stamp_j"].strip()]
-    if not any(stamps):
-        return Veto(row["robot_i"], row["robot_j"])
-    try:
-        stamp_i, stamp_j = map(float, stamps)
-    except ValueError:
-        stamp_i = stamp_j = math.nan
-    if not (math.isfinite(stamp_i) and math.isfinite(stamp_j)):
-        raise ValueError(f"line {number}: two stamps or none are needed, not '{stamps[0]}' and '{stamps[1]}'")
-    return Veto(row["robot_i"], row["robot_j"], (stamp_i, stamp_j))
 
 
 def metrics_json(metrics: Iterable[Metric]) -> str:

@@ -9,7 +9,7 @@ from fcslam.errors import EvaluationError
 from fcslam.service.http.responses import LearningRound
 
 ROUNDS_FILE: Final = "rounds.csv"
-"""In the output folder of `fcslam learn federate`."""
+"""In the output folder of `fcslam tools federate`."""
 MOST_ROUNDS: Final = 10_000
 _LOSS = "loss_"
 _MEASURES = ("repeatability", "mma_3px", "revisit_recall", "places_found")

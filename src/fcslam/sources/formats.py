@@ -146,8 +146,8 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
     kind = format_of(path)
     if (options is not None or robot is not None) and not kind.takes_options:
         raise SourceError(
-            f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
-            "--camera-topic, --laser-pose, a robot after a colon) go with ROS bags only, leave them out"
+            f"{path}: a {kind.name} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
+            "only, leave them out"
         )
     if robot is not None:
         options = replace(options or BagOptions(), robot=robot)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fcslam.errors import InputError
 
-TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "robot.pem", "robot.key"
+TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "client.pem", "client.key"
 """Files in a robot's folder of credentials."""
 
 

@@ -132,7 +132,7 @@ def test_extracted_features_score_as_the_detector_that_runs_here(scenes, tmp_pat
     assert (
         main(
             [
-                "learn",
+                "tools",
                 "extract",
                 str(scene.parent),
                 "-o",

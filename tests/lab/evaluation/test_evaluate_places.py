@@ -94,7 +94,7 @@ def test_geometry_accepts_what_it_should(described):
 def test_extracted_features_are_those_of_the_detector(folders, tmp_path):
     name = folders[0].name
     options = ["--detector", "orb", "--keypoints", "500"]
-    assert main(["learn", "extract", str(folders[0]), "-o", str(tmp_path / name), *options]) == 0
+    assert main(["tools", "extract", str(folders[0]), "-o", str(tmp_path / name), *options]) == 0
     found = describe_images(read_place_set(folders[0]), folders[0], choose_features(str(tmp_path)))
     assert all(len(place.descriptors) for place in (*found.queries, *found.gallery))
     (truth,) = found.place_set.questions.values()

@@ -21,7 +21,8 @@ BLIND = SimulationSettings(
     building=Building.FLAT, robots=1, path_length_m=3.0, camera=None, lidar=LidarSettings(beams=40, rate_hz=10.0)
 )
 SEEING = BLIND.model_copy(update={"camera": CameraSettings(width=64, height=48, rate_hz=4.0)})
-COMMAND = ["simulate", "--building", "flat", "--path-length", "4", "--robots", "2", "--no-camera", "--seed", "2"]
+COMMAND = ["tools", "simulate", "--building", "flat", "--path-length", "4"]
+COMMAND += ["--robots", "2", "--no-camera", "--seed", "2"]
 
 
 def files(folder):
@@ -133,7 +134,7 @@ def test_the_command_goes_on(tmp_path, monkeypatch):
     [
         (["--seed", "3"], "seed was 2 and is now 3"),
         (["--path-length", "5"], "path_length_m was 4.0 and is now 5.0"),
-        (["--moved-furniture", "0.5"], "moved_furniture was 0.0 and is now 0.5"),
+        (["--config", "moved_furniture=0.5"], "moved_furniture was 0.0 and is now 0.5"),
     ],
 )
 def test_other_settings_are_refused(change, words, tmp_path, capsys):

@@ -35,7 +35,7 @@ TINY = {
 
 def start(*words, log):
     """A command that an interrupt ends, even where the tests were started in the background, which ignores them."""
-    command = [sys.executable, "-m", "fcslam.cli", "learn", "federate", *words]
+    command = [sys.executable, "-m", "fcslam.cli", "tools", "federate", *words]
     with log.open("ab") as file:
         return subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=heed_interrupts)  # noqa: PLW1509
 
@@ -62,7 +62,7 @@ def embedded(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", PATH)
         words = ["local", *folders, "-o", str(folder / "out"), "--config", str(folder / "tiny.yaml")]
-        process = start(*words, "--device", "cpu", log=folder / "log")
+        process = start(*words, log=folder / "log")
     assert process.wait(LIMIT_S) == 0, (folder / "log").read_text()
     return folder
 
@@ -78,15 +78,13 @@ class Deployment:
             make_credentials(place, ["127.0.0.1"], robots, datetime.now(UTC))
 
     def server(self):
-        files = {"--tokens": "tokens.yaml", "--tls-certificate": "cloud.pem", "--tls-key": "cloud.key"}
-        words = ["serve", self.where, "-o", str(self.folder / "deployed"), "--device", "cpu"]
-        words += [word for option, file in files.items() for word in (option, str(self.keys / file))]
+        words = ["serve", self.where, "-o", str(self.folder / "deployed"), "--credentials", str(self.keys)]
         return self._started(*words, "--config", str(self._images / "tiny.yaml"), log="server")
 
     def robot(self, name, owner=None, keys=None, log=None):
         log, keys = log or name, keys or self.keys
         words = ["join", f"https://{self.where}", str(self._images / name), "-o", str(self.folder / f"home-{name}")]
-        words += ["--device", "cpu", "--credentials", str(keys / "robots" / (owner or name))]
+        words += ["--credentials", str(keys / "robots" / (owner or name))]
         return self._started(*words, log=log)
 
     def said(self, who):

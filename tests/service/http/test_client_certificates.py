@@ -23,7 +23,7 @@ def pair(folder, name):
 
 
 def own_pair(folder, robot):
-    return pair(folder / "robots" / robot, "robot")
+    return pair(folder / "robots" / robot, "client")
 
 
 @pytest.fixture(scope="module")

@@ -17,13 +17,13 @@ Sets = Annotated[
     typer.Argument(
         metavar="SETS...",
         help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), "
-        "fleets with cameras that fcslam simulate wrote, or recordings of a LiDAR.",
+        "fleets with cameras that fcslam tools simulate wrote, or recordings of a LiDAR.",
     ),
 ]
 Features = Annotated[
     str,
     typer.Option(
-        help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that `fcslam learn "
+        help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that `fcslam tools "
         "extract` wrote, with a subfolder for each set."
     ),
 ]

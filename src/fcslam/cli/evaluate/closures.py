@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from fcslam.cli.evaluate.arguments import Reference, RunFolder
 from fcslam.cli.evaluate.fleet import percent
-from fcslam.cli.options import Csv, Quiet
+from fcslam.cli.options import Csv
 from fcslam.cli.output import answers, notices, print_line
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ def closures(
     reference: Reference,
     *,
     csv: Csv = None,
-    quiet: Quiet = False,
 ) -> None:
     """Measure precision and recall of a run's closures, by stage, against the optimised graph of the relations."""
     from fcslam.cli.progress import ProgressDisplay
@@ -28,7 +27,7 @@ def closures(
     from fcslam.metrics.closures import ClosureCriteria
 
     criteria = ClosureCriteria()
-    with ProgressDisplay(notices(quiet)) as display:
+    with ProgressDisplay(notices()) as display:
         display.start("evaluating")
         report = evaluate_closures(run, reference, criteria)
     _show_closures(report, criteria)

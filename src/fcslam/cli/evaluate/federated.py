@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.mission_options import SettingsFiles, chosen_settings
+from fcslam.cli.options import output_option
 from fcslam.cli.output import EVALUATIONS, answers, new_folder, notices, print_line
-from fcslam.cli.training_options import TRAINING_OUTPUT, Device, compute_budget, require_training_libraries
+from fcslam.cli.training_options import TRAINING_OUTPUT, compute_budget, require_training_libraries
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,13 +22,10 @@ def federated(
     ],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, EVALUATIONS)] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file of the study's settings.")] = None,
-    device: Device = "auto",
-    quiet: Quiet = False,
+    config: SettingsFiles = None,
 ) -> None:
     """Train centrally, federated and on each robot alone, with equal starts and sample counts, and compare."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.config import load
     from fcslam.errors import EvaluationError
 
     require_training_libraries("flwr", extra="federated")
@@ -37,10 +35,10 @@ def federated(
     folders = {folder.resolve().name: folder for folder in robots}
     if len(folders) < max(len(robots), 2):
         raise EvaluationError("at least two robots are needed, in folders of different names")
-    settings = StudySettings() if config is None else load(StudySettings, config)
+    settings = chosen_settings(StudySettings(), config)
     output = output or new_folder(EVALUATIONS)
-    with ProgressDisplay(notices(quiet), f"output: {output}") as display:
-        findings = run_study(Study(folders, output, settings, compute_budget(device), display.show))
+    with ProgressDisplay(notices(), f"output: {output}") as display:
+        findings = run_study(Study(folders, output, settings, compute_budget(), display.show))
     reports = report(findings)
     write_report(reports, output / "report.csv")
     console = answers()

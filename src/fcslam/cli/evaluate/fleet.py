@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.evaluate.arguments import RunFolder
-from fcslam.cli.options import Csv, Quiet
+from fcslam.cli.options import Csv
 from fcslam.cli.output import answers, notices, print_line
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ def fleet(
         Path | None,
         typer.Option(help="PNG file to draw: the robots' maps, matched places, the fused map and the truth."),
     ] = None,
-    quiet: Quiet = False,
 ) -> None:
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from fcslam.cli.progress import ProgressDisplay
@@ -46,7 +45,7 @@ def fleet(
     from fcslam.lab.evaluation.fleet.relations import write_metrics
     from fcslam.lab.evaluation.fleet.report import evaluate_fleet
 
-    with ProgressDisplay(notices(quiet)) as display:
+    with ProgressDisplay(notices()) as display:
         display.start("evaluating")
         report = evaluate_fleet(run, truth)
     show_fleet(report, answers())
@@ -56,7 +55,7 @@ def fleet(
         from fcslam.lab.evaluation.fleet.charts import fleet_charts
         from fcslam.maps.fleet_figure import write_figure
 
-        with ProgressDisplay(notices(quiet)) as display:
+        with ProgressDisplay(notices()) as display:
             display.start("drawing")
             write_figure(fleet_charts(run, truth), figure)
 

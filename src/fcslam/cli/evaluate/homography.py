@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.evaluate.arguments import SEED
-from fcslam.cli.options import Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.metrics.framing import HomographyGroundTruth
@@ -41,7 +40,7 @@ def homography(
     features: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of extracted features, SCENE/1.npz ..., as `fcslam learn extract` writes them, to evaluate "
+            help="Folder of extracted features, SCENE/1.npz ..., as `fcslam tools extract` writes them, to evaluate "
             "instead of detectors or, with --detector, beside them. Can be repeated."
         ),
     ] = None,
@@ -53,7 +52,6 @@ def homography(
     ] = HomographyGroundTruth.CORRECTED,
     csv: Annotated[Path | None, typer.Option(help="Write all measures of all pairs to this CSV file.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Draw matches and curves into this folder.")] = None,
-    quiet: Quiet = False,
 ) -> None:
     """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
     from fcslam.cli.progress import ProgressDisplay
@@ -65,7 +63,7 @@ def homography(
 
     found = find_scenes(scenes)
     detectors = choose_detectors(detector or (), weights or (), features or ())
-    with ProgressDisplay(notices(quiet)) as display:
+    with ProgressDisplay(notices()) as display:
         evaluated = display.start("evaluating", len(found) * len(detectors))
         report = evaluate_homography(found, detectors, ground_truth, evaluated)
         if figures is not None:

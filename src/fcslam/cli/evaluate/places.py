@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.evaluate.arguments import SEED, Features, Label, Sets, TrainOn
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.options import output_option
 from fcslam.cli.output import EVALUATIONS, answers, new_folder, notices, print_line
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ def places(
     verify: Annotated[
         bool, typer.Option("--verify", help="Also verify the geometry of the most similar places.")
     ] = False,
-    quiet: Quiet = False,
 ) -> None:
     """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
     from fcslam.cli.progress import ProgressDisplay
@@ -50,7 +49,7 @@ def places(
 
     strategies = _strategies(strategy or ("static", "windowed", "incremental"))
     output = output or new_folder(EVALUATIONS)
-    with ProgressDisplay(notices(quiet)) as display:
+    with ProgressDisplay(notices()) as display:
         results = _evaluate(sets, features, label or (), train_on or (), strategies, display, verify=verify)
     write_results(output, results)
     save(curves_figure(results), output / "precision_recall.png")

@@ -17,25 +17,18 @@ def quality(
         Path | None,
         typer.Option(help="Folder with the true poses; the cells of the certificate are compared with them."),
     ] = None,
-    bar: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Largest error of a good cell, in metres.", show_default="that of the run"),
-    ] = None,
     csv: Csv = None,
 ) -> None:
     """Print how good the maps of a run are, what to drive again, and with --truth whether that is right."""
     from rich.table import Table
 
-    from fcslam.errors import EvaluationError
     from fcslam.lab.evaluation.fleet.quality import certificates_of, evaluate_quality
     from fcslam.lab.evaluation.fleet.relations import write_metrics
     from fcslam.runs import open_run
 
-    if bar is not None and not 0.0 < bar < float("inf"):
-        raise EvaluationError(f"--bar {bar:g}: no map is that good; give metres above 0, as in 0.05")
     console = answers()
     for k, one in certificates_of(open_run(run), run).items():
-        limit = one["bar"] if bar is None else bar
+        limit = one["bar"]
         good = sum(cell["bound_95"] <= limit for cell in one["cells"])
         print_line(
             console, f"map {k}: {good} of {len(one['cells'])} m2 are good to {limit:g} m within {one['within']:g} m"
@@ -50,7 +43,7 @@ def quality(
             print_line(console, f"map {k}: {drive['text']}")
     if truth is None:
         return
-    metrics = evaluate_quality(run, truth, bar).metrics()
+    metrics = evaluate_quality(run, truth).metrics()
     table = Table("against the truth", "value")
     for metric in metrics:
         table.add_row(metric.name, f"{metric.value:.4g}")

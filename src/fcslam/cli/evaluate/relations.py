@@ -20,14 +20,6 @@ def relations(
     across_robots: Annotated[
         bool, typer.Option("--across-robots", help="Use only relations between stamps of different robots.")
     ] = False,
-    gap_s: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Use only relations between stamps that lie further apart, in seconds.",
-            show_default="20 with --across-robots, else all",
-        ),
-    ] = None,
     parts: Annotated[
         Path | None,
         typer.Option(
@@ -46,7 +38,7 @@ def relations(
         write_metrics,
     )
 
-    errors = evaluate_relations(run, reference, RelationsQuestion(across_robots, gap_s, parts))
+    errors = evaluate_relations(run, reference, RelationsQuestion(across_robots, parts=parts))
     _show_relations(errors, "relations across robots" if across_robots else "relations")
     if csv is not None:
         write_metrics(relation_metrics(errors), csv)

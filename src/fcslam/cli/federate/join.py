@@ -1,13 +1,12 @@
-"""`fcslam learn federate join`: one robot of a fleet on several machines."""
+"""`fcslam tools federate join`: one robot of a fleet on several machines."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fcslam.cli.options import Quiet
 from fcslam.cli.output import notices, print_line
-from fcslam.cli.training_options import Device, compute_budget, require_training_libraries
+from fcslam.cli.training_options import compute_budget, require_training_libraries
 
 
 def join(
@@ -21,7 +20,6 @@ def join(
         str | None,
         typer.Option(help="Name of the robot, as in its token.", show_default="that of the folder of images"),
     ] = None,
-    device: Device = "auto",
     credentials: Annotated[
         Path | None,
         typer.Option(
@@ -29,7 +27,6 @@ def join(
             help="Folder with the robot's credentials: token, and ca.pem if it is needed to trust the server.",
         ),
     ] = None,
-    quiet: Quiet = False,
 ) -> None:
     """Join a fleet as one robot: train on local images whenever the server asks; Ctrl-C stops.
 
@@ -50,7 +47,7 @@ def join(
         check_name(robot, "robot")
     except PacketError as error:
         raise TrainingError(f"{error}; give another --name") from error
-    console, printed = notices(quiet), set[str]()
+    console, printed = notices(), set[str]()
 
     def print_once(line: str) -> None:
         if line not in printed:
@@ -59,5 +56,5 @@ def join(
 
     found = Credentials() if credentials is None else read_credentials(credentials)
     link = RobotLink(server, robot, found.token, found.ca)
-    client = RobotClient(robot, images, output / "labels", secret_noise, compute_budget(device).device)
+    client = RobotClient(robot, images, output / "labels", secret_noise, compute_budget().device)
     launch.join(link, client, print_once)

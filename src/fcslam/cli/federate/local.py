@@ -1,4 +1,4 @@
-"""`fcslam learn federate local`: a whole fleet in one process."""
+"""`fcslam tools federate local`: a whole fleet in one process."""
 
 import time
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from fcslam.cli.federate.options import RoundFlags
 from fcslam.cli.federate.rounds import show_rounds
 from fcslam.cli.groups import with_groups
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.options import output_option
 from fcslam.cli.output import TRAINING, notices, print_line
 from fcslam.cli.training_options import TRAINING_OUTPUT, require_training_libraries
 
@@ -22,7 +22,6 @@ def local(
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
     rounds: RoundFlags,
-    quiet: Quiet = False,
 ) -> None:
     """Train one detector on the images of several robots, simulated in this process.
 
@@ -34,7 +33,7 @@ def local(
     require_training_libraries("flwr", extra="federated")
     from fcslam.learning.federated.local import federate_locally
 
-    console = notices(quiet)
+    console = notices()
     job = rounds.job(output, settings)
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {job.output}") as display:

@@ -1,4 +1,4 @@
-"""`fcslam learn federate serve`: the server of a fleet on several machines."""
+"""`fcslam tools federate serve`: the server of a fleet on several machines."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,12 +8,11 @@ import typer
 from fcslam.cli.federate.options import RoundFlags, parse_address
 from fcslam.cli.federate.rounds import show_rounds
 from fcslam.cli.groups import with_groups
-from fcslam.cli.listening import check_tls, listen
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.listening import Credentials, check_tls, find_files, listen
+from fcslam.cli.options import output_option
 from fcslam.cli.output import TRAINING, notices, print_line
 from fcslam.cli.training_options import TRAINING_OUTPUT, require_training_libraries
 
-_TLS = "TLS"
 MAX_LINES = 1000
 """Different notices that are printed, so that nobody on the network can fill a log."""
 
@@ -24,25 +23,15 @@ def serve(
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
     rounds: RoundFlags,
-    tokens: Annotated[
-        Path | None,
-        typer.Option(help="File of the robots' tokens; `fcslam setup certificates` makes one.", rich_help_panel=_TLS),
-    ] = None,
-    tls_certificate: Annotated[
-        Path | None, typer.Option(help="Certificate of this machine (PEM).", rich_help_panel=_TLS)
-    ] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(help="Private key of --tls-certificate (PEM).", rich_help_panel=_TLS)
-    ] = None,
+    credentials: Credentials = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Use neither encryption nor authentication.", rich_help_panel=_TLS)
+        bool,
+        typer.Option("--insecure", help="Use neither encryption nor authentication.", rich_help_panel="Credentials"),
     ] = False,
-    quiet: Quiet = False,
 ) -> None:
     """Run the server of a fleet: wait for robots at HOST:PORT and train one detector with them.
 
-    Give --tokens, --tls-certificate and --tls-key, which `fcslam setup certificates` makes. Give --insecure only in a
-    network that nobody else can reach.
+    Give --credentials with tokens and a certificate. Give --insecure only in a network that nobody else can reach.
     """
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import ServiceError
@@ -52,13 +41,16 @@ def serve(
     from fcslam.learning.federated import launch
     from fcslam.service.http.authentication import Authenticator, read_tokens
 
-    tls = None if tls_certificate is None or tls_key is None else (tls_certificate, tls_key)
+    tokens, certificate, key = find_files(credentials)
+    tls = None if certificate is None or key is None else (certificate, key)
     if insecure == (tokens is not None and tls is not None):
-        raise ServiceError("give --tokens, --tls-certificate and --tls-key, or --insecure in a network of your own")
-    check_tls(tls_certificate, tls_key)
+        raise ServiceError(
+            "give --credentials with tokens.yaml, cloud.pem and cloud.key, or --insecure in a network of your own"
+        )
+    check_tls(certificate, key)
     host, port = parse_address(address)
     options = rounds.compute_budget()
-    console, printed = notices(quiet), set[str]()
+    console, printed = notices(), set[str]()
 
     def print_once(line: str) -> None:
         if line not in printed and len(printed) < MAX_LINES:

@@ -30,7 +30,7 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int, 
     Raises:
         OutputError: the folder holds something else, or cannot be written.
     """
-    text = f"# What `fcslam simulate` recorded here.\nfcslam: {fcslam.__version__}\nseed: {seed}\n{dump(settings)}"
+    text = f"# What fcslam simulated here.\nfcslam: {fcslam.__version__}\nseed: {seed}\n{dump(settings)}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / SETTINGS).is_file() and resume:

@@ -219,7 +219,7 @@ def _only_robot(bag: CountedBag, members: Sequence[_Member], options: BagOptions
         apart = []
     notes = tuple(
         f"{bag.path}: {topic.name} is not used, as its namespace or frames are not those of the laser, "
-        f"'{one_line(member.frame)}' (--odom-topic chooses)"
+        f"'{one_line(member.frame)}' (--sensors odom-topic chooses)"
         for topic in apart
     )
     topics = tuple(topic for topic in bag.topics if topic not in apart)

@@ -49,7 +49,7 @@ _EACH_LASER = "give one for each laser, in the same order"
 _MOST_JUMPS = 0.2
 """Share of the readings of odometry at which it may jump."""
 _OF_SCANS = "its range_min and range_max"
-_OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --cloud-band"
+_OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --sensors cloud-band"
 
 
 class _Reading(NamedTuple):
@@ -215,9 +215,11 @@ class RosBag:
         topics, poses = self._options.scan_topics, self._options.laser_poses
         for topic in topics:
             if topics.count(topic) > 1:
-                raise SourceError(f"{path}: --scan-topic {topic} is given twice; give each laser's topic once")
+                raise SourceError(f"{path}: --sensors scan-topic={topic} is given twice; give each laser's topic once")
         if poses and topics and len(poses) < len(topics):
-            raise SourceError(f"{path}: {len(poses)} --laser-pose for {len(topics)} --scan-topic; {_EACH_LASER}")
+            raise SourceError(
+                f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {_EACH_LASER}"
+            )
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
@@ -233,7 +235,7 @@ class RosBag:
         if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
             raise SourceError(
                 f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as that of two publishers or in "
-                "another unit; choose another one by --odom-topic, or none to map without"
+                "another unit; choose another one by --sensors odom-topic, or none to map without"
             )
 
     def _first_errors(self) -> str:
@@ -245,7 +247,7 @@ class RosBag:
         lasers, poses = self.stream.lasers, self._options.laser_poses
         if poses and len(poses) != len(lasers):
             named = ", ".join(laser.name for laser in lasers)
-            raise SourceError(f"{self.stream.path}: {len(poses)} --laser-pose for the lasers {named}; {_EACH_LASER}")
+            raise SourceError(f"{self.stream.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
         if poses:
             return [given_mounting(pose, laser.topic.type) for pose, laser in zip(poses, lasers, strict=True)]
         topic_of: dict[str, str] = {}
@@ -254,7 +256,8 @@ class RosBag:
             if other != laser.topic.name:
                 raise SourceError(
                     f"{self.stream.path}: the scans of {other} and {laser.topic.name} have one frame, "
-                    f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --laser-pose X,Y,THETA "
+                    f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --sensors "
+                    "laser-pose=X,Y,THETA "
                     "for each"
                 )
         return [self._mounting(laser, tree, base_frame) for laser in lasers]
@@ -306,13 +309,13 @@ class RosBag:
             raise SourceError(
                 f"{self.stream.path}: tf has {error}{self._first_errors()}, so it does not say where the laser of "
                 f"{topic} sits; say it by "
-                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
+                f"--sensors laser-pose=X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
                 "if it is in another part of this recording, give both joined by a comma"
             ) from error
         except TiltedLaserError as error:
             raise SourceError(
                 f"{self.stream.path}: the laser of {topic} is {error} and does not look along the floor; choose a "
-                "level one by --scan-topic, or say its pose by --laser-pose"
+                "level one by --sensors scan-topic, or say its pose by --sensors laser-pose"
             ) from error
 
     def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:

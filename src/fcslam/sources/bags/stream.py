@@ -80,7 +80,7 @@ class RecordedLaser(NamedTuple):
         if self.topic.type not in LASER_SCANS:
             yield (
                 f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
-                "above the floor (--cloud-band chooses)"
+                "above the floor (--sensors cloud-band chooses)"
             )
         if self.topic.type in SCANS and self.topic.type not in LASER_SCANS and self.first.sweep is None:
             yield (
@@ -396,7 +396,7 @@ class BagStream:
             known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in self.tree.links)
             raise SourceError(
                 f"{self.path}: tf has no transform from {options.odom_frame or 'a frame'} to "
-                f"{options.base_frame or 'a frame above the laser'}; give others by --odom-frame and --base-frame; "
+                f"{options.base_frame or 'a frame above the laser'}; give --sensors odom-frame and base-frame; "
                 f"tf has {known or 'no transforms'}"
             )
 
@@ -414,7 +414,7 @@ class BagStream:
             return chosen
         raise SourceError(
             f"{self.path}: {topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one the "
-            "laser is on; choose one by --base-frame"
+            "laser is on; choose one by --sensors base-frame"
         )
 
     def _poses_of(self, odometry: "OdometryInput") -> Iterator[Pose]:
@@ -463,7 +463,7 @@ class BagStream:
         except NoTransformError as error:
             raise SourceError(
                 f"{self.path}: tf has {error}, so it does not say where the sensor of {topic.name} sits; say it by "
-                "--laser-pose X,Y,THETA (metres, radians)"
+                "--sensors laser-pose=X,Y,THETA (metres, radians)"
             ) from error
 
     def _levelled(self, topic: Topic, frame: str, mounting: CloudMounting) -> CloudMounting:

@@ -25,9 +25,9 @@ from fcslam.sources.bags.transforms import last_part
 
 _NAMED_AT_MOST = 15
 _NEEDED = {
-    "--scan-topic": f"{SCAN}, {POINT_CLOUD} or a depth image",
-    "--odom-topic": f"{ODOMETRY}, or tf",
-    "--camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
+    "--sensors scan-topic": f"{SCAN}, {POINT_CLOUD} or a depth image",
+    "--sensors odom-topic": f"{ODOMETRY}, or tf",
+    "--sensors camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
 }
 _SAME_VIEW_RAD = 0.1
 """Fields of view that differ by less are equally wide."""
@@ -91,7 +91,9 @@ def choose_topics(
             f"{_known(robot.topics)}"
         )
     readable = [*scans, *_images(robot)]
-    lasers = [topic for name in options.scan_topics for topic in _candidates(robot, readable, name, "--scan-topic")]
+    lasers = [
+        topic for name in options.scan_topics for topic in _candidates(robot, readable, name, "--sensors scan-topic")
+    ]
     if not lasers:
         preferred = _preferred(scans)
         lasers = [_best_scan(preferred, [_views_rad(preferred, field_of_view_rad)])]
@@ -99,16 +101,16 @@ def choose_topics(
     able = [*_measured(robot), *transforms]
     if wanted is not None:
         able = [topic for topic in heard if topic.type == ODOMETRY or is_transforms(topic)]
-    odometries = [] if wanted == NO_ODOMETRY else _candidates(robot, able, wanted, "--odom-topic")
+    odometries = [] if wanted == NO_ODOMETRY else _candidates(robot, able, wanted, "--sensors odom-topic")
     camera, camera_info, camera_notes = _choose_camera(robot, options.camera_topic, has_images)
     notes = [*camera_notes]
     if not options.scan_topics:
-        notes = [*_note(robot, "laser scans", "--scan-topic", lasers[0], scans), *camera_notes]
+        notes = [*_note(robot, "laser scans", "--sensors scan-topic", lasers[0], scans), *camera_notes]
     measured = [topic for topic in odometries if topic.type == ODOMETRY]
     if not measured:
         return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
     odometry = _best_odometry(measured)
-    notes += _note(robot, "odometry", "--odom-topic", odometry, measured)
+    notes += _note(robot, "odometry", "--sensors odom-topic", odometry, measured)
     return Topics(tuple(lasers), (odometry,), transforms, camera, camera_info, tuple(notes))
 
 
@@ -141,15 +143,15 @@ def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[Ba
     if scans and not options.scan_topics:
         scan = _best_scan(scans, [bag.views_rad for bag in bags])
         options = replace(options, scan_topics=(scan.name,))
-        notes += _fleet_note("laser scans", "--scan-topic", scan, [bag.scans for bag in bags])
+        notes += _fleet_note("laser scans", "--sensors scan-topic", scan, [bag.scans for bag in bags])
     if measured and options.odom_topic is None:
         odometry = _best_odometry(measured)
         options = replace(options, odom_topic=odometry.name)
-        notes += _fleet_note("odometry", "--odom-topic", odometry, [bag.measured for bag in bags])
+        notes += _fleet_note("odometry", "--sensors odom-topic", odometry, [bag.measured for bag in bags])
     if cameras and options.camera_topic is None:
         camera = min(cameras, key=_camera_rank)
         options = replace(options, camera_topic=camera.name)
-        notes += _fleet_note("images", "--camera-topic", camera, [bag.cameras for bag in bags])
+        notes += _fleet_note("images", "--sensors camera-topic", camera, [bag.cameras for bag in bags])
     return options, tuple(notes)
 
 
@@ -215,7 +217,7 @@ def _choose_camera(
 ) -> tuple[Topic | None, Topic | None, list[str]]:
     """Topics of images and of their calibration, and notes about the choice."""
     images = _images(robot)
-    cameras = [topic for topic in _candidates(robot, images, wanted, "--camera-topic") if has_images(topic)]
+    cameras = [topic for topic in _candidates(robot, images, wanted, "--sensors camera-topic") if has_images(topic)]
     if not cameras:
         names = ", ".join(topic.name for topic in images)
         return (
@@ -231,7 +233,7 @@ def _choose_camera(
             None,
             [f"{robot.bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"],
         )
-    return chosen, info_of[chosen], _note(robot, "images", "--camera-topic", chosen, cameras)
+    return chosen, info_of[chosen], _note(robot, "images", "--sensors camera-topic", chosen, cameras)
 
 
 def _images(robot: BagRobot) -> list[Topic]:

@@ -36,23 +36,20 @@ class Judged(NamedTuple):
         ]
 
 
-def evaluate_quality(folder: Path, truth: Path, bar_m: float | None = None) -> Judged:
+def evaluate_quality(folder: Path, truth: Path) -> Judged:
     """Compare the certificate of a run folder with true poses.
 
     Args:
         folder: the run folder.
         truth: folder with the truth, as in ``known_poses``.
-        bar_m: judge by another bar than that of the certificate.
 
     Raises:
-        EvaluationError: there is no certificate, the bar is not above 0, or the truth cannot be used.
+        EvaluationError: there is no certificate, or the truth cannot be used.
     """
-    if bar_m is not None and not 0.0 < bar_m < np.inf:
-        raise EvaluationError(f"a bar of {bar_m:g} m: no map is that good; give one above 0, as in --bar 0.05")
     run = open_run(folder)
     known = known_poses(run, truth)
     found = [
-        judge(one, known.estimate.T_map_base[rows], known.truth.T_map_base[rows], bar_m)
+        judge(one, known.estimate.T_map_base[rows], known.truth.T_map_base[rows])
         for k, one in certificates_of(run, folder).items()
         if (rows := known.estimate.maps == k).any()
     ]
@@ -77,7 +74,7 @@ def certificates_of(run: Run, folder: Path) -> dict[int, dict[str, Any]]:
         raise EvaluationError(f"{folder}: {QUALITY}.json is broken ({error})") from error
 
 
-def judge(certificate: dict[str, Any], estimate: FloatArray, truth: FloatArray, bar_m: float | None = None) -> Judged:
+def judge(certificate: dict[str, Any], estimate: FloatArray, truth: FloatArray) -> Judged:
     """The cells of one map, given estimated and true poses (N, 3) of its robots, row by row."""
     squares = np.floor(estimate[:, :2] / CELL_M).astype(np.int64)
     kept = np.unique(squares, axis=0, return_index=True)[1]
@@ -90,4 +87,4 @@ def judge(certificate: dict[str, Any], estimate: FloatArray, truth: FloatArray, 
     centres = np.array([(cell["x"], cell["y"]) for cell in certificate["cells"]]).reshape(-1, 2)
     nearest = tree.query(centres)[1] if len(centres) else np.zeros(0, np.int64)
     bound_m = np.array([cell["bound_95"] for cell in certificate["cells"]])
-    return Judged(bound_m, error_m[nearest], certificate["bar"] if bar_m is None else bar_m)
+    return Judged(bound_m, error_m[nearest], certificate["bar"])

@@ -24,17 +24,13 @@ class RelationsQuestion:
 
     across_robots: bool = False
     """Only relations whose stamps belong to different robots."""
-    minimum_gap_s: float | None = None
-    """Only relations whose stamps are further apart; None: 20 s across robots, no limit otherwise."""
     parts: Path | None = None
     """Run folder that assigns stamps to robots, if not the evaluated one. It lets you evaluate a run of one robot with
     the same relations as a run of several robots from the same recording."""
 
     @property
     def gap_s(self) -> float:
-        """The effective minimum gap."""
-        if self.minimum_gap_s is not None:
-            return self.minimum_gap_s
+        """Smallest time between the stamps of a relation that counts."""
         return ACROSS_ROBOTS_GAP_S if self.across_robots else 0.0
 
 

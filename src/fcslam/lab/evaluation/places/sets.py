@@ -9,7 +9,7 @@ The files in a folder decide how it is read:
   images of it at both ends are ignored, all others are different.
 - ``associations.txt`` and ``groundtruth.txt``: a TUM RGB-D sequence (Sturm et al. 2012), online. A match is an overlap
   of the views by depth and pose of more than 0.5, different is less than 0.1.
-- ``simulation.yaml``: a fleet that ``fcslam simulate`` recorded with cameras. Each robot's images, a metre or half a
+- ``simulation.yaml``: a fleet with cameras of ``fcslam tools simulate``. Each robot's images, a metre or half a
   radian apart, are queries for those of the robots before it. Overlap is that of the walls that the LiDARs met in the
   cameras' views. The limits are those of TUM's sequences.
 - ``matches.csv`` (query, gallery, relation) with folders ``queries`` and ``gallery``: relation is ``match`` or

@@ -1,30 +1,29 @@
-"""`fcslam convert`: write a recording in another format."""
+"""`fcslam record`: write the sensors of a live robot, or of another recording, into a file."""
 
 import re
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Event, Timer
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.groups import with_groups
+from fcslam.cli.live import is_live, named_address
 from fcslam.cli.options import Force, Quiet
 from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.recordings import (
-    BagFlags,
-    open_recording,
-    print_faults,
-    print_notes,
-)
+from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
+from fcslam.cli.ros_options import stopping
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.records import LaserScan, SensorRecord
-    from fcslam.sources import Source, Survey
+    from fcslam.sources import BagOptions, Source, Survey
 
 _CARMEN = re.compile(r"\.(clf|log)(\.(gz|xz|bz2))?$")
 _RECORDING = ".fcslam"
@@ -32,25 +31,76 @@ _FOLDER_MARKS = {"": "metadata.yaml", _RECORDING: "meta.yaml"}
 """The file that marks a folder as a recording, which ``--force`` may replace; by suffix of the folder."""
 
 
-@with_groups
-def convert(
-    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Recording to read.")],
-    output: Annotated[
-        Path,
+def record(
+    source: Annotated[
+        str,
         typer.Argument(
-            metavar="OUTPUT",
-            help="File to write. Its suffix chooses the format: .clf or .log (and .gz, .xz, .bz2) a CARMEN log, .bag a "
-            "ROS 1 bag, .mcap or .db3 a ROS 2 bag, no suffix a ROS 2 bag folder, .fcslam a recording folder.",
+            metavar="ADDRESS|LOG",
+            help="A live robot: ros2:/NAMESPACE, zenoh:/NAMESPACE or ros1:/NAMESPACE; ros2:/ has none. Or a recording, "
+            "to write it in another format.",
         ),
     ],
     *,
-    bags: BagFlags,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FILE",
+            help="File to write. A live robot: .mcap from ROS 2, .bag from ROS 1. A recording: .clf or .log (and .gz, "
+            ".xz, .bz2) a CARMEN log, .bag a ROS 1 bag, .mcap or .db3 a ROS 2 bag, no suffix a ROS 2 bag folder, "
+            ".fcslam a recording folder.",
+        ),
+    ],
+    duration: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Time to record a live robot, in seconds.", show_default="until Ctrl-C"),
+    ] = None,
+    sensors: Sensors = None,
     force: Force = False,
     quiet: Quiet = False,
+) -> None:  # fmt: skip
+    """Record the sensors of a live robot: everything that `fcslam map` needs. Or convert a recording."""
+    console, options = notices(quiet), bag_options(sensors)
+    if is_live(source):
+        _record(source, output, duration, options, force, console)
+    else:
+        _convert(source, output, options, force, console)
+
+
+def _record(
+    address: str, output: Path, duration: float | None, options: "BagOptions | None", force: bool, console: "Console"
 ) -> None:
-    """Write the scans, odometry and images of a recording in another format."""
-    console = notices(quiet)
-    source = open_recording(recording, bags.options())
+    from fcslam.errors import OutputError
+    from fcslam.ros.addresses import open_network
+    from fcslam.ros.node import await_sensors
+    from fcslam.ros.parameters import NodeParameters
+    from fcslam.ros.record import record as record_messages
+    from fcslam.sources import BagOptions
+
+    _, place = named_address(address)
+    suffix = ".bag" if place.network == "ros1" else ".mcap"
+    if output.suffix != suffix:
+        raise OutputError(f"{output}: a recording of {place.network} is a {suffix} file; choose such a name")
+    _prepare(output, force)
+    stop = Event()
+    with closing(open_network(place)) as network:
+        found = await_sensors(network, place.namespace, options or BagOptions(), NodeParameters().topic_timeout)
+        print_line(console, f"records {', '.join(found.kinds)}; Ctrl-C ends the recording")
+        timer = Timer(duration or 0.0, stop.set)
+        timer.daemon = True
+        with stopping(stop.set):
+            if duration is not None:
+                timer.start()
+            counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
+        timer.cancel()
+    print_line(answers(), f"{_listed(counts)}: {output}")
+
+
+def _listed(counts: Counter[str]) -> str:
+    return ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"
+
+
+def _convert(log: str, output: Path, options: "BagOptions | None", force: bool, console: "Console") -> None:
+    source = open_recording(log, options)
     _prepare(output, force)
     survey = source.survey()
     print_notes(console, survey.notes)
