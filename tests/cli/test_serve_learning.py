@@ -6,11 +6,11 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import main
-from fcslam.cli.learning_options import LearningFlags
-from fcslam.cli.server_options import ServerFlags
+from fcslam.cli.learning_options import learning_plan
 from fcslam.errors import InputError
 from fcslam.records import Channel
 from fcslam.robot.frontend import RobotConfig
+from fcslam.wire.http_transport import Server
 
 
 @pytest.mark.parametrize(
@@ -32,16 +32,14 @@ def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeyp
     assert not (tmp_path / "data").exists()
 
 
-def plan(tmp_path, config=None, learn=True):
-    (tmp_path / "token").write_text("secret\n")
-    server = ServerFlags("http://localhost:8340,http://192.0.2.1:8340", tmp_path)
-    return LearningFlags(learn).plan(config or RobotConfig(), server, tmp_path)
+def plan(tmp_path, config=None):
+    server = Server("http://localhost:8340,http://192.0.2.1:8340")
+    return learning_plan(config or RobotConfig(), server, tmp_path, tmp_path)
 
 
 def test_a_robot_learns_at_the_service_that_maps_it(tmp_path):
     found = plan(tmp_path)
     assert (found.server, found.credentials, found.state) == ("http://localhost:8340", tmp_path, tmp_path)
-    assert plan(tmp_path, learn=False) is None
 
 
 def test_a_robot_without_a_camera_cannot_learn(tmp_path):
@@ -52,4 +50,4 @@ def test_a_robot_without_a_camera_cannot_learn(tmp_path):
 @pytest.mark.parametrize(("server", "has_state"), [(None, True), ("http://localhost:8340", False)])
 def test_a_live_robot_learns_with_a_service_and_a_state_folder(server, has_state, tmp_path):
     with pytest.raises(InputError, match="give --server and --state"):
-        LearningFlags(True).plan(RobotConfig(), ServerFlags(server), tmp_path if has_state else None)
+        learning_plan(RobotConfig(), server and Server(server), None, tmp_path if has_state else None)

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.groups import with_groups
 from fcslam.cli.live import is_live
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
-from fcslam.cli.ros_options import RosFlags
-from fcslam.cli.server_options import AccessFlags
+from fcslam.cli.ros_options import RosParameters, UseSimTime, node_parameters
+from fcslam.cli.server_options import Credentials, ServerUrl, access
 from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from fcslam.wire.http_transport import Server
 
 
-@with_groups
 def localize(
     source: Annotated[
         str,
@@ -67,9 +65,11 @@ def localize(
         ),
     ] = False,
     config: ConfigFiles = None,
-    access: AccessFlags,
+    server: ServerUrl = None,
+    credentials: Credentials = None,
     sensors: Sensors = None,
-    ros: RosFlags,
+    ros_parameters: RosParameters = None,
+    use_sim_time: UseSimTime = False,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -85,12 +85,12 @@ def localize(
 
     settings, console = mission_config(config), notices(quiet)
     initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
-    server, live = access.access(), is_live(source)
+    cloud, live = access(server, credentials), is_live(source)
     if live and update:
         raise InputError("--update draws what a recording saw; record the drive, and localise the recording")
-    if server is not None:
+    if cloud is not None:
         keep_private()
-        _fetch(map_path, server, console)
+        _fetch(map_path, cloud, console)
     if live:
         from fcslam.cli.live import drive_live, named_address
         from fcslam.live.localized_robot import LocalizedRobot
@@ -98,7 +98,15 @@ def localize(
 
         name, place = named_address(source)
         start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
-        drive_live(name, place, start, bag_options(sensors) or BagOptions(), ros.parameters(), output, console)
+        drive_live(
+            name,
+            place,
+            start,
+            bag_options(sensors) or BagOptions(),
+            node_parameters(ros_parameters, use_sim_time),
+            output,
+            console,
+        )
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.groups import with_groups
-from fcslam.cli.learning_options import LearningFlags
+from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.live import is_live
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
-from fcslam.cli.server_options import Floor, ServerFlags
+from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
 from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from fcslam.sources import Source, Survey
 
 
-@with_groups
 def play(
     recording: Annotated[
         str,
@@ -40,7 +38,9 @@ def play(
         ),
     ],
     *,
-    server: ServerFlags,
+    server: ServerUrl = None,
+    credentials: Credentials = None,
+    budget_kbps: Budget = None,
     state: Annotated[
         Path,
         typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
@@ -57,7 +57,7 @@ def play(
     floor: Floor = "",
     config: ConfigFiles = None,
     sensors: Sensors = None,
-    learning: LearningFlags,
+    learn: Learn = False,
     quiet: Quiet = False,
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
@@ -70,7 +70,7 @@ def play(
     keep_private()
     if is_live(recording):
         raise InputError(f"{recording}: is a live robot; `fcslam robot {recording}` maps it")
-    settings, cloud = mission_config(config), server.access()
+    settings, cloud = mission_config(config), access(server, credentials, budget_kbps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = _speed(speed)
@@ -79,11 +79,11 @@ def play(
     survey = opened.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
-    plan = learning.plan(settings.robot, server, state)
+    plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kbps, floor)
     live = Robot(
         opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor,
-        wiring=Wiring(playback=Playback(fingerprint, resume), keeps_keyframes=learning.learn),
+        wiring=Wiring(playback=Playback(fingerprint, resume), keeps_keyframes=learn),
     )  # fmt: skip
     with closing(live):
         _play(live, opened, survey.scan_count, pace, plan, state, console)

@@ -6,14 +6,13 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.groups import with_groups
-from fcslam.cli.learning_options import LearningFlags
+from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices
 from fcslam.cli.recordings import Sensors, bag_options
-from fcslam.cli.ros_options import RosFlags
-from fcslam.cli.server_options import NETWORK, Floor, ServerFlags
+from fcslam.cli.ros_options import RosParameters, UseSimTime, node_parameters
+from fcslam.cli.server_options import NETWORK, Budget, Credentials, Floor, ServerUrl, access
 
 
 def _explain_traffic(wanted: bool) -> None:
@@ -38,7 +37,6 @@ def _explain_traffic(wanted: bool) -> None:
     raise typer.Exit
 
 
-@with_groups
 def robot(
     address: Annotated[
         str,
@@ -49,7 +47,9 @@ def robot(
         ),
     ],
     *,
-    server: ServerFlags,
+    server: ServerUrl = None,
+    credentials: Credentials = None,
+    budget_kbps: Budget = None,
     state: Annotated[
         Path | None,
         typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
@@ -58,8 +58,9 @@ def robot(
     floor: Floor = "",
     config: ConfigFiles = None,
     sensors: Sensors = None,
-    ros: RosFlags,
-    learning: LearningFlags,
+    ros_parameters: RosParameters = None,
+    use_sim_time: UseSimTime = False,
+    learn: Learn = False,
     quiet: Quiet = False,
     _explain: Annotated[
         bool,
@@ -87,14 +88,23 @@ def robot(
             "service"
         )
     name, place = named_address(address)
-    settings = mission_config(config)
+    settings, cloud = mission_config(config), access(server, credentials, budget_kbps)
     start = partial(
         Robot,
-        server=server.access(),
+        server=cloud,
         state=state,
         config=settings,
         floor=floor,
-        wiring=Wiring(keeps_keyframes=learning.learn),
+        wiring=Wiring(keeps_keyframes=learn),
     )
-    plan = learning.plan(settings.robot, server, state)
-    drive_live(name, place, start, bag_options(sensors) or BagOptions(), ros.parameters(), output, notices(quiet), plan)
+    plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
+    drive_live(
+        name,
+        place,
+        start,
+        bag_options(sensors) or BagOptions(),
+        node_parameters(ros_parameters, use_sim_time),
+        output,
+        notices(quiet),
+        plan,
+    )

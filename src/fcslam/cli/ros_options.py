@@ -4,7 +4,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,31 +15,29 @@ if TYPE_CHECKING:
 _ROS = "ROS networks"
 
 
-@dataclass(frozen=True)
-class RosFlags:
-    """The parameters of the node of a live robot."""
+RosParameters = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        rich_help_panel=_ROS,
+        help="Parameters (YAML), as of a ROS 2 node; those of slam_toolbox that mean the same have its names.",
+    ),
+]
+UseSimTime = Annotated[
+    bool, typer.Option("--use-sim-time", help="Time is what /clock says, as in a simulator.", rich_help_panel=_ROS)
+]
 
-    ros_parameters: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", rich_help_panel=_ROS,
-            help="Parameters (YAML), as of a ROS 2 node; those of slam_toolbox that mean the same have its names.",
-        ),
-    ] = None  # fmt: skip
-    use_sim_time: Annotated[
-        bool, typer.Option("--use-sim-time", help="Time is what /clock says, as in a simulator.", rich_help_panel=_ROS)
-    ] = False
 
-    def parameters(self) -> "NodeParameters":
-        """The parameters in the file, or the default ones, with the changes of the command line.
+def node_parameters(file: Path | None, use_sim_time: bool) -> "NodeParameters":
+    """The parameters in the file, or the default ones, with the changes of the command line.
 
-        Raises:
-            ConfigError: the file cannot be read, or a parameter is unknown or out of range.
-        """
-        from fcslam.ros.parameters import load_parameters
+    Raises:
+        ConfigError: the file cannot be read, or a parameter is unknown or out of range.
+    """
+    from fcslam.ros.parameters import load_parameters
 
-        parameters = load_parameters(self.ros_parameters)
-        return parameters.model_copy(update={"use_sim_time": True}) if self.use_sim_time else parameters
+    parameters = load_parameters(file)
+    return parameters.model_copy(update={"use_sim_time": True}) if use_sim_time else parameters
 
 
 @contextmanager

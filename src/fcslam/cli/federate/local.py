@@ -6,22 +6,24 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.federate.options import RoundFlags
+from fcslam.cli.federate.options import Public, round_settings
 from fcslam.cli.federate.rounds import show_rounds
-from fcslam.cli.groups import with_groups
+from fcslam.cli.mission_options import SettingsFiles
 from fcslam.cli.options import output_option
-from fcslam.cli.output import TRAINING, notices, print_line
-from fcslam.cli.training_options import TRAINING_OUTPUT, require_training_libraries
+from fcslam.cli.output import TRAINING, new_folder, notices, print_line
+from fcslam.cli.training_options import TRAINING_OUTPUT, Quick, Start, compute_budget, require_training_libraries
 
 
-@with_groups
 def local(
     folders: Annotated[
         list[Path], typer.Argument(help="Folders of images, one for each robot. The folder names the robot.")
     ],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
-    rounds: RoundFlags,
+    config: SettingsFiles = None,
+    start: Start = None,
+    public: Public = None,
+    quick: Quick = False,
 ) -> None:
     """Train one detector on the images of several robots, simulated in this process.
 
@@ -29,15 +31,16 @@ def local(
     """
     from fcslam.cli.progress import ProgressDisplay
 
-    settings = rounds.settings()
+    settings = round_settings(config, quick)
     require_training_libraries("flwr", extra="federated")
+    from fcslam.learning.federated.job import FederatedJob
     from fcslam.learning.federated.local import federate_locally
 
     console = notices()
-    job = rounds.job(output, settings)
+    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {job.output}") as display:
-        files = federate_locally(folders, job, rounds.compute_budget(), show_rounds(display, console, settings))
+        files = federate_locally(folders, job, compute_budget(quick), show_rounds(display, console, settings))
     for file in files:
         typer.echo(str(file))
     print_line(console, f"{time.perf_counter() - began:.0f} s")

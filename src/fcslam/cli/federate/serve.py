@@ -5,24 +5,26 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.federate.options import RoundFlags, parse_address
+from fcslam.cli.federate.options import Public, parse_address, round_settings
 from fcslam.cli.federate.rounds import show_rounds
-from fcslam.cli.groups import with_groups
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
+from fcslam.cli.mission_options import SettingsFiles
 from fcslam.cli.options import output_option
-from fcslam.cli.output import TRAINING, notices, print_line
-from fcslam.cli.training_options import TRAINING_OUTPUT, require_training_libraries
+from fcslam.cli.output import TRAINING, new_folder, notices, print_line
+from fcslam.cli.training_options import TRAINING_OUTPUT, Quick, Start, compute_budget, require_training_libraries
 
 MAX_LINES = 1000
 """Different notices that are printed, so that nobody on the network can fill a log."""
 
 
-@with_groups
 def serve(
     address: Annotated[str, typer.Argument(metavar="HOST:PORT", help="Address to listen on.")],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
-    rounds: RoundFlags,
+    config: SettingsFiles = None,
+    start: Start = None,
+    public: Public = None,
+    quick: Quick = False,
     credentials: Credentials = None,
     insecure: Annotated[
         bool,
@@ -36,9 +38,10 @@ def serve(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import ServiceError
 
-    settings = rounds.settings()
+    settings = round_settings(config, quick)
     require_training_libraries("flwr", extra="federated")
     from fcslam.learning.federated import launch
+    from fcslam.learning.federated.job import FederatedJob
     from fcslam.service.http.authentication import Authenticator, read_tokens
 
     tokens, certificate, key = find_files(credentials)
@@ -49,7 +52,7 @@ def serve(
         )
     check_tls(certificate, key)
     host, port = parse_address(address)
-    options = rounds.compute_budget()
+    options = compute_budget(quick)
     console, printed = notices(), set[str]()
 
     def print_once(line: str) -> None:
@@ -58,7 +61,7 @@ def serve(
             print_line(console, line)
 
     authenticator = Authenticator(None if insecure or tokens is None else read_tokens(tokens))
-    job = rounds.job(output, settings)
+    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     with listen(host, port) as listener, ProgressDisplay(console, f"output: {job.output}") as display:
         progress = show_rounds(display, console, settings)
         launch.serve(job, options, listener, None if insecure else tls, authenticator, progress, print_once)
