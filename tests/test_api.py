@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def mapped(logs, folder):
-    return fcslam.map_recordings(logs, output=folder, seed=3)
+    return fcslam.map_recordings(logs, output=folder, config={"seed": 3})
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_recordings_may_be_one_path_named_paths_or_sources(logs):
     (log, *_) = logs
     runs = [
         fcslam.map_recordings(str(log), **quick),
-        fcslam.map_recordings([open_source(log)], join_maps=False),
+        fcslam.map_recordings([open_source(log)], **quick),
         fcslam.map_recordings({"anna": log}, **quick),
     ]
     assert [list(run.trajectories) for run in runs] == [["robot_1"], ["robot_1"], ["anna"]]
@@ -149,19 +149,17 @@ def test_recordings_may_be_one_path_named_paths_or_sources(logs):
 
 def test_split_cuts_one_recording_and_progress_is_called(logs):
     seen = []
-    run = fcslam.map_recordings(logs[0], split=2, join_maps=False, progress=seen.append)
+    run = fcslam.map_recordings(logs[0], split=2, config={"fleet": {"join_maps": False}}, progress=seen.append)
     assert list(run.trajectories) == ["robot_1_1", "robot_1_2"]
     assert isinstance(seen[-1], fcslam.Progress)
     assert seen[-1].fusing
 
 
-def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_them(tmp_path):
+def test_settings_come_from_a_model_a_mapping_or_a_file(tmp_path):
     path = tmp_path / "mission.yaml"
     path.write_text("seed: 7\n")
     for config in (fcslam.MissionConfig(seed=7), {"seed": 7}, path, str(path)):
-        assert api.settings_of(config, None, None) == fcslam.MissionConfig(seed=7)
-        changed = api.settings_of(config, 8, False)
-        assert (changed.seed, changed.fleet.join_maps) == (8, False)
+        assert api.settings_of(config) == fcslam.MissionConfig(seed=7)
 
 
 @pytest.mark.parametrize(

@@ -44,8 +44,6 @@ def map_recordings(
     config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
     output: StrPath | None = None,
     split: int = 1,
-    seed: int | None = None,
-    join_maps: bool | None = None,
     vetoes: Iterable[Veto] = (),
     bag_options: BagOptions | None = None,
     progress: Watch | None = None,
@@ -71,8 +69,6 @@ def map_recordings(
         output: run folder to write; by default nothing is written.
         split: number of robots into which a single recording is cut, with equal scan counts; the odometry of each
             starts at zero.
-        seed: replaces the seed of the configuration.
-        join_maps: replaces ``fleet.join_maps`` of the configuration; False maps each robot alone.
         vetoes: closures that you know to be false.
         bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
         progress: called every 50 scans, and before the maps are fused, with the state of the mission.
@@ -95,7 +91,7 @@ def map_recordings(
     if output is not None:
         prepare_output(Path(output), force)
     earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto
-    settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
+    settings = settings_of(continued_config(earlier) if config is None else config)
     opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=0 if earlier else 1)
     robots = split_recordings(opened, split)
     check_robots(robots)
@@ -151,7 +147,7 @@ def localize(
 
     if output is not None:
         prepare_output(Path(output), force)
-    settings = settings_of(config, None, None)
+    settings = settings_of(config)
     occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
     if isinstance(recording, str | os.PathLike):
         recording = _checked(sources.open_source(Path(recording), bag_options))
@@ -237,21 +233,13 @@ def _checked(source: Source) -> Source:
     return source
 
 
-def settings_of(
-    config: MissionConfig | Mapping[str, Any] | StrPath | None, seed: int | None = None, join_maps: bool | None = None
-) -> MissionConfig:
-    """A complete configuration from what a user gives; ``seed`` and ``join_maps`` replace its own.
+def settings_of(config: MissionConfig | Mapping[str, Any] | StrPath | None) -> MissionConfig:
+    """A complete configuration from what a user gives.
 
     Raises:
         ConfigError: a key is unknown, a value is wrong, or the file cannot be read.
     """
     if isinstance(config, str | os.PathLike):
-        config = load(MissionConfig, Path(config))
-    elif not isinstance(config, MissionConfig):
-        config = parse(MissionConfig, dict(config or {}), "config")
-    content = config.model_dump()
-    if seed is not None:
-        content["seed"] = seed
-    if join_maps is not None:
-        content["fleet"]["join_maps"] = join_maps
-    return parse(MissionConfig, content, "map_recordings")
+        return load(MissionConfig, Path(config))
+    content = config.model_dump() if isinstance(config, MissionConfig) else dict(config or {})
+    return parse(MissionConfig, content, "config")

@@ -147,7 +147,7 @@ def test_vetoes_stay_in_force(logs, tmp_path):
 
 
 def test_the_settings_of_the_cloud_are_kept(logs, tmp_path):
-    fcslam.map_recordings(logs[:2], output=tmp_path / "alone", join_maps=False)
+    fcslam.map_recordings(logs[:2], output=tmp_path / "alone", config={"fleet": {"join_maps": False}})
     run = fcslam.map_recordings([], onto=tmp_path / "alone")
     assert len({trajectory.map_index for trajectory in run.trajectories.values()}) == 2
 
