@@ -1,31 +1,19 @@
-"""The tables on a PostgreSQL server, by versions.
+"""The tables on a PostgreSQL server.
 
 The schema ``fcslam`` holds what all missions share; each mission has a schema of its own with the tables of a mission
-file. A migration only adds, so instances of the version before go on beside it.
+file.
 """
 
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 from fcslam.errors import StoreError
 from fcslam.storage.postgres import Postgres
 
-MIGRATING: Final = 0x0FC51A
-"""The lock of whoever changes the tables."""
-
-
-class Migration(NamedTuple):
-    """The step from one version to the next."""
-
-    shared: str
-    """Statements for the schema ``fcslam``."""
-    mission: str
-    """Statements for the schema of each mission."""
-
-
-MIGRATIONS: Final = (
-    Migration(
-        shared="""
+VERSION: Final = 1
+"""Version of the tables."""
+PREPARING: Final = 0x0FC51A
+"""The lock of whoever makes the tables."""
+SHARED: Final = """
 CREATE TABLE missions (
     number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
     name TEXT COLLATE "C" NOT NULL UNIQUE,
@@ -46,8 +34,8 @@ CREATE TABLE detectors (
     number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
     channel TEXT NOT NULL, version TEXT NOT NULL, content BYTEA NOT NULL, UNIQUE (channel, version)
 )
-""",
-        mission="""
+"""
+MISSION: Final = """
 CREATE TABLE packets (
     arrival BIGINT PRIMARY KEY,
     robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL, sequence BIGINT NOT NULL,
@@ -79,9 +67,7 @@ CREATE TABLE tracks (
 CREATE TABLE facts (name TEXT COLLATE "C" PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE files (name TEXT COLLATE "C" PRIMARY KEY, number BIGINT NOT NULL, content BYTEA NOT NULL);
 CREATE TABLE agents (robot TEXT COLLATE "C" PRIMARY KEY, agent TEXT NOT NULL, heard TIMESTAMPTZ NOT NULL)
-""",
-    ),
-)
+"""
 
 
 def schema_of(number: int) -> str:
@@ -89,34 +75,25 @@ def schema_of(number: int) -> str:
     return f"fcslam_mission_{number}"
 
 
-def prepare(server: Postgres, migrations: Sequence[Migration] = MIGRATIONS) -> None:
-    """Make the tables on a server, or bring those of an earlier version to this one.
+def prepare(server: Postgres) -> None:
+    """Make the tables on a server that has none.
 
     Raises:
-        StoreError: they are of a newer version, the role may not make them, or the server cannot be used.
+        StoreError: they are of another version, the role may not make them, or the server cannot be used.
     """
-    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({MIGRATING})") as connection:
+    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({PREPARING})") as connection:
         found = connection.execute("SELECT to_regclass('fcslam.version') IS NOT NULL").fetchone()
         if not (found and found[0]):
             connection.execute("CREATE SCHEMA IF NOT EXISTS fcslam")
+            connection.execute(f"SET LOCAL search_path TO fcslam; {SHARED}".encode())
             connection.execute("CREATE TABLE fcslam.version (number BIGINT NOT NULL)")
-            connection.execute("INSERT INTO fcslam.version VALUES (0)")
+            connection.execute(f"INSERT INTO fcslam.version VALUES ({VERSION})".encode())
         (version,) = connection.execute("SELECT number FROM fcslam.version").fetchone() or (0,)
-        if version > len(migrations):
-            raise StoreError(
-                f"{server.url}: a store of version {version}; this fcslam reads version {len(migrations)}; "
-                "install a newer fcslam"
-            )
-        for migration in migrations[version:]:
-            connection.execute(f"SET LOCAL search_path TO fcslam; {migration.shared}".encode())
-            for (number,) in connection.execute("SELECT number FROM missions ORDER BY number").fetchall():
-                connection.execute(f"SET LOCAL search_path TO {schema_of(number)}; {migration.mission}".encode())
-        if version < len(migrations):
-            connection.execute("UPDATE fcslam.version SET number = %s", (len(migrations),))
+        if version != VERSION:
+            raise StoreError(f"{server.url}: a store of version {version}; this fcslam reads version {VERSION}")
         connection.execute("COMMIT")
 
 
-def mission_statements(number: int, migrations: Sequence[Migration] = MIGRATIONS) -> bytes:
+def mission_statements(number: int) -> bytes:
     """Statements that make the tables of a new mission."""
-    tables = "; ".join(migration.mission for migration in migrations)
-    return f"CREATE SCHEMA {schema_of(number)}; SET LOCAL search_path TO {schema_of(number)}; {tables}".encode()
+    return f"CREATE SCHEMA {schema_of(number)}; SET LOCAL search_path TO {schema_of(number)}; {MISSION}".encode()
