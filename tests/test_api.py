@@ -170,7 +170,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file(tmp_path):
         ({"recordings": ["LOG", "LOG"]}, fcslam.SourceError, "robot_1"),
         ({"recordings": ["LOG", "TWIN"], "split": 2}, fcslam.SourceError, "cuts one recording"),
         ({"split": 0}, fcslam.SourceError, "0 parts"),
-        ({"seed": -1}, fcslam.ConfigError, "seed"),
+        ({"config": {"seed": -1}}, fcslam.ConfigError, "seed"),
         ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
         ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),
         ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.ConfigError, "nobody"),
@@ -216,7 +216,7 @@ reveal_type(run.maps[0].origin_xy)
 reveal_type(run.metrics["maps"].value)
 reveal_type([closure.status for closure in run.closures])
 reveal_type(fcslam.open_run("runs/building"))
-fcslam.map_recordings("a.clf", seeds=1)
+fcslam.map_recordings("a.clf", spit=1)
 """
 
 
@@ -234,7 +234,7 @@ def test_type_checkers_know_the_api(tmp_path):
     assert revealed[1:] == ["tuple[float, float]", "float", "list[ClosureStatus]", "Run"]
     assert revealed[0].startswith("ndarray[")
     assert re.findall(r"^script.py:.* error: (.*)", answer.stdout, re.MULTILINE) == [
-        'Unexpected keyword argument "seeds" for "map_recordings"; did you mean "seed"?  [call-arg]'
+        'Unexpected keyword argument "spit" for "map_recordings"; did you mean "split"?  [call-arg]'
     ]
 
 

@@ -100,7 +100,7 @@ def read_bytes(path: Path, within: Path | None = None, most: int = MOST_BYTES) -
     Raises:
         OSError: as ``open_file``, or the file is larger than ``most``.
     """
-    with open_file(path, within) as file:
+    with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise LimitError(f"{path.name} has {_size(size)}; the limit is {_size(most)}")
@@ -117,14 +117,14 @@ def read_text(path: Path, within: Path | None = None, most: int = MOST_BYTES) ->
     return read_bytes(path, within, most).decode("utf-8")
 
 
-def read_arrays(path: Path, within: Path | None = None) -> Arrays:
+def read_arrays(path: Path) -> Arrays:
     """Every array of a ``.npz`` file; objects are not read.
 
     Raises:
         OSError: as ``open_file``, or the arrays are larger than ``most_unpacked`` of the file's size.
         ValueError: the file is not an archive of arrays, or is broken.
     """
-    with open_file(path, within) as file:
+    with open_file(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 total = sum(member.file_size for member in archive.infolist())
@@ -310,14 +310,14 @@ _DECOMPRESSORS: Final[dict[str, Callable[[], Any]]] = {
 }  # fmt: skip
 
 
-def open_database(path: Path, within: Path | None = None) -> sqlite3.Connection:
+def open_database(path: Path) -> sqlite3.Connection:
     """Open an SQLite database to read its tables. It is not changed, and none of its code runs.
 
     Raises:
         OSError: as ``open_file``.
         sqlite3.Error: it is damaged, or has a view, a trigger, a virtual table or a computed column.
     """
-    with open_file(path, within) as file:
+    with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
     connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
     try:

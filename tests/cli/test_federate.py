@@ -83,8 +83,8 @@ def test_a_run_folder_holds_everything(run, fleet):
 def test_the_delivered_detectors_run(run, fleet, tmp_path):
     run, _ = run
     for name in ("detector.onnx", "detector-int8.onnx"):
-        arguments = ["tools", "extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
-        assert main([*arguments, "--weights", str(run / name)]) == 0
+        arguments = ["tools", "extract", str(fleet / "one"), "--output", str(tmp_path / name)]
+        assert main([*arguments, "--detector", str(run / name)]) == 0
         assert len(list((tmp_path / name).rglob("*.npz"))) == 3
 
 

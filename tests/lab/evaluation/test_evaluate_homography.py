@@ -230,9 +230,9 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
         (["{empty}"], "no scene in it"),
         (["{scenes}", "{scenes}"], "there is another scene i_dim"),
         (["{scenes}", "--detector", "orb", "--detector", "orb"], "orb: named twice"),
-        (["{scenes}", "--features", "{empty}/none"], "no such folder"),
-        (["{scenes}", "--features", "{empty}"], "cannot read the features"),
-        (["{scenes}", "--detector", "onnx", "--weights", "{empty}/n.onnx"], "cannot read the network weights"),
+        (["{scenes}", "--detector", "{empty}/none"], "no such folder"),
+        (["{scenes}", "--detector", "{empty}"], "cannot read the features"),
+        (["{scenes}", "--detector", "onnx", "--detector", "{empty}/n.onnx"], "cannot read the network weights"),
         (["{scenes}", "--detector", "orb", "--csv", "{empty}/none/t.csv"], "cannot write the table"),
         (["{scenes}", "--detector", "orb", "--figures", "{scenes}/i_dim/1.png"], "cannot write the figures"),
     ],
@@ -269,5 +269,5 @@ def test_features_of_an_image_of_another_size_are_refused(scenes, tmp_path, caps
     (tmp_path / "i_dim").mkdir()
     none = ImageFeatures(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 32), np.uint8))
     write_features(tmp_path / "i_dim" / "1.npz", none, (640, 480))
-    assert main(["evaluate", "homography", str(scenes), "--features", str(tmp_path)]) == 2
+    assert main(["evaluate", "homography", str(scenes), "--detector", str(tmp_path)]) == 2
     assert "of an image of 640 x 480 pixels" in capsys.readouterr().err

@@ -31,7 +31,7 @@ app.command(epilog=examples("fcslam evaluate closures runs/intel-3 intel.relatio
 app.command(
     epilog=examples(
         "fcslam evaluate homography hpatches --detector onnx --detector orb",
-        "fcslam evaluate homography hpatches --features features --csv pairs.csv",
+        "fcslam evaluate homography hpatches --detector features --csv pairs.csv",
     )
 )(homography)
 app.command(

@@ -27,21 +27,13 @@ def homography(
     ],
     *,
     detector: Annotated[
-        list[EvaluatedDetectorKind] | None,
-        typer.Option(help="Evaluate only this detector. Can be repeated.", show_default="all"),
-    ] = None,
-    weights: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Option(
-            help="Network weights (.onnx) of the detectors onnx and logits. Can be repeated.",
-            show_default="the bundled network",
-        ),
-    ] = None,
-    features: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder of extracted features, SCENE/1.npz ..., as `fcslam tools extract` writes them, to evaluate "
-            "instead of detectors or, with --detector, beside them. Can be repeated."
+            metavar="NAME|FILE|FOLDER",
+            help="Evaluate only this detector: onnx, logits (the network's descriptors before they are bits), orb, sift, "
+            "fast, harris or shi; the .onnx file of a network for onnx and logits, in place of the bundled one; or a "
+            "folder of extracted features, SCENE/1.npz ..., as `fcslam tools extract` writes them. Can be repeated.",
+            show_default="all",
         ),
     ] = None,
     ground_truth: Annotated[
@@ -62,7 +54,10 @@ def homography(
     from fcslam.lab.evaluation.detectors.scenes import find_scenes
 
     found = find_scenes(scenes)
-    detectors = choose_detectors(detector or (), weights or (), features or ())
+    kinds = [EvaluatedDetectorKind(one) for one in detector or () if one in list(EvaluatedDetectorKind)]
+    places = [Path(one) for one in detector or () if one not in list(EvaluatedDetectorKind)]
+    weights = [place for place in places if place.suffix == ".onnx"]
+    detectors = choose_detectors(kinds, weights, [place for place in places if place.suffix != ".onnx"])
     with ProgressDisplay(notices()) as display:
         evaluated = display.start("evaluating", len(found) * len(detectors))
         report = evaluate_homography(found, detectors, ground_truth, evaluated)
