@@ -100,7 +100,7 @@ def read_bytes(path: Path, within: Path | None = None, most: int = MOST_BYTES) -
     Raises:
         OSError: as ``open_file``, or the file is larger than ``most``.
     """
-    with open_file(path) as file:
+    with open_file(path, within) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise LimitError(f"{path.name} has {_size(size)}; the limit is {_size(most)}")

@@ -30,9 +30,9 @@ def homography(
         list[str] | None,
         typer.Option(
             metavar="NAME|FILE|FOLDER",
-            help="Evaluate only this detector: onnx, logits (the network's descriptors before they are bits), orb, sift, "
-            "fast, harris or shi; the .onnx file of a network for onnx and logits, in place of the bundled one; or a "
-            "folder of extracted features, SCENE/1.npz ..., as `fcslam tools extract` writes them. Can be repeated.",
+            help="Evaluate only this detector: onnx, logits (the network's descriptors before they are bits), orb, "
+            "sift, fast, harris or shi; the .onnx file of a network for onnx and logits, in place of the bundled one; or "
+            "a folder of extracted features, SCENE/1.npz ..., as `fcslam tools extract` writes them. Can be repeated.",
             show_default="all",
         ),
     ] = None,
