@@ -31,8 +31,8 @@ def homography(
         typer.Option(
             metavar="NAME|FILE|FOLDER",
             help="Evaluate only this detector: onnx, logits (the network's descriptors before they are bits), orb, "
-            "sift, fast, harris or shi; the .onnx file of a network for onnx and logits, in place of the bundled one; "
-            "or a folder of extracted features, SCENE/1.npz ..., as `fcslam tools extract` writes them. Can be repeated.",
+            "sift, fast, harris or shi; the .onnx file of a network for onnx and logits; or a folder of extracted "
+            "features, SCENE/1.npz ..., as `fcslam tools extract` writes them. Can be repeated.",
             show_default="all",
         ),
     ] = None,
