@@ -23,6 +23,11 @@ export const chart = {
 };
 let version = 0, queued = false;
 
+// Reading the size of an element lays the page out, so it is read when it changes.
+const size = { w: 0, h: 0 };
+const measure = () => { size.w = canvas.clientWidth; size.h = canvas.clientHeight; };
+measure();
+
 // ---- Colours ----
 
 let theme = {};
@@ -55,10 +60,10 @@ function recoloured(picture) {
 const cosSin = (turn) => [Math.cos(turn), Math.sin(turn)];
 export function onScreen([x, y]) {
   const { view } = chart, [c, s] = cosSin(view.turn), dx = x - view.x, dy = y - view.y;
-  return [canvas.clientWidth / 2 + (c * dx - s * dy) * view.scale, canvas.clientHeight / 2 - (s * dx + c * dy) * view.scale];
+  return [size.w / 2 + (c * dx - s * dy) * view.scale, size.h / 2 - (s * dx + c * dy) * view.scale];
 }
 export function onMap([px, py]) {
-  const { view } = chart, [c, s] = cosSin(view.turn), u = (px - canvas.clientWidth / 2) / view.scale, v = (canvas.clientHeight / 2 - py) / view.scale;
+  const { view } = chart, [c, s] = cosSin(view.turn), u = (px - size.w / 2) / view.scale, v = (size.h / 2 - py) / view.scale;
   return [view.x + c * u + s * v, view.y - s * u + c * v];
 }
 
@@ -73,8 +78,8 @@ function whole(index, width, height, turn = 0) {
   return { x: c * u + s * v, y: -s * u + c * v, scale: Math.min(width / (high[0] - low[0] + 2), height / (high[1] - low[1] + 2)), turn };
 }
 export function fit() {
-  const inset = canvas.clientWidth > 700 ? 40 : 10;
-  chart.view = whole(chart.index, canvas.clientWidth - inset, canvas.clientHeight - inset, chart.view?.turn) ?? chart.view;
+  const inset = size.w > 700 ? 40 : 10;
+  chart.view = whole(chart.index, size.w - inset, size.h - inset, chart.view?.turn) ?? chart.view;
   redraw();
 }
 export function fitAll() { chart.moved = false; chart.followed = false; fit(); }
@@ -113,6 +118,14 @@ export function levelWalls() {
 
 // ---- Tiles ----
 
+async function renew(kept, answer) {
+  const tag = answer.headers.get("ETag");
+  if (tag && tag === kept.tag) return answer.body?.cancel(); // most tiles stay as they are
+  const picture = await createImageBitmap(await answer.blob());
+  kept.picture?.close();
+  Object.assign(kept, { picture: recoloured(picture), tag });
+  picture.close();
+}
 // The newest picture of a tile that has come; a newer one is asked for once, and replaces it whatever happens meanwhile.
 function tile(index, z, x, y) {
   const key = `${index}/${z}/${x}/${y}`, kept = tiles.get(key) ?? { picture: null, version: -1, isAsked: false };
@@ -120,8 +133,7 @@ function tile(index, z, x, y) {
   if (kept.version < version && !kept.isAsked) {
     const asked = version;
     kept.isAsked = true;
-    ask(`maps/${index}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
-      .then((picture) => { kept.picture?.close(); kept.picture = recoloured(picture); kept.version = asked; picture.close(); })
+    ask(`maps/${index}/tiles/${z}/${x}/${y}.png`).then((answer) => renew(kept, answer)).then(() => { kept.version = asked; })
       .catch((error) => {
         if (!report && !(error instanceof Refused)) return new Promise((done) => setTimeout(done, RETRY_MS));
         kept.version = asked; // a report has no more of them, and a refused token gets none
@@ -195,7 +207,7 @@ function linksOf(channel) {
 function strokeWay(path, colour, width, alpha = 1) {
   const { view } = chart, [c, s] = cosSin(view.turn), k = view.scale;
   pen.save();
-  pen.translate(canvas.clientWidth / 2, canvas.clientHeight / 2); pen.transform(k * c, -k * s, -k * s, -k * c, 0, 0); pen.translate(-view.x, -view.y);
+  pen.translate(size.w / 2, size.h / 2); pen.transform(k * c, -k * s, -k * s, -k * c, 0, 0); pen.translate(-view.x, -view.y);
   pen.globalAlpha = alpha; pen.strokeStyle = colour; pen.lineWidth = width / k; pen.lineJoin = "round"; pen.stroke(path);
   pen.restore();
 }
@@ -256,7 +268,7 @@ function drawRobot(robot) {
 const isEarlierDrive = (robot) => fleet.robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch && r.map === robot.map);
 
 function drawGrid() {
-  const step = barMetres(), w = canvas.clientWidth, h = canvas.clientHeight, corners = [[0, 0], [w, 0], [0, h], [w, h]].map(onMap);
+  const step = barMetres(), w = size.w, h = size.h, corners = [[0, 0], [w, 0], [0, h], [w, h]].map(onMap);
   const [low, high] = [Math.min, Math.max].map((pick) => [0, 1].map((k) => pick(...corners.map((corner) => corner[k]))));
   const path = new Path2D();
   for (let x = Math.ceil(low[0] / step) * step; x < high[0]; x += step) { path.moveTo(x, low[1]); path.lineTo(x, high[1]); }
@@ -272,7 +284,7 @@ function drawQuality() {
 
 function draw() {
   queued = false;
-  const w = canvas.clientWidth, h = canvas.clientHeight, ratio = devicePixelRatio, { view } = chart;
+  const { w, h } = size, ratio = devicePixelRatio, { view } = chart;
   if (canvas.width !== Math.round(w * ratio) || canvas.height !== Math.round(h * ratio)) { canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio); if (!chart.moved && view) return fit(); }
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.fillStyle = theme.unknown; pen.fillRect(0, 0, w, h);
@@ -311,7 +323,8 @@ function barMetres() {
 function showScale() {
   const bar = barMetres();
   at("bar").style.width = `${bar * chart.view.scale}px`;
-  at("metres").textContent = `${bar < 1 ? bar.toPrecision(1) : bar} m`;
+  const text = `${bar < 1 ? bar.toPrecision(1) : bar} m`;
+  if (at("metres").textContent !== text) at("metres").textContent = text; // a new text lays the page out
 }
 
 // ---- What the pointer and the keys do ----
@@ -333,10 +346,10 @@ function hit(point) {
 }
 
 // Keeps the point of the canvas where it is.
-export function zoom(factor, point = [canvas.clientWidth / 2, canvas.clientHeight / 2]) {
+export function zoom(factor, point = [size.w / 2, size.h / 2]) {
   const { view } = chart;
   if (!view) return;
-  const widest = Math.sqrt(canvas.clientWidth * canvas.clientHeight / MOST_TILES) / WORLD_M; // so many tiles fill the canvas
+  const widest = Math.sqrt(size.w * size.h / MOST_TILES) / WORLD_M; // so many tiles fill the canvas
   const held = onMap(point);
   view.scale = Math.max(Math.min(widest, view.scale), Math.min(2000, view.scale * factor));
   const off = onMap(point);
@@ -346,7 +359,7 @@ export function zoom(factor, point = [canvas.clientWidth / 2, canvas.clientHeigh
 }
 function pan(dx, dy) {
   if (!chart.view) return;
-  const [x, y] = onMap([canvas.clientWidth / 2 - dx, canvas.clientHeight / 2 - dy]);
+  const [x, y] = onMap([size.w / 2 - dx, size.h / 2 - dy]);
   Object.assign(chart.view, { x, y });
   chart.moved = true; chart.followed = false;
   redraw();
@@ -383,4 +396,4 @@ canvas.addEventListener("keydown", (e) => {
   const press = chart.tool?.keys?.[e.key] ?? keys[e.key];
   if (press) { e.preventDefault(); press(); }
 });
-new ResizeObserver(redraw).observe(canvas);
+new ResizeObserver(() => { measure(); redraw(); }).observe(canvas);
