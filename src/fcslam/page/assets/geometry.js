@@ -1,4 +1,4 @@
-// Poses [x, y, heading] and points [x, y], in metres and radians; and archives.
+// Poses [x, y, heading] and points [x, y], in metres and radians.
 
 export const turned = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 export function compose([x, y, a], [u, v, b]) {
@@ -29,30 +29,4 @@ export function wallDirection(images) {
         sin += strength * Math.sin(angle); cos += strength * Math.cos(angle);
       }
   return Math.atan2(sin, cos) / 4;
-}
-
-function crc32(bytes) {
-  let crc = ~0;
-  for (const byte of bytes) {
-    crc ^= byte;
-    for (let k = 0; k < 8; k++) crc = (crc >>> 1) ^ (0xedb88320 & -(crc & 1));
-  }
-  return ~crc >>> 0;
-}
-
-// A ZIP archive of files [name, bytes], which are stored as they are (APPNOTE.TXT 4.3).
-export function zip(files) {
-  const parts = [], directory = [];
-  let offset = 0;
-  const record = (numbers) => { const made = new DataView(new ArrayBuffer(numbers.reduce((sum, [size]) => sum + size, 0))); let at = 0; for (const [size, value] of numbers) { made[size === 2 ? "setUint16" : "setUint32"](at, value, true); at += size; } return new Uint8Array(made.buffer); };
-  for (const [name, bytes] of files) {
-    const path = new TextEncoder().encode(name), sizes = [[4, crc32(bytes)], [4, bytes.length], [4, bytes.length], [2, path.length], [2, 0]];
-    const common = [[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 0x21], ...sizes];
-    const header = record([[4, 0x04034b50], ...common]);
-    parts.push(header, path, bytes);
-    directory.push(record([[4, 0x02014b50], [2, 20], ...common, [2, 0], [2, 0], [2, 0], [4, 0], [4, offset]]), path);
-    offset += header.length + path.length + bytes.length;
-  }
-  const size = directory.reduce((sum, part) => sum + part.length, 0);
-  return new Blob([...parts, ...directory, record([[4, 0x06054b50], [2, 0], [2, 0], [2, files.length], [2, files.length], [4, size], [4, offset], [2, 0]])], { type: "application/zip" });
 }

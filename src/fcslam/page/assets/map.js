@@ -2,7 +2,7 @@
 
 import { colourOf, fleet, isPast, keyOf, poseAt, robotNamed } from "./fleet.js";
 import { distance, middle, movedPoint, wallDirection } from "./geometry.js";
-import { Refused, ask, at, report } from "./service.js";
+import { Refused, ask, at, json, report } from "./service.js";
 
 const WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
 const BAR_PX = 120; // longest scale bar
@@ -33,7 +33,7 @@ measure();
 let theme = {};
 export function readTheme() {
   const style = getComputedStyle(document.documentElement);
-  const names = ["floor", "wall", "unknown", "grid", "ink", "surface", "accent", "laser", "camera", "alert", "area", "keepout", "erase", "free"];
+  const names = ["floor", "wall", "unknown", "grid", "ink", "surface", "accent", "laser", "camera", "alert", "area", "keepout", "erase", "free", "plan", "appeared", "disappeared"];
   theme = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
   forgetTiles();
 }
@@ -167,7 +167,7 @@ function drawTiles(brush, index, { x, y, scale, turn }, w, h) {
 
 // ---- Layers ----
 
-export const isShown = (layer) => at(`layer-${layer}`).checked;
+export const isShown = (layer) => at(`layer-${layer}`).checked && !at(`layer-${layer}`).parentElement.hidden;
 export function redraw() { if (!queued) { queued = true; requestAnimationFrame(draw); } }
 
 // A robot's path until the moment, in metres of the map: all of it, its last minutes, and its last pose. Poses nearer than a pixel are left out.
@@ -204,11 +204,12 @@ function linksOf(channel) {
 }
 
 // A path in metres of the map.
-function strokeWay(path, colour, width, alpha = 1) {
+function strokeWay(path, colour, width, alpha = 1, fill = 0) {
   const { view } = chart, [c, s] = cosSin(view.turn), k = view.scale;
   pen.save();
   pen.translate(size.w / 2, size.h / 2); pen.transform(k * c, -k * s, -k * s, -k * c, 0, 0); pen.translate(-view.x, -view.y);
   pen.globalAlpha = alpha; pen.strokeStyle = colour; pen.lineWidth = width / k; pen.lineJoin = "round"; pen.stroke(path);
+  if (fill) { pen.globalAlpha = fill; pen.fillStyle = colour; pen.fill(path, "evenodd"); }
   pen.restore();
 }
 export function outline(points, { colour = theme.accent, fill = 0, width = 2, dash = [], closed = true }) {
@@ -276,10 +277,32 @@ function drawGrid() {
   strokeWay(path, theme.grid, 1, 0.5);
 }
 
-// The certificate: a square for each cell, in one colour if it is good and in another one if not.
-function drawQuality() {
-  const { cell, cells } = fleet.quality[chart.index] ?? { cells: [] }, half = cell / 2;
-  for (const { x, y, good } of cells) outline([[-half, -half], [half, -half], [half, half], [-half, half]].map(([dx, dy]) => [x + dx, y + dy]), { colour: theme[good ? "free" : "keepout"], fill: 0.35, width: 0.5 });
+// What the service knows of a map besides its cells: shapes, which are read when their layer is switched on.
+const LOOKS = { // colour, width of the line, filling
+  quality: { good: ["free", 0.5, 0.3], bad: ["keepout", 0.5, 0.4] },
+  plan: { plan: ["plan", 1.5, 0], missing: ["disappeared", 6, 0], new: ["appeared", 6, 0], moved: ["area", 6, 0] },
+  changes: { appeared: ["appeared", 3, 1], disappeared: ["disappeared", 3, 1] },
+  tags: { tag: ["camera", 2, 0.4] },
+};
+const shapes = new Map();
+export function forgetShapes() { shapes.clear(); redraw(); }
+function shapesOf(layer) {
+  const path = `maps/${chart.index}/layers/${layer}`;
+  if (!shapes.has(path)) {
+    shapes.set(path, []);
+    json(path).then((found) => { shapes.set(path, found.map((one) => ({ ...one, path: new Path2D(one.path) }))); redraw(); }, () => {});
+  }
+  return shapes.get(path);
+}
+function drawShapes(layer) {
+  const found = shapesOf(layer);
+  for (const { kind, path } of found) { const [colour, width, fill] = LOOKS[layer][kind]; strokeWay(path, theme[colour], width, 1, fill); }
+  for (const { kind, text, x, y } of found) if (text) label(text, onScreen([x, y]), theme[LOOKS[layer][kind][0]]);
+}
+// The layers of the service that the open map has.
+export function showLayers() {
+  const known = fleet.maps.find((m) => m.map === chart.index)?.layers ?? [];
+  for (const layer of Object.keys(LOOKS)) at(`layer-${layer}`).parentElement.hidden = !known.includes(layer);
 }
 
 function draw() {
@@ -297,7 +320,7 @@ function draw() {
   }
   // A tile in view stays, or each drawing would ask for it again.
   for (const [key, { picture }] of tiles) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; picture?.close(); tiles.delete(key); }
-  if (isShown("quality")) drawQuality();
+  for (const layer of Object.keys(LOOKS)) if (isShown(layer)) drawShapes(layer);
   if (isShown("grid")) drawGrid();
   if (isShown("closures")) for (const [channel, colour] of [["lidar", theme.laser], ["camera", theme.camera], ["tag", theme.free]]) strokeWay(linksOf(channel), colour, 1, 0.5);
   if (isShown("areas")) for (const region of fleet.regions) drawRegion(region);

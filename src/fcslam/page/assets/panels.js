@@ -2,7 +2,7 @@
 
 import { colourOf, closures, firstStamp, fleet, keyOf, placed, robotNamed } from "./fleet.js";
 import { between, distance, middle, turned } from "./geometry.js";
-import { canvas, chart, choose, goTo, openMap, redraw } from "./map.js";
+import { canvas, chart, choose, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
 import { attention, count, dayOf, decisionOf, duration, editOf, evidence, history, listed, metres, moment, sensorOf, stateOf } from "./words.js";
@@ -72,7 +72,7 @@ export function showControls() {
 // ---- Maps and their state ----
 
 export function showMaps() {
-  at("has-quality").hidden = !Object.keys(fleet.quality).length;
+  showLayers();
   const title = (m) => `${listed(m.robots)}${m.floor && `, floor ${m.floor}`}`;
   at("tabs").hidden = fleet.maps.length < 2;
   fill(at("tabs"), [chart.index, fleet.maps.map(title)], () => fleet.maps.map((m) => {

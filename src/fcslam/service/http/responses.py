@@ -1,5 +1,6 @@
 """The responses of the service, as OpenAPI describes them."""
 
+from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -130,6 +131,15 @@ class ClosureSummary(Settings):
     explanation: str = Field(description="the reason with its numbers, as one clause")
 
 
+class Layer(StrEnum):
+    """What is drawn over a map."""
+
+    PLAN = "plan"
+    CHANGES = "changes"
+    TAGS = "tags"
+    QUALITY = "quality"
+
+
 class MapSummary(Settings):
     """Which robots share a map."""
 
@@ -140,6 +150,7 @@ class MapSummary(Settings):
     extent: tuple[float, float, float, float] | None = Field(
         description="lowest x and y, highest x and y that the map covers, in metres; null before there is a map"
     )
+    layers: list[Layer] = Field(description="what can be drawn over it")
     georeferenced: bool = Field(description="whether its place on the earth is known")
 
 
@@ -154,6 +165,20 @@ class LearningRound(Settings):
     reason: str = Field(description="of the gate for releasing it or not; empty without a gate")
     losses: dict[str, float]
     measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
+
+
+class MapShape(Settings):
+    """A shape that is drawn over a map, and its label."""
+
+    kind: Literal["plan", "missing", "new", "moved", "appeared", "disappeared", "tag", "good", "bad"] = Field(
+        description="line of the floor plan; wall that only the plan or only the scans have, or that moved; surface "
+        "that appeared or disappeared since the first day; tag; square metre as accurate as the certificate asks, "
+        "or not"
+    )
+    path: str = Field(description="data of an SVG path, metres of the map")
+    text: str = ""
+    x: float = Field(default=0.0, description="of the label, metres of the map")
+    y: float = 0.0
 
 
 class MapSeparation(Settings):
