@@ -19,7 +19,7 @@ from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, OccupancyMap, open_run
 from fcslam.runs.map_files import map_stem
-from fcslam.service.map_layers import map_shapes
+from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
     all_sessions,
@@ -75,6 +75,8 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
             ).decode()
         except ValueError as error:
             raise EvaluationError(f"the run has closures that cannot be shown ({error})") from error
+    if mission.run_folder is not None:
+        texts |= {f"maps/{k}/walls": _json(walls_of(mission.run_folder, k)) for k in zooms}
     located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
     if mission.run_folder is not None:
         for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):

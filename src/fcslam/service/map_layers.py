@@ -6,15 +6,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from fcslam.anchoring.anchors import PLAN_JSON, TAGS_JSON
+from fcslam.anchoring.walls import wall_direction
 from fcslam.errors import EvaluationError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED
 from fcslam.maps.exports import outlines
 from fcslam.mission.map_changes import changes_of
 from fcslam.mission.mission_file import stored_mission
 from fcslam.runs import QUALITY
-from fcslam.service.http.responses import Layer, MapShape
+from fcslam.runs.map_files import map_stem, parse_map
+from fcslam.service.http.responses import Layer, MapShape, WallDirection
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
-from fcslam.untrusted import read_text
+from fcslam.untrusted import read_bytes, read_text
 
 TAG_M: Final = 0.15
 """Half a side of the square that stands for a tag."""
@@ -59,6 +61,17 @@ def map_shapes(mission: ViewedMission, k: int, layer: Layer) -> list[MapShape]:
         return []
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise EvaluationError(f"{_FILES[layer]} cannot be shown ({error})") from error
+
+
+def walls_of(folder: Path, k: int) -> WallDirection:
+    """The direction of the walls of map ``k`` of a run folder, which has it.
+
+    Raises:
+        EvaluationError: the files of the map are broken.
+    """
+    stem = map_stem(k)
+    pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
+    return WallDirection(direction_rad=wall_direction(parse_map(stem, pgm, description)))
 
 
 def _changes(mission: ViewedMission, folder: Path, k: int) -> list[MapShape]:

@@ -7,13 +7,20 @@ import { ask, at, report } from "./service.js";
 import { tell } from "./tools.js";
 import { listed } from "./words.js";
 
+// `path` may also be a function that makes the file and returns its path.
 const download = (text, path, name) => button(text, async () => {
   try {
-    const address = URL.createObjectURL(await (await ask(path)).blob());
+    const address = URL.createObjectURL(await (await ask(typeof path === "string" ? path : await path())).blob());
     Object.assign(document.createElement("a"), { href: address, download: `${fleet.mission}-${name}` }).click();
     setTimeout(() => URL.revokeObjectURL(address), 1000);
   } catch (error) { tell(error.message); }
 });
+async function finish() {
+  tell("The run is being finished; a long one takes minutes.");
+  const { number } = await (await ask("finalize", { method: "POST" })).json();
+  tell("The run is finished.");
+  return `missions/${encodeURIComponent(fleet.mission)}/runs/${number}.zip`;
+}
 const stem = (map) => (map ? `map_${map}` : "map");
 
 export function showFiles() {
@@ -24,6 +31,7 @@ export function showFiles() {
     card("Paths", "Where each robot was, and when, as text in the format of TUM; and all measurements between scans, in the format g2o.",
       download("Paths (zip)", "trajectories.zip", "paths.zip"), download("Pose graph (g2o)", "pose_graph.g2o", "pose_graph.g2o")),
     ...(report ? [] : [card("Report", "This page as one file that needs no service. It opens in any browser.", download("Report (html)", "report.html", "report.html"))]),
+    ...(mayEdit && !readOnly ? [card("Finished run", "The map of all that arrived, and how accurate each square metre is. Unpack it and open it with fcslam show. The robots may go on.", download("Finished run (zip)", finish, "run.zip"))] : []),
     ...(mayEdit && !readOnly ? [card("Mission", "All that the robots sent and all edits. Another service can import it.", download("Mission file", `missions/${encodeURIComponent(mission)}/export`, "mission.sqlite"))] : []),
     card("This view", "A link that opens the same part of the map. It holds no token.", button("Copy the link", () => navigator.clipboard.writeText(location.href).then(() => tell("The link is copied."), () => tell(`Copy it from the address bar: ${location.href}`))), button("Print", () => print())),
   ]);

@@ -14,19 +14,3 @@ export const distance = (p, q) => Math.hypot(p[0] - q[0], p[1] - q[1]);
 export const length = (points) => points.reduce((sum, p, k) => sum + (k ? distance(p, points[k - 1]) : 0), 0);
 export const area = (points) => Math.abs(points.reduce((sum, [x, y], k) => { const [u, v] = points[(k + 1) % points.length]; return sum + x * v - y * u; }, 0)) / 2;
 export const middle = (points) => [0, 1].map((k) => points.reduce((sum, p) => sum + p[k], 0) / points.length);
-
-// The direction of most walls of pictures, up to an eighth of a turn: edges along it and across it count the same.
-export function wallDirection(images) {
-  let sin = 0, cos = 0;
-  for (const { data, width, height } of images)
-    for (let y = 1; y < height - 1; y++)
-      for (let x = 1; x < width - 1; x++) {
-        const k = 4 * (y * width + x), at = (i, j) => data[k + 4 * (i + j * width)];
-        const dx = at(1, -1) + 2 * at(1, 0) + at(1, 1) - at(-1, -1) - 2 * at(-1, 0) - at(-1, 1), dy = at(-1, -1) + 2 * at(0, -1) + at(1, -1) - at(-1, 1) - 2 * at(0, 1) - at(1, 1);
-        const strength = Math.hypot(dx, dy); // Sobel
-        if (strength < 150) continue;
-        const angle = 4 * Math.atan2(dy, dx);
-        sin += strength * Math.sin(angle); cos += strength * Math.cos(angle);
-      }
-  return Math.atan2(sin, cos) / 4;
-}

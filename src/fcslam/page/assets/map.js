@@ -1,7 +1,7 @@
 // The map: tiles, layers, and how the pointer and the keys move it.
 
 import { colourOf, fleet, isPast, keyOf, poseAt, robotNamed } from "./fleet.js";
-import { distance, middle, movedPoint, wallDirection } from "./geometry.js";
+import { distance, middle, movedPoint } from "./geometry.js";
 import { Refused, ask, at, json, report } from "./service.js";
 
 const WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
@@ -67,19 +67,21 @@ export function onMap([px, py]) {
   return [view.x + c * u + s * v, view.y - s * u + c * v];
 }
 
-// The view of a whole map, or of its paths while it has no cells; undefined if there are none.
-function whole(index, width, height, turn = 0) {
-  const extent = fleet.maps.find((m) => m.map === index)?.extent, corners = extent ? [[extent[0], extent[1]], [extent[2], extent[1]], [extent[2], extent[3]], [extent[0], extent[3]]] : [];
-  const points = corners.length ? corners : fleet.robots.flatMap((r) => (r.map === index ? (fleet.trails.get(r.session) ?? []).map((p) => p.slice(1, 3)) : []));
-  if (!points.length) return undefined;
-  const [c, s] = cosSin(turn), low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-  for (const [x, y] of points) for (const [k, value] of [c * x - s * y, s * x + c * y].entries()) { low[k] = Math.min(low[k], value); high[k] = Math.max(high[k], value); }
-  const [u, v] = [0, 1].map((k) => (low[k] + high[k]) / 2);
-  return { x: c * u + s * v, y: -s * u + c * v, scale: Math.min(width / (high[0] - low[0] + 2), height / (high[1] - low[1] + 2)), turn };
+function cornersOf(index) {
+  const extent = fleet.maps.find((m) => m.map === index)?.extent;
+  return extent ? [0, 2].flatMap((i) => [1, 3].map((j) => [extent[i], extent[j]])) : [];
 }
+// Shows all of the open map and of the one beside it, or of the paths while there are no cells.
 export function fit() {
-  const inset = size.w > 700 ? 40 : 10;
-  chart.view = whole(chart.index, size.w - inset, size.h - inset, chart.view?.turn) ?? chart.view;
+  const { beside } = chart, turn = chart.view?.turn ?? 0, [c, s] = cosSin(turn), inset = size.w > 700 ? 40 : 10;
+  const cells = [...cornersOf(chart.index), ...(beside ? cornersOf(beside.map).map((corner) => movedPoint(beside.pose, corner)) : [])];
+  const points = cells.length ? cells : fleet.robots.flatMap((r) => (r.map === chart.index ? (fleet.trails.get(r.session) ?? []).map((p) => p.slice(1, 3)) : []));
+  if (points.length) {
+    const along = points.map(([x, y]) => [c * x - s * y, s * x + c * y]);
+    const [low, high] = [Math.min, Math.max].map((pick) => [0, 1].map((k) => along.reduce((end, p) => pick(end, p[k]), along[0][k])));
+    const [u, v] = [0, 1].map((k) => (low[k] + high[k]) / 2);
+    chart.view = { x: c * u + s * v, y: -s * u + c * v, scale: Math.min((size.w - inset) / (high[0] - low[0] + 2), (size.h - inset) / (high[1] - low[1] + 2)), turn };
+  }
   redraw();
 }
 export function fitAll() { chart.moved = false; chart.followed = false; fit(); }
@@ -102,17 +104,9 @@ export function goTo([x, y], scale = 40) {
 }
 export function forgetTiles() { for (const { picture } of tiles.values()) picture?.close(); tiles.clear(); redraw(); }
 
-// Turns the map so that most walls of the tiles that are there are level, or back.
-export function levelWalls() {
-  if (!chart.view) return;
-  const side = TILE_PX / 4, brush = new OffscreenCanvas(side, side).getContext("2d", { willReadFrequently: true });
-  brush.filter = "blur(1px)"; // no stairs of cells
-  const images = [...tiles].filter(([key, { picture }]) => picture && key.startsWith(`${chart.index}/`)).map(([, { picture }]) => {
-    brush.fillStyle = theme.unknown; brush.fillRect(0, 0, side, side);
-    brush.drawImage(picture, 0, 0, side, side);
-    return brush.getImageData(0, 0, side, side);
-  });
-  chart.view.turn = chart.view.turn ? 0 : -wallDirection(images);
+// Turns the map so that most walls are level, or back.
+export async function levelWalls() {
+  chart.view.turn = chart.view.turn ? 0 : -(await json(`maps/${chart.index}/walls`)).direction_rad;
   fitAll();
 }
 
@@ -227,6 +221,13 @@ export function label(text, [px, py], colour = theme.ink, size = 13) {
   pen.lineWidth = 4; pen.lineJoin = "round"; pen.strokeStyle = theme.surface; pen.strokeText(text, px, py);
   pen.fillStyle = colour; pen.fillText(text, px, py);
 }
+// Places the name of a robot above it, or below if another name is there.
+let named = [];
+function nameRobot(text, [px, py]) {
+  const half = 4 * text.length, isTaken = (y) => named.some(([x, v, wide]) => Math.abs(x - px) < wide + half && Math.abs(v - y) < 15);
+  const y = isTaken(py - 18) ? py + 28 : py - 18;
+  named.push([px, y, half, text]);
+}
 export function dot(point, colour = theme.accent, radius = 5) {
   pen.beginPath(); pen.arc(...onScreen(point), radius, 0, 2 * Math.PI);
   pen.fillStyle = colour; pen.fill(); pen.strokeStyle = theme.surface; pen.lineWidth = 2; pen.stroke();
@@ -264,7 +265,7 @@ function drawRobot(robot) {
   pen.lineJoin = "round"; pen.lineWidth = isChosen ? 7 : 4; pen.strokeStyle = isChosen ? theme.accent : theme.surface; pen.stroke();
   pen.fillStyle = colour; pen.fill();
   pen.restore();
-  if (isShown("names")) label(robot.robot, [px, py - 18]);
+  if (isShown("names")) nameRobot(robot.robot, [px, py]);
 }
 const isEarlierDrive = (robot) => fleet.robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch && r.map === robot.map);
 
@@ -324,9 +325,11 @@ function draw() {
   if (isShown("grid")) drawGrid();
   if (isShown("closures")) for (const [channel, colour] of [["lidar", theme.laser], ["camera", theme.camera], ["tag", theme.free]]) strokeWay(linksOf(channel), colour, 1, 0.5);
   if (isShown("areas")) for (const region of fleet.regions) drawRegion(region);
+  named = [];
   const chosen = fleet.selected, shown = fleet.robots.filter((r) => r.map === chart.index && r.T_map_base && !r.removed);
   for (const robot of shown.filter((r) => r.session !== chosen)) drawRobot(robot);
   for (const robot of shown.filter((r) => r.session === chosen)) drawRobot(robot); // on top
+  for (const [x, y, , text] of named) label(text, [x, y]);
   if (chart.closure) {
     const ends = chart.closure.ends.filter((end, k) => end && robotNamed([chart.closure.robot_i, chart.closure.robot_j][k])?.map === chart.index);
     if (chart.closure.map === chart.index) outline(ends, { colour: theme.laser, width: 4, closed: false });

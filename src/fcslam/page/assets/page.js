@@ -71,7 +71,7 @@ for (const tool of document.querySelectorAll("[data-tool]"))
 for (const turn of document.querySelectorAll("[data-turn]")) turn.addEventListener("click", () => spin(turn.dataset.turn * TURN_RAD));
 const acts = {
   "zoom-in": () => zoom(1.4), "zoom-out": () => zoom(1 / 1.4), fit: fitAll, save, cancel: stop, veto: () => decide("veto"), pin: () => decide("pin"), locate,
-  level: () => { levelWalls(); showControls(); },
+  level: () => levelWalls().then(showControls, (error) => tell(error.message)),
   follow: () => { chart.followed = !chart.followed; if (chart.followed) { showRobot(fleet.selected); chart.followed = true; } showControls(); },
   reload: () => location.reload(),
 };

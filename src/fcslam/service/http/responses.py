@@ -167,6 +167,12 @@ class LearningRound(Settings):
     measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
 
 
+class WallDirection(Settings):
+    """How a map's walls run."""
+
+    direction_rad: float = Field(description="of most walls, from the x axis, in [-pi/4, pi/4)")
+
+
 class MapShape(Settings):
     """A shape that is drawn over a map, and its label."""
 

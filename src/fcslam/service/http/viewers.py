@@ -30,6 +30,7 @@ from fcslam.service.http.responses import (
     MapSummary,
     RobotSummary,
     SessionSummary,
+    WallDirection,
     content,
     refusals,
 )
@@ -37,7 +38,7 @@ from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
 from fcslam.service.learning_rounds import read_rounds
 from fcslam.service.live_poses import live_scan
-from fcslam.service.map_layers import map_shapes
+from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
     all_sessions,
@@ -209,6 +210,14 @@ def map_router(state: ViewerState) -> APIRouter:
         """What is drawn over a map: floor plan and deviations, changes since the first day, tags, certificate."""
         async with turn:
             return await run_in_threadpool(map_shapes, state.mission, k, layer)
+
+    @router.get("/maps/{k}/walls", responses=refusals(400, 404))
+    async def get_walls(k: Index) -> WallDirection:
+        """The direction of most walls of a map."""
+        folder = _folder_of(state)
+        _existing(state, f"{map_stem(k)}.pgm")
+        async with turn:
+            return await run_in_threadpool(walls_of, folder, k)
 
     @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
     def get_metrics() -> FileResponse:
