@@ -7,6 +7,7 @@ import re
 import signal
 import socket
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 from zipfile import ZipFile
@@ -371,7 +372,9 @@ def test_a_viewer_sees_and_may_not_veto(page, packets, credentials, tmp_path):
         view(page, "edits")
         says(page, "#locked", "Your token may look")
         assert page.locator(".admin:visible").count() == 0
-        assert "Mission file" not in page.locator("#files").text_content()
+        files = page.locator("#files").text_content()
+        assert "Report (html)" in files
+        assert not any(name in files for name in ("Mission file", "Finished run"))
         with httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {token('eye')}"}) as client:
             assert client.get(f"{API}/edits").json() == []
 
@@ -495,17 +498,45 @@ def test_shortcuts_of_the_browser_are_left_to_it_and_the_pointer_has_coordinates
     assert re.fullmatch(r"[\d.]+ m", page.locator("#metres").inner_text())
 
 
+def fulfil(answer, route):
+    route.fulfill(body=json.dumps(answer))
+
+
 def test_a_robot_with_a_hostile_name_is_text(page, mapped):
     """No robot can have such a name; a page must not rely on that."""
     evil = "<script>window.evil=1</script><img src=x onerror=window.evil=1>"
 
-    robots = [{**robot, "session": evil, "robot": evil} for robot in httpx.get(f"{mapped.url}{API}/robots").json()]
-    page.route("**/api/v1/robots", lambda route: route.fulfill(body=json.dumps(robots)))
+    def ask(path):
+        return httpx.get(f"{mapped.url}{API}/{path}").json()
+
+    region = {"kind": "region", "content": {"use": "area", "name": evil, "session": evil, "stamp": 0, "polygon": []}}
+    closures = [
+        {**one, "robot_i": evil, "robot_j": f"{evil}+1", "explanation": evil}
+        for one in ask("closures?status=accepted&limit=5")
+    ]
+    answers = {
+        "fleet": {**ask("fleet"), "mission": evil, "maps": 2},
+        "robots": [{**robot, "session": evil, "robot": evil, "floor": evil} for robot in ask("robots")],
+        "maps": [{**ask("maps")[0], "map": k, "robots": [evil], "floor": evil} for k in (0, 1)],
+        "edits": [{**region, "number": 1, "author": evil, "time_s": 1e9, "undone_by": None}],
+        "separations": [{"maps": [0, 1], "candidates": 1, "verified": 0, "reason": None, "explanation": evil}],
+        "closures?*": closures,
+        "metrics.json": [{"name": evil, "value": 1.0, "unit": evil}],
+    }
+    for path, answer in answers.items():
+        page.route(f"**/api/v1/{path}", partial(fulfil, answer))
     page.route("**/api/v1/trajectories/**", lambda route: route.fulfill(body="0 0 0 0 0 0 0 1\n"))
     page.goto(mapped.url)
     says(page, "#robots", evil)
-    for name in ("attention", "evidence", "history", "edits", "files"):
+    page.get_by_text("All numbers").click()
+    says(page, "#metrics", evil)
+    for name, where in {"attention": "#attention", "history": "#events", "edits": "#edits", "files": "#files"}.items():
         view(page, name)
+        says(page, where, evil)
+    view(page, "evidence")
+    page.locator("#two-robots").uncheck()
+    page.locator("#list button").first.click()
+    says(page, "#facts-of-closure", evil)
     assert page.evaluate("window.evil") is None
     assert page.locator("main img, main script").count() == 0
 
