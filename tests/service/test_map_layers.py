@@ -10,7 +10,7 @@ from fcslam.errors import EvaluationError
 from fcslam.maps.exports import outlines
 from fcslam.page.shown_run import ShownRun
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from fcslam.service.http.responses import Layer
+from fcslam.service.http.responses import MapLayer
 from fcslam.service.map_layers import layers_of, map_shapes, walls_of
 from fcslam.service.summaries import map_summaries
 from tests.mission.test_map_changes import write_run
@@ -57,30 +57,30 @@ def test_a_map_names_its_layers(run, tmp_path):
     write_run(tmp_path / "one-day", (0,))
     with ShownRun(tmp_path / "one-day", "one-day") as shown:
         assert layers_of(shown, 0) == []
-        assert map_shapes(shown, 0, Layer.CHANGES) == []
+        assert map_shapes(shown, 0, MapLayer.CHANGES) == []
 
 
 def test_a_plan_has_its_lines_and_what_differs_from_them(run):
-    plan, moved, missing = map_shapes(run, 0, Layer.PLAN)
+    plan, moved, missing = map_shapes(run, 0, MapLayer.PLAN)
     assert (plan.kind, plan.path) == ("plan", PLAN["drawing"])
     assert (moved.kind, moved.path, moved.text, moved.x, moved.y) == (
         "moved", "M1.0 2.0L3.0 2.0", "moved by 0.32 m", 2.0, 2.0
     )  # fmt: skip
     assert (missing.kind, missing.text) == ("missing", "")
-    assert map_shapes(run, 1, Layer.PLAN) == []
+    assert map_shapes(run, 1, MapLayer.PLAN) == []
 
 
 def test_tags_and_accuracy_are_those_of_the_map(run):
-    (tag,) = map_shapes(run, 0, Layer.TAGS)
+    (tag,) = map_shapes(run, 0, MapLayer.TAGS)
     assert (tag.kind, tag.text, tag.x, tag.y) == ("tag", "tag 7 (moved, or there twice)", 1.0, 2.0)
-    assert [(s.kind, s.path) for s in map_shapes(run, 0, Layer.QUALITY)] == [
+    assert [(s.kind, s.path) for s in map_shapes(run, 0, MapLayer.QUALITY)] == [
         ("good", "M0.0 0.0h1.0v1.0h-1.0z"), ("bad", "M1.0 0.0h1.0v1.0h-1.0z")
     ]  # fmt: skip
-    assert map_shapes(run, 1, Layer.QUALITY) == []
+    assert map_shapes(run, 1, MapLayer.QUALITY) == []
 
 
 def test_changes_lie_where_boxes_came_and_went(run):
-    shapes = {shape.kind: points(shape.path) for shape in map_shapes(run, 0, Layer.CHANGES)}
+    shapes = {shape.kind: points(shape.path) for shape in map_shapes(run, 0, MapLayer.CHANGES)}
     for kind, box in (("appeared", (1.0, -1.0)), ("disappeared", (1.0, 1.0))):
         assert np.abs(shapes[kind] - box).max() < 0.5
 
@@ -89,7 +89,7 @@ def test_a_broken_file_is_named(run, tmp_path):
     folder = write_run(tmp_path / "broken", (0,))
     (folder / "plan.json").write_text('{"maps": [3]}')
     with ShownRun(folder, "broken") as shown, pytest.raises(EvaluationError, match=r"plan\.json"):
-        map_shapes(shown, 0, Layer.PLAN)
+        map_shapes(shown, 0, MapLayer.PLAN)
 
 
 def test_outlines_run_through_the_middles_of_cells_and_around_holes():

@@ -14,7 +14,7 @@ from fcslam.mission.map_changes import changes_of
 from fcslam.mission.mission_file import stored_mission
 from fcslam.runs import QUALITY
 from fcslam.runs.map_files import map_stem, parse_map
-from fcslam.service.http.responses import Layer, MapShape, WallDirection
+from fcslam.service.http.responses import MapLayer, MapShape, WallDirection
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import read_bytes, read_text
 
@@ -22,10 +22,10 @@ TAG_M: Final = 0.15
 """Half a side of the square that stands for a tag."""
 
 
-_FILES: Final = {Layer.PLAN: PLAN_JSON, Layer.TAGS: TAGS_JSON, Layer.QUALITY: f"{QUALITY}.json"}
+_FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: f"{QUALITY}.json"}
 
 
-def layers_of(mission: ViewedMission, k: int) -> list[Layer]:
+def layers_of(mission: ViewedMission, k: int) -> list[MapLayer]:
     """The layers that map ``k`` may have; all but the changes are of finished runs."""
     folder = mission.run_folder
     if folder is None:
@@ -38,12 +38,12 @@ def layers_of(mission: ViewedMission, k: int) -> list[Layer]:
         if robot.map_index == k
     ):
         if first_s > ended_s:
-            return [*found, Layer.CHANGES]
+            return [*found, MapLayer.CHANGES]
         ended_s = last_s if ended_s == float("inf") else max(ended_s, last_s)
     return found
 
 
-def map_shapes(mission: ViewedMission, k: int, layer: Layer) -> list[MapShape]:
+def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape]:
     """A layer of map ``k``; empty if there is nothing to draw.
 
     Raises:
@@ -52,7 +52,7 @@ def map_shapes(mission: ViewedMission, k: int, layer: Layer) -> list[MapShape]:
     folder = mission.run_folder
     if folder is None:
         return []
-    if layer is Layer.CHANGES:
+    if layer is MapLayer.CHANGES:
         return _changes(mission, folder, k)
     try:
         content = json.loads(read_text(folder / _FILES[layer], folder))
@@ -126,8 +126,8 @@ def _shape(kind: str, path: str, text: str = "", x: float = 0.0, y: float = 0.0)
     return MapShape.model_validate({"kind": kind, "path": path, "text": text, "x": x, "y": y})
 
 
-_DRAWN: Final[Mapping[Layer, Callable[[Mapping[str, Any], int], list[MapShape]]]] = {
-    Layer.PLAN: _plan,
-    Layer.TAGS: _tags,
-    Layer.QUALITY: _quality,
+_DRAWN: Final[Mapping[MapLayer, Callable[[Mapping[str, Any], int], list[MapShape]]]] = {
+    MapLayer.PLAN: _plan,
+    MapLayer.TAGS: _tags,
+    MapLayer.QUALITY: _quality,
 }

@@ -291,7 +291,7 @@ function shapesOf(layer) {
   const path = `maps/${chart.index}/layers/${layer}`;
   if (!shapes.has(path)) {
     shapes.set(path, []);
-    json(path).then((found) => { shapes.set(path, found.map((one) => ({ ...one, path: new Path2D(one.path) }))); redraw(); }, () => {});
+    json(path).then((found) => { shapes.set(path, found.map((one) => ({ ...one, path: new Path2D(one.path) }))); redraw(); }, (error) => { at("message").textContent = error.message; });
   }
   return shapes.get(path);
 }

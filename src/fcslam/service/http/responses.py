@@ -135,7 +135,7 @@ class ClosureSummary(Settings):
     explanation: str = Field(description="the reason with its numbers, as one clause")
 
 
-class Layer(StrEnum):
+class MapLayer(StrEnum):
     """What is drawn over a map."""
 
     PLAN = "plan"
@@ -154,7 +154,7 @@ class MapSummary(Settings):
     extent: tuple[float, float, float, float] | None = Field(
         description="lowest x and y, highest x and y that the map covers, in metres; null before there is a map"
     )
-    layers: list[Layer] = Field(description="what can be drawn over it")
+    layers: list[MapLayer] = Field(description="what can be drawn over it")
     georeferenced: bool = Field(description="whether its place on the earth is known")
 
 

@@ -23,8 +23,8 @@ from fcslam.service.http.responses import (
     ClosureSummary,
     EditSummary,
     FleetSummary,
-    Layer,
     LearningRound,
+    MapLayer,
     MapSeparation,
     MapShape,
     MapSummary,
@@ -206,7 +206,7 @@ def map_router(state: ViewerState) -> APIRouter:
     turn = asyncio.Lock()  # changes take as much memory as a map
 
     @router.get("/maps/{k}/layers/{layer}", responses=refusals(400))
-    async def get_layer(k: Index, layer: Layer) -> list[MapShape]:
+    async def get_layer(k: Index, layer: MapLayer) -> list[MapShape]:
         """What is drawn over a map: floor plan and deviations, changes since the first day, tags, certificate."""
         async with turn:
             return await run_in_threadpool(map_shapes, state.mission, k, layer)
