@@ -30,6 +30,8 @@ playwright = pytest.importorskip("playwright.sync_api", reason="no Playwright: m
 
 AXE = Path(os.environ.get("FCSLAM_AXE", ".venv/axe/package/axe.min.js"))
 """axe-core, which looks for faults of accessibility; it comes from npm."""
+MOVED = 0x6A1B9A
+"""Colour of a wall that is elsewhere in the floor plan, on a light page."""
 WAIT_MS = 60_000
 WHOLE_PAGE_BYTES = 60_000
 
@@ -291,6 +293,9 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
     folder = write_run(tmp_path / "building", (0, 1))
     certificate = {"bar": 0.05, "cell": 1.0, "drives": [], "cells": [{"x": 0.0, "y": 0.0, "good": True}] * 3}
     (folder / "quality.json").write_text(json.dumps({"0": certificate}))
+    moved = {"kind": "moved", "start": [-1.0, 0.0], "end": [1.0, 0.0], "length_m": 2.0, "by_m": 0.3}
+    plan = {"drawing": "M-2 -2L2 -2z", "maps": [{"map": 0, "aligned": True, "deviations": [moved]}]}
+    (folder / "plan.json").write_text(json.dumps(plan))
     with ShownRun(folder, "building") as shown:
         (tmp_path / "report.html").write_text(report_html(shown))
     with (
@@ -304,7 +309,9 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
         assert pixels(page, [APPEARED]) == [0]
         page.get_by_label("Since the first day").check()
         until(page, lambda: pixels(page, [APPEARED])[0] > 50, "what appeared")
-        assert not page.get_by_label("Floor plan").is_visible()
+        page.get_by_label("Floor plan").check()
+        until(page, lambda: pixels(page, [MOVED])[0] > 50, "the wall that moved")
+        assert not page.get_by_label("Tags").is_visible()
         view(page, "history")
         says(page, "#events", "Monday")
         page.get_by_role("button", name="anna begins drive 2").click()
