@@ -14,6 +14,7 @@ Chromium runs without a window and draws in software, on the machine of the serv
   is zoomed and dragged; memory of the page's script, of its process, and of the process that answers.
 """
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -21,7 +22,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import cycle
@@ -182,7 +183,10 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
                         self.wfile.write(b'event: live\ndata: {"number": %d}\n\n' % number)
                         time.sleep(0.1)
             elif path.startswith("/api/v1/trajectories/"):
-                self.answer(tum[path.split("/")[-1].split(".")[0]].encode(), "text/plain")
+                poses = tum[path.split("/")[-1].split(".")[0]].encode()
+                known = len(poses) if "digest=" in self.path else 0
+                headers = {"Fcslam-After": str(known), "Fcslam-Digest": hashlib.sha256(poses).hexdigest()}
+                self.answer(poses[known:], "text/plain", headers)
             elif "/tiles/" in path:
                 self.answer(floor, "image/png")
             elif path == "/api/v1/robots":
@@ -192,8 +196,14 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
             else:
                 self.send_error(404)
 
-        def answer(self, body: bytes, kind: str) -> None:
-            self.send_response(200)
+        def answer(self, body: bytes, kind: str, headers: Mapping[str, str] | None = None) -> None:
+            """As the service does: what a browser has is not sent again."""
+            tag = f'"{hashlib.sha256(body).hexdigest()}"'
+            is_known = self.headers.get("If-None-Match") == tag
+            body = b"" if is_known else body
+            self.send_response(304 if is_known else 200)
+            for name, value in {"ETag": tag, "Cache-Control": "no-cache", **(headers or {})}.items():
+                self.send_header(name, value)
             self.send_header("Content-Type", kind)
             self.end_headers()
             self.wfile.write(body)

@@ -5,6 +5,7 @@
 To correct a page, correct the help of the command or the docstring of the route.
 """
 
+import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
@@ -145,8 +146,23 @@ def rest_page() -> str:
         "\n".join([f"## {name.capitalize()}", "", "| request | role | does |", "|---|---|---|", *rows, ""])
         for name, rows in groups.items()
     ]
+    numbers = ["## Numbers in answers", "", "| answer | field | meaning and unit |", "|---|---|---|"]
+    numbers += [f"| {answer} | `{field}` | {cell(meaning)} |" for answer, field, meaning in numbers_of(app.openapi())]
     head = ["## Parameters", "", "| request | parameter | in | allowed |", "|---|---|---|---|"]
-    return "\n".join([REST, *parts, *head, *parameters, ""])
+    return "\n".join([REST, *parts, *numbers, "", *head, *parameters, ""])
+
+
+def numbers_of(described: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Answer, field and meaning of all numbers that viewers get, as OpenAPI describes them."""
+    schemas = described["components"]["schemas"]
+    shown = [
+        path["get"] for path in described["paths"].values() if path.get("get", {}).get("tags") in (["fleet"], ["maps"])
+    ]
+    answers = re.findall(r"schemas/(\w+)", json.dumps([operation["responses"]["200"] for operation in shown]))
+    for name in sorted(set(answers)):
+        for field, schema in schemas[name]["properties"].items():
+            if re.search(r'"type": "(number|integer)"', json.dumps(schema)):
+                yield name, field, schema.get("description", "")
 
 
 def roles_of(routes: Iterable[Any]) -> Iterator[tuple[tuple[str, str], str]]:

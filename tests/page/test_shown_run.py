@@ -4,6 +4,7 @@ import asyncio
 import base64
 import gzip
 import hashlib
+import io
 import json
 import re
 import shutil
@@ -11,6 +12,7 @@ import subprocess
 from contextlib import aclosing
 from dataclasses import replace
 from html.parser import HTMLParser
+from zipfile import ZipFile
 
 import httpx
 import numpy as np
@@ -208,7 +210,9 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
         assert f"{kind} 'sha256-{digest}';" in policy
     assert policy.startswith("default-src 'none';")
     responses = json.loads(texts)
-    paths = [*ASKED, *(f"trajectories/{name}.tum" for name in ("a", "a%2B1", "b"))]
+    trajectories = (f"trajectories/{name}.tum" for name in ("a", "a%2B1", "b"))
+    layers = (f"maps/{k}/{part}" for k in (0, 1) for part in ("layers/quality", "walls"))
+    paths = [*ASKED, *trajectories, *layers]
     assert set(responses["texts"]) == set(paths)
     for path, answer in zip(paths, ask(shown, *(f"/api/v1/{path}" for path in paths)), strict=True):
         assert responses["texts"][path].splitlines() == answer.text.splitlines() or path == "maps"
@@ -217,9 +221,11 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
     (tile,) = ask(shown, f"/api/v1/{deepest[0]}")
     assert base64.b64decode(responses["pictures"][deepest[0]]) == tile.content
     files = responses["files"]
-    assert {"maps/0.pgm", "maps/0.yaml", "maps/1.pgm"} <= set(files)
-    (pgm,) = ask(shown, "/api/v1/maps/0.pgm")
-    assert gzip.decompress(base64.b64decode(files["maps/0.pgm"])) == pgm.content
+    paths = ["maps/0.zip", "maps/1.zip", "maps/0.svg", "trajectories.zip"]
+    for path, answer in zip(paths, ask(shown, *(f"/api/v1/{path}" for path in paths)), strict=True):
+        assert gzip.decompress(base64.b64decode(files[path])) == answer.content
+    with ZipFile(io.BytesIO(gzip.decompress(base64.b64decode(files["maps/1.zip"])))) as archive:
+        assert archive.namelist() == ["map_1.pgm", "map_1.yaml"]
 
 
 @pytest.mark.parametrize(("resolution_m", "zoom"), [(2.0, 0), (8.0, 0), (64.0, -1)])

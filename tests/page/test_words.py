@@ -47,7 +47,7 @@ def test_the_evidence_names_what_it_rests_on(told):
 
 def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):
     assert told["well"] == []
-    assert told["silent"] == [["a and c are silent, the first for 2 min.", "Show the robots"]]
+    assert told["silent"] == [["a and c have been silent, the first for 2 min.", "Show the robots"]]
     ((text, advice, why, do),) = told["apart"]
     assert (text, why, do) == ("a and b have separate maps.", "few points", {"map": 1, "beside": 0})
     assert "Drive b through an area that a has mapped" in advice
@@ -63,6 +63,14 @@ def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):
     assert told["late"] == ["The map is 2 min old, and 3 messages of robots are not in it yet."]
     assert told["contradiction"] == [
         ["What a measured contradicts the other paths.", {"view": "evidence", "robot": "a"}]
+    ]
+
+
+def test_the_accuracy_is_that_of_the_certificate(told):
+    assert told["accuracy"] == [
+        "3 of 4 m² of the map are accurate to 5 cm.",
+        "",
+        "How accurate the map is, its finished run tells: see Download.",
     ]
 
 

@@ -19,6 +19,7 @@ console.log(JSON.stringify({
   vetoed: need({ robots: [a, alone], maps: [{ map: 0, robots: ["a"] }, { map: 1, robots: ["b"] }], separations: [{ ...apart, reason: "vetoed" }] }).map((n) => n.do),
   disk: need({ counts: { ...counts, free_bytes: 4e8 } }).map((n) => n.text),
   certificate: need({ quality: { 0: { bar: 0.05, cells: [{ good: true }, { good: false }, { good: false }], drives: [{ text: "drive from (1, 2) to (3, 4) again: about 2 m2 more are good then", from: [1, 2], to: [3, 4] }] }, 1: { bar: 0.05, cells: [{ good: false }], drives: [] } } }).map((n) => [n.text, n.help, n.do]),
+  accuracy: [{ quality: { 0: { bar: 0.05, cells: [1, 1, 0].map((good) => ({ good })) }, 1: { bar: 0.05, cells: [{ good: 1 }] } }, readOnly: true }, { quality: {}, readOnly: true }, { quality: {}, readOnly: false, maps: [0] }].map(accuracy),
   late: need({ counts: { ...counts, applied: 2, map_age_s: 100 } }).map((n) => n.text),
   contradiction: need({ contradicted: [{ ...closure, reason: "robot_contradicted", explanation: "why" }] }).map((n) => [n.text, n.do]),
   sensors: ["lidar", "camera", "tag"].map((channel) => sensorOf({ channel })),

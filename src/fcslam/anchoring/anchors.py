@@ -20,6 +20,7 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
+from fcslam.maps.exports import outlines
 from fcslam.records import FloatArray, frozen
 from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
@@ -121,8 +122,9 @@ def anchored(
     if result.sightings or anchors.survey is not None:
         files[TAGS_JSON] = _json({"tags": tags, "distances": distances, "surveyed": surveyed})
     if anchors.plan is not None:
-        files[PLAN_JSON] = _json({"maps": reports})
-        files[PLAN_PNG] = _picture(anchors.plan.drawing, pictures)
+        drawing = anchors.plan.drawing
+        files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
+        files[PLAN_PNG] = _picture(drawing, pictures)
     return Anchored(result, files)
 
 

@@ -2,8 +2,11 @@
 
 import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -14,6 +17,8 @@ from fcslam.untrusted import MOST_TEXT_BYTES, read_bytes, read_text
 _WALL, _FLOOR = "#1a1a1a", "#e8edf2"
 _TRANSFORMATION, _KEYS, _NUMBERS = 34264, 34735, 34736
 """Tags of GeoTIFF: from pixels to coordinates, the coordinate system, and numbers that it refers to."""
+_SMOOTHED_CELLS = 0.7
+"""Outlines leave the cells' corners by less."""
 _SHORT, _DOUBLE = 3, 12
 """Types of values in TIFF."""
 
@@ -41,7 +46,7 @@ def earth_frame(folder: Path, number: int) -> EarthFrame | None:
 
 
 def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
-    """A map of a run folder as ``svg`` or ``tif``.
+    """A map of a run folder as ``svg`` or ``tif``, or its ``pgm`` and ``yaml`` as ``zip``.
 
     Returns:
         None if there is no such map, or if it is to be on the earth and its place there is not known.
@@ -54,6 +59,8 @@ def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
         pgm, description = (read_bytes(folder / f"{stem}.{end}", folder) for end in ("pgm", "yaml"))
     except OSError:
         return None
+    if suffix == "zip":
+        return zipped({f"{stem}.pgm": pgm, f"{stem}.yaml": description})
     occupancy = parse_map(stem, pgm, description.decode(errors="replace"))
     if suffix == "svg":
         return map_svg(occupancy).encode()
@@ -82,6 +89,29 @@ def _area(mask: NDArray[np.bool_]) -> str:
     ends = np.nonzero(edges == -1)[1]
     runs = zip(begins.tolist(), rows.tolist(), (ends - begins).tolist(), strict=True)
     return "".join(f"M{x} {y}h{length}v1h-{length}z" for x, y, length in runs)
+
+
+def outlines(mask: NDArray[np.bool_], occupancy: OccupancyMap) -> str:
+    """The outlines of a mask (H, W) of a map's cells as the data of an SVG path in metres of the map.
+
+    They run through the middles of cells, so a line of single cells is a line.
+    """
+    rings, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+    paths = []
+    for ring in rings:
+        corners = cv2.approxPolyDP(ring, _SMOOTHED_CELLS, closed=True)[:, 0]
+        metres = (corners + 0.5) * occupancy.resolution_m + np.array(occupancy.origin_xy)
+        paths.append("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in metres) + "z")
+    return "".join(paths)
+
+
+def zipped(files: Mapping[str, bytes]) -> bytes:
+    """Files by name as a ZIP archive; the same files give the same bytes."""
+    archive = io.BytesIO()
+    with ZipFile(archive, "w", ZIP_DEFLATED) as writer:
+        for name, content in files.items():
+            writer.writestr(ZipInfo(name), content, ZIP_DEFLATED)
+    return archive.getvalue()
 
 
 def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:

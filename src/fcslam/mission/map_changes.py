@@ -54,8 +54,20 @@ def find_changes(folder: Path, since: str | None = None, until: str | None = Non
         SourceError: it has no mission file or no such map, its robots sent words only, or a time is unknown or before
             the first period.
     """
-    run = open_run(folder)
-    seen = _seen(run, read_mission(folder), map_index, folder)
+    return changes_of(open_run(folder), read_mission(folder), since, until, map_index, str(folder))
+
+
+def changes_of(
+    run: Run, mission: SavedMission, since: str | None, until: str | None, map_index: int, name: str
+) -> Changes:
+    """As ``find_changes``, of a run and its mission; ``name`` tells in messages which run it is.
+
+    Keyscans that are newer than the run are left out.
+
+    Raises:
+        SourceError: as for ``find_changes``.
+    """
+    seen = _seen(run, mission, map_index, name)
     periods = periods_of(seen.keyscans)
     first = 0 if since is None else _period_at("since", since, periods)
     last = len(periods) - 1 if until is None else _period_at("until", until, periods)
@@ -64,7 +76,7 @@ def find_changes(folder: Path, since: str | None = None, until: str | None = Non
             f"nothing to compare: no session between {_named(periods[first])} and {_named(periods[last])}; "
             f"the map has {len(periods)} period{'s' * (len(periods) != 1)}: {'; '.join(map(_named, periods))}"
         )
-    config = read_mission(folder).config.map
+    config = mission.config.map
     kept = {session for period in periods[: last + 1] for session in period.sessions}
     rows = [k for k, keyscan in enumerate(seen.keyscans) if keyscan.id.robot in kept]
     keyscans = [seen.keyscans[k] for k in rows]
@@ -123,11 +135,15 @@ def _table(changes: Changes) -> str:
     return text.getvalue()
 
 
-def _seen(run: Run, mission: SavedMission, map_index: int, folder: Path) -> _Seen:
+def _seen(run: Run, mission: SavedMission, map_index: int, name: str) -> _Seen:
     """The keyscans of the run's map and their poses; sessions that are not in it are left out."""
     members = {name: robot for name, robot in run.trajectories.items() if robot.map_index == map_index}
     if not members:
-        raise SourceError(f"{folder}: has no map {map_index}; the first one is 0")
+        raise SourceError(f"{name}: has no map {map_index}; the first one is 0")
+
+    def is_mapped(keyscan: Keyscan) -> bool:
+        return bool(keyscan.stamp <= members[keyscan.id.robot].stamps.max() + STAMP_TOLERANCE_S)
+
     lasers: dict[str, Sequence[LaserModel]] = {}
     keyscans: list[Keyscan] = []
     poses: list[FloatArray] = []
@@ -138,17 +154,17 @@ def _seen(run: Run, mission: SavedMission, map_index: int, folder: Path) -> _See
                 continue
             if isinstance(packet.body, Hello):
                 lasers[packet.robot] = packet.body.lasers
-            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
+            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m) and is_mapped(packet.body):
                 keyscans.append(packet.body)
     if not keyscans:
-        raise SourceError(f"{folder}: no robot of map {map_index} sent ranges (robot.sends: words); nothing to compare")
+        raise SourceError(f"{name}: no robot of map {map_index} sent ranges (robot.sends: words); nothing to compare")
     stamps = {name: np.argsort(robot.stamps, kind="stable") for name, robot in members.items()}
     for keyscan in keyscans:
         robot, order = members[keyscan.id.robot], stamps[keyscan.id.robot]
         sorted_stamps = robot.stamps[order]
         k = min(int(np.searchsorted(sorted_stamps, keyscan.stamp - STAMP_TOLERANCE_S)), len(order) - 1)
         if k < 0 or abs(sorted_stamps[k] - keyscan.stamp) > STAMP_TOLERANCE_S:
-            raise SourceError(f"{folder}: the trajectory of {keyscan.id.robot} has no pose at {keyscan.stamp:.6f} s")
+            raise SourceError(f"{name}: the trajectory of {keyscan.id.robot} has no pose at {keyscan.stamp:.6f} s")
         poses.append(robot.T_map_base[order[k]])
     return _Seen(keyscans, np.array(poses).reshape(-1, 3), lasers)
 

@@ -108,7 +108,7 @@ def read_mission(path: Path) -> SavedMission:
     path = mission_path(path)
     try:
         with opened_copy(path) as store:
-            mission = replace(_read(store), state=_state_beside(path))
+            mission = replace(stored_mission(store), state=_state_beside(path))
         if mission.state is None:
             check_unpacked(
                 sum(len(packet.data) for packet in mission.stored),
@@ -252,7 +252,8 @@ def as_stored(sized: SizedPacket) -> StoredPacket:
     return StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, sized.data)
 
 
-def _read(store: MissionStore) -> SavedMission:
+def stored_mission(store: MissionStore) -> SavedMission:
+    """What a store holds, without a state."""
     packets: list[StoredPacket] = []
     last = 0
     while arrived := store.arrivals(last, _AT_ONCE):

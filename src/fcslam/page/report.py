@@ -19,6 +19,7 @@ from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, OccupancyMap, open_run
 from fcslam.runs.map_files import map_stem
+from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
     all_sessions,
@@ -27,6 +28,7 @@ from fcslam.service.summaries import (
     map_summaries,
     newest_closures,
     run_of,
+    trajectories_zip,
 )
 from fcslam.service.viewed_mission import ViewedMission
 from fcslam.untrusted import read_text
@@ -55,15 +57,17 @@ def report_html(mission: ViewedMission) -> str:
 
 def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
     """Responses of the service to the page, by path. Maps have tiles down to ``zooms``."""
-    sessions = all_sessions(mission)
+    sessions, maps = all_sessions(mission), map_summaries(mission)
     texts = {
         "fleet": _json(fleet_summary(mission, read_only=True, may_edit=False)),
-        "maps": _json(one.model_copy(update={"zoom": zooms.get(one.map, 0)}) for one in map_summaries(mission)),
+        "maps": _json(one.model_copy(update={"zoom": zooms.get(one.map, 0)}) for one in maps),
         "separations": _json(map_separations(mission)),
         "robots": _json(sessions),
         "edits": _json(all_edits(mission)),
         "learning": "[]",
     }
+    for k, layer in [(one.map, layer) for one in maps for layer in one.layers]:
+        texts[f"maps/{k}/layers/{layer}"] = _json(map_shapes(mission, k, layer))
     for status in ClosureStatus:
         try:
             texts[f"closures?status={status}&limit={MOST_CLOSURES}"] = newest_closures(
@@ -71,6 +75,8 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
             ).decode()
         except ValueError as error:
             raise EvaluationError(f"the run has closures that cannot be shown ({error})") from error
+    if mission.run_folder is not None:
+        texts |= {f"maps/{k}/walls": _json(walls_of(mission.run_folder, k)) for k in zooms}
     located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
     if mission.run_folder is not None:
         for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):
@@ -98,11 +104,12 @@ def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
     """What the page downloads, compressed with gzip and in base64, by path."""
     if mission.run_folder is None:
         return {}
-    named = {f"maps/{k}.{suffix}": f"{map_stem(k)}.{suffix}" for k in maps for suffix in ("pgm", "yaml", "png")}
+    named = {f"maps/{k}.png": f"{map_stem(k)}.png" for k in maps}
     named[POSE_GRAPH] = POSE_GRAPH
     files = {path: mission.run_folder / name for path, name in named.items()}
     contents = {path: file.read_bytes() for path, file in files.items() if file.is_file()}
-    for k, suffix in itertools.product(maps, ("svg", "tif")):
+    contents[f"{TRAJECTORIES}.zip"] = trajectories_zip(mission.run_folder)
+    for k, suffix in itertools.product(maps, ("zip", "svg", "tif")):
         if (exported := export_map(mission.run_folder, k, suffix)) is not None:
             contents[f"maps/{k}.{suffix}"] = exported
     return {path: base64.b64encode(gzip.compress(content, mtime=0)).decode() for path, content in contents.items()}

@@ -13,12 +13,12 @@ from typing import Any
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
-from fcslam.maps.exports import earth_frame
+from fcslam.maps.exports import earth_frame, zipped
 from fcslam.maps.palette import robot_colors
 from fcslam.maps.tiles import finest_zoom
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel, ClosureStatus, Edit
-from fcslam.runs import ClosureRow, Run, separations
+from fcslam.runs import TRAJECTORIES, ClosureRow, Run, separations
 from fcslam.runs.map_files import HEADER_BYTES, area_of, map_stem
 from fcslam.service.http.responses import (
     ClosureSummary,
@@ -29,6 +29,7 @@ from fcslam.service.http.responses import (
     SessionSummary,
 )
 from fcslam.service.live_poses import live_pose
+from fcslam.service.map_layers import layers_of
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes
 from fcslam.wire.messages import Hello
@@ -145,10 +146,17 @@ def map_summaries(mission: ViewedMission) -> list[MapSummary]:
             floor=floor,
             robots=[r.robot for r in robots if r.map_index == k],
             **_tiling(folder, map_stem(k)),
+            layers=layers_of(mission, k),
             georeferenced=folder is not None and earth_frame(folder, k) is not None,
         )
         for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
     ]
+
+
+def trajectories_zip(folder: Path) -> bytes:
+    """The trajectories of a run folder as one archive."""
+    files = sorted((folder / TRAJECTORIES).glob("*.tum"))
+    return zipped({file.name: read_bytes(file, folder) for file in files})
 
 
 def map_separations(mission: ViewedMission) -> list[MapSeparation]:

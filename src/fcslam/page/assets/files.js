@@ -1,32 +1,38 @@
 // What the page gives away: files of the map, and a link to the view that is open.
 
 import { fleet } from "./fleet.js";
-import { zip } from "./geometry.js";
 import { chart } from "./map.js";
 import { button, element, fill } from "./panels.js";
 import { ask, at, report } from "./service.js";
 import { tell } from "./tools.js";
 import { listed } from "./words.js";
 
-const bytes = async (path) => new Uint8Array(await (await ask(path)).arrayBuffer());
-function save(name, blob) {
-  const address = URL.createObjectURL(blob);
-  Object.assign(document.createElement("a"), { href: address, download: name }).click();
-  setTimeout(() => URL.revokeObjectURL(address), 1000);
+// `path` may also be a function that makes the file and returns its path.
+const download = (text, path, name) => button(text, async () => {
+  try {
+    const address = URL.createObjectURL(await (await ask(typeof path === "string" ? path : await path())).blob());
+    Object.assign(document.createElement("a"), { href: address, download: `${fleet.mission}-${name}` }).click();
+    setTimeout(() => URL.revokeObjectURL(address), 1000);
+  } catch (error) { tell(error.message); }
+});
+async function finish() {
+  tell("The run is being finished; a long one takes minutes.");
+  const { number } = await (await ask("finalize", { method: "POST" })).json();
+  tell("The run is finished.");
+  return `missions/${encodeURIComponent(fleet.mission)}/runs/${number}.zip`;
 }
-const saver = (name, make) => () => make().then((blob) => save(`${fleet.mission}-${name}`, blob), (error) => tell(error.message));
-const whole = (path, name) => saver(name, async () => new Blob([await bytes(path)]));
 const stem = (map) => (map ? `map_${map}` : "map");
 
 export function showFiles() {
-  const { maps, robots, readOnly, mayEdit, mission } = fleet, card = (title, text, ...buttons) => { const item = element("li", element("h3", title)); item.append(element("p", text), ...buttons); return item; };
+  const { maps, readOnly, mayEdit, mission } = fleet, card = (title, text, ...buttons) => { const item = element("li", element("h3", title)); item.append(element("p", text), ...buttons); return item; };
   fill(at("files"), [mission, maps.map((m) => [m.map, m.robots, m.extent, m.georeferenced]), mayEdit], () => [
     ...maps.filter((m) => m.extent).map((m) => card(maps.length > 1 ? `Map of ${listed(m.robots)}` : "Map", "For Nav2 and other programs of ROS: a picture of cells and its description, in one archive.",
-      button("Map for Nav2 (zip)", saver(`${stem(m.map)}.zip`, async () => zip(await Promise.all(["pgm", "yaml"].map(async (end) => [`${stem(m.map)}.${end}`, await bytes(`maps/${m.map}.${end}`)]))))), ...[["Picture", "png"], ["Drawing", "svg"], ...(m.georeferenced ? [["On the earth", "tif"]] : [])].map(([name, end]) => button(`${name} (${end})`, whole(`maps/${m.map}.${end}`, `${stem(m.map)}.${end}`))))),
+      ...[["Map for Nav2", "zip"], ["Picture", "png"], ["Drawing", "svg"], ...(m.georeferenced ? [["On the earth", "tif"]] : [])].map(([name, end]) => download(`${name} (${end})`, `maps/${m.map}.${end}`, `${stem(m.map)}.${end}`)))),
     card("Paths", "Where each robot was, and when, as text in the format of TUM; and all measurements between scans, in the format g2o.",
-      button("Paths (zip)", saver("paths.zip", async () => zip(await Promise.all(robots.filter((r) => r.map !== null).map(async (r) => [`${r.session}.tum`, await bytes(`trajectories/${encodeURIComponent(r.session)}.tum`)]))))), button("Pose graph (g2o)", whole("pose_graph.g2o", "pose_graph.g2o"))),
-    ...(report ? [] : [card("Report", "This page as one file that needs no service. It opens in any browser.", button("Report (html)", whole("report.html", "report.html")))]),
-    ...(mayEdit && !readOnly ? [card("Mission", "All that the robots sent and all edits. Another service can import it.", button("Mission file", whole(`missions/${encodeURIComponent(mission)}/export`, "mission.sqlite")))] : []),
+      download("Paths (zip)", "trajectories.zip", "paths.zip"), download("Pose graph (g2o)", "pose_graph.g2o", "pose_graph.g2o")),
+    ...(report ? [] : [card("Report", "This page as one file that needs no service. It opens in any browser.", download("Report (html)", "report.html", "report.html"))]),
+    ...(mayEdit && !readOnly ? [card("Finished run", "The map of all that arrived, and how accurate each square metre is. Unpack it and open it with fcslam show. The robots may go on.", download("Finished run (zip)", finish, "run.zip"))] : []),
+    ...(mayEdit && !readOnly ? [card("Mission", "All that the robots sent and all edits. Another service can import it.", download("Mission file", `missions/${encodeURIComponent(mission)}/export`, "mission.sqlite"))] : []),
     card("This view", "A link that opens the same part of the map. It holds no token.", button("Copy the link", () => navigator.clipboard.writeText(location.href).then(() => tell("The link is copied."), () => tell(`Copy it from the address bar: ${location.href}`))), button("Print", () => print())),
   ]);
 }

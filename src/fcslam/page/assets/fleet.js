@@ -1,6 +1,6 @@
 // The state of the mission, as the service gave it last.
 
-import { Outdated, ask, at, json, report } from "./service.js";
+import { Outdated, ask, at, json, report, unlessSame } from "./service.js";
 
 const MOST_CLOSURES = 5000; // that the page asks for
 
@@ -27,7 +27,7 @@ async function trail(name) {
     const [stamp, x, y, , , , qz, qw] = l.split(" ").map(Number);
     return [stamp, x, y, 2 * Math.atan2(qz, qw)];
   });
-  const all = after ? known.poses.concat(poses) : poses;
+  const all = !after ? poses : poses.length ? known.poses.concat(poses) : known.poses;
   if (digest) received.set(name, { bytes: after + text.length, digest, poses: all });
   return all;
 }
@@ -46,7 +46,8 @@ export function placed(c) {
   const [map, other] = [c.robot_i, c.robot_j].map((name) => robotNamed(name)?.map ?? null), ends = [poseAt(c.robot_i, c.stamp_i), poseAt(c.robot_j, c.stamp_j)];
   return { ...c, ends, map: map === other && ends.every(Boolean) ? map : null };
 }
-export const closures = async (status) => (await json(`closures?status=${status}&limit=${MOST_CLOSURES}`)).map(placed);
+const listedClosures = (status) => unlessSame(`closures?status=${status}&limit=${MOST_CLOSURES}`, (answer) => answer.json());
+export const closures = async (status) => (await listedClosures(status)).map(placed);
 
 // Reads all that is new. One at a time, and another one after it if something happened meanwhile: no answer overtakes a later one.
 export async function update(forget) {
@@ -55,7 +56,7 @@ export async function update(forget) {
   if (counts.version !== release) { at("reload").hidden = false; throw new Outdated("The service has another version: reload the page."); }
   const certificate = counts.read_only ? json("quality.json").catch(() => ({})) : {}; // of finished runs
   const [quality, maps, separations, robots, closed, edits] = await Promise.all(
-    [certificate, json("maps"), json("separations"), json("robots"), json(`closures?status=accepted&limit=${MOST_CLOSURES}`), json("edits")]);
+    [certificate, json("maps"), json("separations"), json("robots"), listedClosures("accepted"), json("edits")]);
   if (fleet.mission !== null && counts.mission !== fleet.mission) { received.clear(); forget(); }
   const seen = robots.filter((r) => r.map !== null), paths = await Promise.all(seen.map((r) => trail(r.session)));
   Object.assign(fleet, { counts, mission: counts.mission, maps, separations, quality, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });

@@ -1,8 +1,8 @@
 // The map: tiles, layers, and how the pointer and the keys move it.
 
 import { colourOf, fleet, isPast, keyOf, poseAt, robotNamed } from "./fleet.js";
-import { distance, middle, movedPoint, wallDirection } from "./geometry.js";
-import { Refused, ask, at, report } from "./service.js";
+import { distance, middle, movedPoint } from "./geometry.js";
+import { Refused, ask, at, json, report } from "./service.js";
 
 const WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
 const BAR_PX = 120; // longest scale bar
@@ -23,12 +23,17 @@ export const chart = {
 };
 let version = 0, queued = false;
 
+// Reading the size of an element lays the page out, so it is read when it changes.
+const size = { w: 0, h: 0 };
+const measure = () => { size.w = canvas.clientWidth; size.h = canvas.clientHeight; };
+measure();
+
 // ---- Colours ----
 
 let theme = {};
 export function readTheme() {
   const style = getComputedStyle(document.documentElement);
-  const names = ["floor", "wall", "unknown", "grid", "ink", "surface", "accent", "laser", "camera", "alert", "area", "keepout", "erase", "free"];
+  const names = ["floor", "wall", "unknown", "grid", "ink", "surface", "accent", "laser", "camera", "alert", "area", "keepout", "erase", "free", "plan", "appeared", "disappeared"];
   theme = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
   forgetTiles();
 }
@@ -55,26 +60,28 @@ function recoloured(picture) {
 const cosSin = (turn) => [Math.cos(turn), Math.sin(turn)];
 export function onScreen([x, y]) {
   const { view } = chart, [c, s] = cosSin(view.turn), dx = x - view.x, dy = y - view.y;
-  return [canvas.clientWidth / 2 + (c * dx - s * dy) * view.scale, canvas.clientHeight / 2 - (s * dx + c * dy) * view.scale];
+  return [size.w / 2 + (c * dx - s * dy) * view.scale, size.h / 2 - (s * dx + c * dy) * view.scale];
 }
 export function onMap([px, py]) {
-  const { view } = chart, [c, s] = cosSin(view.turn), u = (px - canvas.clientWidth / 2) / view.scale, v = (canvas.clientHeight / 2 - py) / view.scale;
+  const { view } = chart, [c, s] = cosSin(view.turn), u = (px - size.w / 2) / view.scale, v = (size.h / 2 - py) / view.scale;
   return [view.x + c * u + s * v, view.y - s * u + c * v];
 }
 
-// The view of a whole map, or of its paths while it has no cells; undefined if there are none.
-function whole(index, width, height, turn = 0) {
-  const extent = fleet.maps.find((m) => m.map === index)?.extent, corners = extent ? [[extent[0], extent[1]], [extent[2], extent[1]], [extent[2], extent[3]], [extent[0], extent[3]]] : [];
-  const points = corners.length ? corners : fleet.robots.flatMap((r) => (r.map === index ? (fleet.trails.get(r.session) ?? []).map((p) => p.slice(1, 3)) : []));
-  if (!points.length) return undefined;
-  const [c, s] = cosSin(turn), low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-  for (const [x, y] of points) for (const [k, value] of [c * x - s * y, s * x + c * y].entries()) { low[k] = Math.min(low[k], value); high[k] = Math.max(high[k], value); }
-  const [u, v] = [0, 1].map((k) => (low[k] + high[k]) / 2);
-  return { x: c * u + s * v, y: -s * u + c * v, scale: Math.min(width / (high[0] - low[0] + 2), height / (high[1] - low[1] + 2)), turn };
+function cornersOf(index) {
+  const extent = fleet.maps.find((m) => m.map === index)?.extent;
+  return extent ? [0, 2].flatMap((i) => [1, 3].map((j) => [extent[i], extent[j]])) : [];
 }
+// Shows all of the open map and of the one beside it, or of the paths while there are no cells.
 export function fit() {
-  const inset = canvas.clientWidth > 700 ? 40 : 10;
-  chart.view = whole(chart.index, canvas.clientWidth - inset, canvas.clientHeight - inset, chart.view?.turn) ?? chart.view;
+  const { beside } = chart, turn = chart.view?.turn ?? 0, [c, s] = cosSin(turn), inset = size.w > 700 ? 40 : 10;
+  const cells = [...cornersOf(chart.index), ...(beside ? cornersOf(beside.map).map((corner) => movedPoint(beside.pose, corner)) : [])];
+  const points = cells.length ? cells : fleet.robots.flatMap((r) => (r.map === chart.index ? (fleet.trails.get(r.session) ?? []).map((p) => p.slice(1, 3)) : []));
+  if (points.length) {
+    const along = points.map(([x, y]) => [c * x - s * y, s * x + c * y]);
+    const [low, high] = [Math.min, Math.max].map((pick) => [0, 1].map((k) => along.reduce((end, p) => pick(end, p[k]), along[0][k])));
+    const [u, v] = [0, 1].map((k) => (low[k] + high[k]) / 2);
+    chart.view = { x: c * u + s * v, y: -s * u + c * v, scale: Math.min((size.w - inset) / (high[0] - low[0] + 2), (size.h - inset) / (high[1] - low[1] + 2)), turn };
+  }
   redraw();
 }
 export function fitAll() { chart.moved = false; chart.followed = false; fit(); }
@@ -97,22 +104,22 @@ export function goTo([x, y], scale = 40) {
 }
 export function forgetTiles() { for (const { picture } of tiles.values()) picture?.close(); tiles.clear(); redraw(); }
 
-// Turns the map so that most walls of the tiles that are there are level, or back.
-export function levelWalls() {
-  if (!chart.view) return;
-  const side = TILE_PX / 4, brush = new OffscreenCanvas(side, side).getContext("2d", { willReadFrequently: true });
-  brush.filter = "blur(1px)"; // no stairs of cells
-  const images = [...tiles].filter(([key, { picture }]) => picture && key.startsWith(`${chart.index}/`)).map(([, { picture }]) => {
-    brush.fillStyle = theme.unknown; brush.fillRect(0, 0, side, side);
-    brush.drawImage(picture, 0, 0, side, side);
-    return brush.getImageData(0, 0, side, side);
-  });
-  chart.view.turn = chart.view.turn ? 0 : -wallDirection(images);
+// Turns the map so that most walls are level, or back.
+export async function levelWalls() {
+  chart.view.turn = chart.view.turn ? 0 : -(await json(`maps/${chart.index}/walls`)).direction_rad;
   fitAll();
 }
 
 // ---- Tiles ----
 
+async function renew(kept, answer) {
+  const tag = answer.headers.get("ETag");
+  if (tag && tag === kept.tag) return answer.body?.cancel(); // most tiles stay as they are
+  const picture = await createImageBitmap(await answer.blob());
+  kept.picture?.close();
+  Object.assign(kept, { picture: recoloured(picture), tag });
+  picture.close();
+}
 // The newest picture of a tile that has come; a newer one is asked for once, and replaces it whatever happens meanwhile.
 function tile(index, z, x, y) {
   const key = `${index}/${z}/${x}/${y}`, kept = tiles.get(key) ?? { picture: null, version: -1, isAsked: false };
@@ -120,8 +127,7 @@ function tile(index, z, x, y) {
   if (kept.version < version && !kept.isAsked) {
     const asked = version;
     kept.isAsked = true;
-    ask(`maps/${index}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
-      .then((picture) => { kept.picture?.close(); kept.picture = recoloured(picture); kept.version = asked; picture.close(); })
+    ask(`maps/${index}/tiles/${z}/${x}/${y}.png`).then((answer) => renew(kept, answer)).then(() => { kept.version = asked; })
       .catch((error) => {
         if (!report && !(error instanceof Refused)) return new Promise((done) => setTimeout(done, RETRY_MS));
         kept.version = asked; // a report has no more of them, and a refused token gets none
@@ -155,7 +161,7 @@ function drawTiles(brush, index, { x, y, scale, turn }, w, h) {
 
 // ---- Layers ----
 
-export const isShown = (layer) => at(`layer-${layer}`).checked;
+export const isShown = (layer) => at(`layer-${layer}`).checked && !at(`layer-${layer}`).parentElement.hidden;
 export function redraw() { if (!queued) { queued = true; requestAnimationFrame(draw); } }
 
 // A robot's path until the moment, in metres of the map: all of it, its last minutes, and its last pose. Poses nearer than a pixel are left out.
@@ -192,11 +198,12 @@ function linksOf(channel) {
 }
 
 // A path in metres of the map.
-function strokeWay(path, colour, width, alpha = 1) {
+function strokeWay(path, colour, width, alpha = 1, fill = 0) {
   const { view } = chart, [c, s] = cosSin(view.turn), k = view.scale;
   pen.save();
-  pen.translate(canvas.clientWidth / 2, canvas.clientHeight / 2); pen.transform(k * c, -k * s, -k * s, -k * c, 0, 0); pen.translate(-view.x, -view.y);
+  pen.translate(size.w / 2, size.h / 2); pen.transform(k * c, -k * s, -k * s, -k * c, 0, 0); pen.translate(-view.x, -view.y);
   pen.globalAlpha = alpha; pen.strokeStyle = colour; pen.lineWidth = width / k; pen.lineJoin = "round"; pen.stroke(path);
+  if (fill) { pen.globalAlpha = fill; pen.fillStyle = colour; pen.fill(path, "evenodd"); }
   pen.restore();
 }
 export function outline(points, { colour = theme.accent, fill = 0, width = 2, dash = [], closed = true }) {
@@ -213,6 +220,13 @@ export function label(text, [px, py], colour = theme.ink, size = 13) {
   pen.font = `600 ${size}px system-ui, sans-serif`; pen.textAlign = "center";
   pen.lineWidth = 4; pen.lineJoin = "round"; pen.strokeStyle = theme.surface; pen.strokeText(text, px, py);
   pen.fillStyle = colour; pen.fillText(text, px, py);
+}
+// Places the name of a robot above it, or below if another name is there.
+let named = [];
+function nameRobot(text, [px, py]) {
+  const half = 4 * text.length, isTaken = (y) => named.some(([x, v, wide]) => Math.abs(x - px) < wide + half && Math.abs(v - y) < 15);
+  const y = isTaken(py - 18) ? py + 28 : py - 18;
+  named.push([px, y, half, text]);
 }
 export function dot(point, colour = theme.accent, radius = 5) {
   pen.beginPath(); pen.arc(...onScreen(point), radius, 0, 2 * Math.PI);
@@ -251,12 +265,12 @@ function drawRobot(robot) {
   pen.lineJoin = "round"; pen.lineWidth = isChosen ? 7 : 4; pen.strokeStyle = isChosen ? theme.accent : theme.surface; pen.stroke();
   pen.fillStyle = colour; pen.fill();
   pen.restore();
-  if (isShown("names")) label(robot.robot, [px, py - 18]);
+  if (isShown("names")) nameRobot(robot.robot, [px, py]);
 }
 const isEarlierDrive = (robot) => fleet.robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch && r.map === robot.map);
 
 function drawGrid() {
-  const step = barMetres(), w = canvas.clientWidth, h = canvas.clientHeight, corners = [[0, 0], [w, 0], [0, h], [w, h]].map(onMap);
+  const step = barMetres(), w = size.w, h = size.h, corners = [[0, 0], [w, 0], [0, h], [w, h]].map(onMap);
   const [low, high] = [Math.min, Math.max].map((pick) => [0, 1].map((k) => pick(...corners.map((corner) => corner[k]))));
   const path = new Path2D();
   for (let x = Math.ceil(low[0] / step) * step; x < high[0]; x += step) { path.moveTo(x, low[1]); path.lineTo(x, high[1]); }
@@ -264,15 +278,37 @@ function drawGrid() {
   strokeWay(path, theme.grid, 1, 0.5);
 }
 
-// The certificate: a square for each cell, in one colour if it is good and in another one if not.
-function drawQuality() {
-  const { cell, cells } = fleet.quality[chart.index] ?? { cells: [] }, half = cell / 2;
-  for (const { x, y, good } of cells) outline([[-half, -half], [half, -half], [half, half], [-half, half]].map(([dx, dy]) => [x + dx, y + dy]), { colour: theme[good ? "free" : "keepout"], fill: 0.35, width: 0.5 });
+// What the service knows of a map besides its cells: shapes, which are read when their layer is switched on.
+const LOOKS = { // colour, width of the line, filling
+  quality: { good: ["free", 0.5, 0.3], bad: ["keepout", 0.5, 0.4] },
+  plan: { plan: ["plan", 1.5, 0], missing: ["disappeared", 6, 0], new: ["appeared", 6, 0], moved: ["area", 6, 0] },
+  changes: { appeared: ["appeared", 3, 1], disappeared: ["disappeared", 3, 1] },
+  tags: { tag: ["camera", 2, 0.4] },
+};
+const shapes = new Map();
+export function forgetShapes() { shapes.clear(); redraw(); }
+function shapesOf(layer) {
+  const path = `maps/${chart.index}/layers/${layer}`;
+  if (!shapes.has(path)) {
+    shapes.set(path, []);
+    json(path).then((found) => { shapes.set(path, found.map((one) => ({ ...one, path: new Path2D(one.path) }))); redraw(); }, (error) => { at("message").textContent = error.message; });
+  }
+  return shapes.get(path);
+}
+function drawShapes(layer) {
+  const found = shapesOf(layer);
+  for (const { kind, path } of found) { const [colour, width, fill] = LOOKS[layer][kind]; strokeWay(path, theme[colour], width, 1, fill); }
+  for (const { kind, text, x, y } of found) if (text) label(text, onScreen([x, y]), theme[LOOKS[layer][kind][0]]);
+}
+// The layers of the service that the open map has.
+export function showLayers() {
+  const known = fleet.maps.find((m) => m.map === chart.index)?.layers ?? [];
+  for (const layer of Object.keys(LOOKS)) at(`layer-${layer}`).parentElement.hidden = !known.includes(layer);
 }
 
 function draw() {
   queued = false;
-  const w = canvas.clientWidth, h = canvas.clientHeight, ratio = devicePixelRatio, { view } = chart;
+  const { w, h } = size, ratio = devicePixelRatio, { view } = chart;
   if (canvas.width !== Math.round(w * ratio) || canvas.height !== Math.round(h * ratio)) { canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio); if (!chart.moved && view) return fit(); }
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.fillStyle = theme.unknown; pen.fillRect(0, 0, w, h);
@@ -285,13 +321,15 @@ function draw() {
   }
   // A tile in view stays, or each drawing would ask for it again.
   for (const [key, { picture }] of tiles) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; picture?.close(); tiles.delete(key); }
-  if (isShown("quality")) drawQuality();
+  for (const layer of Object.keys(LOOKS)) if (isShown(layer)) drawShapes(layer);
   if (isShown("grid")) drawGrid();
   if (isShown("closures")) for (const [channel, colour] of [["lidar", theme.laser], ["camera", theme.camera], ["tag", theme.free]]) strokeWay(linksOf(channel), colour, 1, 0.5);
   if (isShown("areas")) for (const region of fleet.regions) drawRegion(region);
+  named = [];
   const chosen = fleet.selected, shown = fleet.robots.filter((r) => r.map === chart.index && r.T_map_base && !r.removed);
   for (const robot of shown.filter((r) => r.session !== chosen)) drawRobot(robot);
   for (const robot of shown.filter((r) => r.session === chosen)) drawRobot(robot); // on top
+  for (const [x, y, , text] of named) label(text, [x, y]);
   if (chart.closure) {
     const ends = chart.closure.ends.filter((end, k) => end && robotNamed([chart.closure.robot_i, chart.closure.robot_j][k])?.map === chart.index);
     if (chart.closure.map === chart.index) outline(ends, { colour: theme.laser, width: 4, closed: false });
@@ -311,7 +349,8 @@ function barMetres() {
 function showScale() {
   const bar = barMetres();
   at("bar").style.width = `${bar * chart.view.scale}px`;
-  at("metres").textContent = `${bar < 1 ? bar.toPrecision(1) : bar} m`;
+  const text = `${bar < 1 ? bar.toPrecision(1) : bar} m`;
+  if (at("metres").textContent !== text) at("metres").textContent = text; // a new text lays the page out
 }
 
 // ---- What the pointer and the keys do ----
@@ -333,10 +372,10 @@ function hit(point) {
 }
 
 // Keeps the point of the canvas where it is.
-export function zoom(factor, point = [canvas.clientWidth / 2, canvas.clientHeight / 2]) {
+export function zoom(factor, point = [size.w / 2, size.h / 2]) {
   const { view } = chart;
   if (!view) return;
-  const widest = Math.sqrt(canvas.clientWidth * canvas.clientHeight / MOST_TILES) / WORLD_M; // so many tiles fill the canvas
+  const widest = Math.sqrt(size.w * size.h / MOST_TILES) / WORLD_M; // so many tiles fill the canvas
   const held = onMap(point);
   view.scale = Math.max(Math.min(widest, view.scale), Math.min(2000, view.scale * factor));
   const off = onMap(point);
@@ -346,7 +385,7 @@ export function zoom(factor, point = [canvas.clientWidth / 2, canvas.clientHeigh
 }
 function pan(dx, dy) {
   if (!chart.view) return;
-  const [x, y] = onMap([canvas.clientWidth / 2 - dx, canvas.clientHeight / 2 - dy]);
+  const [x, y] = onMap([size.w / 2 - dx, size.h / 2 - dy]);
   Object.assign(chart.view, { x, y });
   chart.moved = true; chart.followed = false;
   redraw();
@@ -383,4 +422,4 @@ canvas.addEventListener("keydown", (e) => {
   const press = chart.tool?.keys?.[e.key] ?? keys[e.key];
   if (press) { e.preventDefault(); press(); }
 });
-new ResizeObserver(redraw).observe(canvas);
+new ResizeObserver(() => { measure(); redraw(); }).observe(canvas);

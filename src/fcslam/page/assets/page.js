@@ -2,7 +2,7 @@
 
 import { readAddress, showFiles, writeAddress } from "./files.js";
 import { fleet, look, robotNamed, update } from "./fleet.js";
-import { chart, fit, fitAll, levelWalls, openMap, readTheme, redraw, stayOpen, zoom } from "./map.js";
+import { chart, fit, fitAll, forgetShapes, levelWalls, openMap, readTheme, redraw, stayOpen, zoom } from "./map.js";
 import {
   decide, forgetCards, locate, pickOnMap, refreshEvidence, select, show, showAge, showAttention, showControls, showEdits, showEvidence, showFacts,
   showFleet, showHistory, showLearning, showMaps, showRobot, slide,
@@ -20,7 +20,7 @@ function forget() {
   Object.assign(chart, { opened: null, view: null, moved: false, followed: false, closure: null, beside: null });
   at("moment").value = at("moment").max;
   at("closure").hidden = true;
-  forgetCards();
+  forgetCards(); forgetShapes();
 }
 
 let asked = readAddress(); // the view of the address, until the map is there
@@ -71,12 +71,12 @@ for (const tool of document.querySelectorAll("[data-tool]"))
 for (const turn of document.querySelectorAll("[data-turn]")) turn.addEventListener("click", () => spin(turn.dataset.turn * TURN_RAD));
 const acts = {
   "zoom-in": () => zoom(1.4), "zoom-out": () => zoom(1 / 1.4), fit: fitAll, save, cancel: stop, veto: () => decide("veto"), pin: () => decide("pin"), locate,
-  level: () => { levelWalls(); showControls(); },
+  level: () => levelWalls().then(showControls, (error) => tell(error.message)),
   follow: () => { chart.followed = !chart.followed; if (chart.followed) { showRobot(fleet.selected); chart.followed = true; } showControls(); },
   reload: () => location.reload(),
 };
 for (const [id, act] of Object.entries(acts)) at(id).addEventListener("click", act);
-for (const layer of document.querySelectorAll("#layers input")) layer.addEventListener("change", redraw);
+for (const layer of document.querySelectorAll("#layers input")) layer.addEventListener("change", forgetShapes);
 for (const id of ["decision", "of-robot", "two-robots"]) at(id).addEventListener("change", () => showEvidence().catch((error) => tell(error.message)));
 at("moment").addEventListener("input", slide);
 at("facts").addEventListener("toggle", () => { if (at("facts").open) showFacts().catch(() => {}); });

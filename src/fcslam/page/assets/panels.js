@@ -2,14 +2,13 @@
 
 import { colourOf, closures, firstStamp, fleet, keyOf, placed, robotNamed } from "./fleet.js";
 import { between, distance, middle, turned } from "./geometry.js";
-import { canvas, chart, choose, goTo, openMap, redraw } from "./map.js";
+import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
-import { attention, count, dayOf, decisionOf, duration, editOf, evidence, history, listed, metres, moment, sensorOf, stateOf } from "./words.js";
+import { accuracy, attention, count, dayOf, decisionOf, duration, editOf, evidence, history, listed, metres, moment, sensorOf, stateOf } from "./words.js";
 
 const LISTED = 200; // rows of the table of evidence
 const NEAR_M = 5; // pairs with both ends so near each other show the same place
-const COLOURS = ["#0072b2", "#e66100", "#009e73", "#7b4fb5", "#b58900", "#56b4e9", "#8c564b", "#607d3b"]; // of curves
 
 export function element(tag, text = "", more = {}) {
   const made = Object.assign(document.createElement(tag), more);
@@ -41,6 +40,7 @@ export function swatch(colour) {
 }
 
 export function show(view) {
+  tell("");
   document.body.dataset.view = view;
   for (const tab of document.querySelectorAll("nav button")) {
     tab.ariaCurrent = tab.dataset.view === view ? "page" : "false";
@@ -72,7 +72,7 @@ export function showControls() {
 // ---- Maps and their state ----
 
 export function showMaps() {
-  at("has-quality").hidden = !Object.keys(fleet.quality).length;
+  showLayers();
   const title = (m) => `${listed(m.robots)}${m.floor && `, floor ${m.floor}`}`;
   at("tabs").hidden = fleet.maps.length < 2;
   fill(at("tabs"), [chart.index, fleet.maps.map(title)], () => fleet.maps.map((m) => {
@@ -127,6 +127,7 @@ export function showFleet() {
   if (shown.length !== list.children.length || shown.some((card, k) => card !== list.children[k])) list.replaceChildren(...shown);
   const { maps } = fleet, extent = maps.length === 1 && maps[0].extent, size = extent ? `, ${(extent[2] - extent[0]).toFixed(0)} × ${(extent[3] - extent[1]).toFixed(0)} m` : "";
   at("summary").textContent = newest.length ? `${count(newest.length, "robot")} on ${maps.length === 1 ? `one map${size}` : count(maps.length, "map")}` : "No robot yet";
+  at("accuracy").textContent = accuracy(fleet);
 }
 
 export function showAttention() {
@@ -157,13 +158,8 @@ function showQuality({ quality, marks }) {
 function besideEachOther({ map, beside }) {
   choose(beside);
   const [first, second] = [beside, map].map((k) => fleet.maps.find((m) => m.map === k)?.extent);
-  if (first && second) chart.beside = { map, pose: [first[2] - second[0] + 2, first[1] - second[1], 0] };
+  if (first && second) { chart.beside = { map, pose: [first[2] - second[0] + 2, first[1] - second[1], 0] }; fit(); }
   showMaps();
-  if (first && second) {
-    chart.view = { x: (first[0] + first[2] + second[2] - second[0] + 2) / 2, y: (first[1] + Math.max(first[3], first[1] + second[3] - second[1])) / 2, turn: 0, scale: Math.min(canvas.clientWidth / (first[2] - first[0] + second[2] - second[0] + 4), canvas.clientHeight / (Math.max(first[3] - first[1], second[3] - second[1]) + 2)) };
-    chart.moved = true;
-    redraw();
-  }
 }
 
 // ---- Evidence ----
@@ -182,7 +178,7 @@ export async function showEvidence() {
   const robot = at("of-robot").value, value = COLUMNS[sorting.column][1];
   const chosen = all.filter((c) => (!robot || c.robot_i === robot || c.robot_j === robot) && (!at("two-robots").checked || robotNamed(c.robot_i)?.robot !== robotNamed(c.robot_j)?.robot));
   listedNow = chosen.sort((a, b) => { const [x, y] = [value(a), value(b)]; return (sorting.down ? -1 : 1) * (x < y ? -1 : x > y ? 1 : 0); }).slice(0, LISTED);
-  at("closures").textContent = `${count(chosen.length, "pair")} ${decisionOf({ status: decision })}${chosen.length > LISTED ? `; the table has the first ${LISTED}` : ""}`;
+  at("closures").textContent = `${count(chosen.length, "pair")} ${decisionOf({ status: decision })}${chosen.length > LISTED ? `; the table has the first ${LISTED}` : chosen.length ? "" : at("two-robots").checked ? ". Untick the box to see those of one robot." : "."}`;
   fill(document.querySelector("#pairs thead tr"), sorting, () => COLUMNS.map(([title], k) => {
     const head = element("th", button(title, () => { sorting = { column: k, down: sorting.column === k && !sorting.down }; showEvidence(); }), { scope: "col" });
     head.ariaSort = sorting.column === k ? (sorting.down ? "descending" : "ascending") : "none";
@@ -254,25 +250,18 @@ export const decide = (kind) => { const { robot_i, robot_j, stamp_i, stamp_j } =
 // ---- History and edits ----
 
 // Each step of the slider passes equally many scans: robots may drive days apart.
-let stamps = [];
+const allStamps = () => [...fleet.trails.values()].flatMap((path) => path.map((p) => p[0])).sort((a, b) => a - b);
 export function setMoment(until) {
-  stamps = [...fleet.trails.values()].flatMap((path) => path.map((p) => p[0])).sort((a, b) => a - b);
-  const seen = stamps.filter((stamp) => stamp <= until).length;
-  fleet.until = seen === stamps.length ? Infinity : until;
-  at("moment").value = fleet.until === Infinity ? 1000 : Math.floor((1000 * seen) / stamps.length);
-  showMoment(seen);
+  const stamps = allStamps(), seen = stamps.filter((stamp) => stamp <= until).length, isNow = seen === stamps.length;
+  fleet.until = isNow ? Infinity : until;
+  if (document.activeElement !== at("moment")) at("moment").value = isNow ? 1000 : Math.floor((1000 * seen) / stamps.length);
+  at("until").textContent = at("moment").ariaValueText = isNow ? "now" : moment(until, firstStamp(), true);
+  at("share").textContent = isNow ? "" : `${seen.toLocaleString("en")} of ${count(stamps.length, "scan")}; the map itself is today's.`;
+  redraw();
 }
 export function slide() {
-  stamps = [...fleet.trails.values()].flatMap((path) => path.map((p) => p[0])).sort((a, b) => a - b);
-  const share = at("moment").value / at("moment").max, seen = Math.ceil(share * stamps.length);
-  fleet.until = share === 1 || !stamps.length ? Infinity : stamps[Math.max(0, seen - 1)];
-  showMoment(seen);
-}
-function showMoment(seen) {
-  const words = fleet.until === Infinity ? "now" : moment(fleet.until, firstStamp(), true);
-  at("until").textContent = at("moment").ariaValueText = words;
-  at("share").textContent = fleet.until === Infinity ? "" : `${seen.toLocaleString("en")} of ${count(stamps.length, "scan")}; the map itself is today's.`;
-  redraw();
+  const stamps = allStamps();
+  setMoment(stamps[Math.max(0, Math.ceil((stamps.length * at("moment").value) / at("moment").max) - 1)] ?? Infinity);
 }
 export function showHistory() {
   if (document.body.dataset.view !== "history") return;
@@ -304,23 +293,10 @@ export async function showFacts() {
   at("config").textContent = config;
   at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) => row(name.replaceAll("_", " "), value === null ? "–" : Number(value.toPrecision(4)).toLocaleString("en", { maximumFractionDigits: 6 }), unit === "1" ? "" : unit)));
 }
-function shape(tag, attributes) {
-  const made = document.createElementNS(at("curves").namespaceURI, tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  return made;
-}
-// Curves of losses, each over its largest value, and of measures; a dot is a round whose detector was released.
+// The rounds of a federated training, newest first.
 export async function showLearning() {
-  const rounds = await json("learning").catch(() => []);
+  const rounds = await json("learning").catch(() => []), names = [...new Set(rounds.flatMap((r) => [...Object.keys(r.losses), ...Object.keys(r.measures)]))];
   at("learned").textContent = rounds.length ? `${count(rounds.length, "round")}, ${rounds.filter((r) => r.released).length} released` : "The robots do not learn: fcslam serve --learn";
-  const names = [...new Set(rounds.flatMap((r) => [...Object.keys(r.losses), ...Object.keys(r.measures)]))], across = (k) => 5 + (290 * k) / Math.max(1, rounds.length - 1), drawn = [];
-  names.forEach((name, n) => {
-    const values = rounds.map((r) => r.losses[name] ?? r.measures[name]), top = rounds[0].losses[name] === undefined ? 1 : Math.max(...values.filter((v) => v !== undefined)) || 1, stroke = COLOURS[n % COLOURS.length];
-    const curve = values.flatMap((v, k) => (v === undefined ? [] : [[across(k), 145 - (140 * v) / top, rounds[k].released]]));
-    drawn.push(shape("polyline", { points: curve.map(([x, y]) => `${x},${y}`).join(" "), fill: "none", stroke }));
-    for (const [cx, cy, released] of curve) if (released) drawn.push(shape("circle", { cx, cy, r: 3, fill: stroke }));
-  });
-  at("curves").replaceChildren(...drawn);
-  at("legend").replaceChildren(...names.map((name, n) => { const item = element("li", swatch(COLOURS[n % COLOURS.length])); item.append(rounds[0].losses[name] === undefined ? name.replaceAll("_", " ") : `${name}: loss, over its largest value`); return item; }));
-  at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, (r.measures.mma_3px ?? r.measures.revisit_recall)?.toFixed(3) ?? "–", r.robots.join(", "), [r.reason, r.left_out].filter(Boolean).join("; "))));
+  at("of-rounds").replaceChildren(...["Round", "Robots", "Left out", ...names.map((name) => name.replaceAll("_", " "))].map((title) => element("th", title, { scope: "col" })));
+  at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, r.robots.join(", "), [r.reason, r.left_out].filter(Boolean).join("; "), ...names.map((name) => (r.losses[name] ?? r.measures[name])?.toFixed(3) ?? "–"))));
 }

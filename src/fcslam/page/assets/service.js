@@ -39,6 +39,16 @@ export async function ask(path, { method = "GET", body } = {}) {
 }
 export const json = async (path) => (await ask(path)).json();
 
+// Reads something again only if it changed: `make` turns a response into what the page keeps.
+const kept = new Map();
+export async function unlessSame(path, make) {
+  const answer = await ask(path), tag = answer.headers.get("ETag"), known = kept.get(path);
+  if (tag && known?.tag === tag) { answer.body?.cancel(); return known.made; }
+  const made = await make(answer);
+  kept.set(path, { tag, made });
+  return made;
+}
+
 // Follows the events: `changed` reads what is new, `say` tells how the connection is. A new attempt ends those before it.
 let attempt = 0, stop = new AbortController();
 export async function follow(changed, say) {

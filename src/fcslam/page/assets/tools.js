@@ -121,7 +121,7 @@ export const onChange = (act) => { changed = act; };
 export async function change(path, body) {
   try {
     const { number } = await (await ask(path, { method: "POST", body })).json();
-    tell(`Saved as edit ${number}; the map follows. You can take it back under Edits.`);
+    tell(body ? `Saved as edit ${number}; the map follows. You can take it back under Edits.` : "Taken back; the map follows.");
     await changed();
   } catch (error) { tell(error.message); }
 }

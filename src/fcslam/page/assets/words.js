@@ -60,6 +60,13 @@ export function evidence(robots, accepted) {
   return new Map([...shared].map(([session, others]) => [session, others.size ? say(others) : "Nobody else has seen its places yet"]));
 }
 
+// How accurate the maps are, by their certificates.
+export function accuracy({ quality, readOnly, maps }) {
+  if (!readOnly) return maps.length ? "How accurate the map is, its finished run tells: see Download." : "";
+  const cells = Object.values(quality).flatMap((one) => one.cells), [first] = Object.values(quality);
+  return cells.length ? `${cells.filter((c) => c.good).length.toLocaleString("en")} of ${cells.length.toLocaleString("en")} m² of the map are accurate to ${Math.round(100 * first.bar)} cm.` : "";
+}
+
 // Why two maps are apart, and what would help.
 function separation(s, maps) {
   const [first, second] = s.maps.map((k) => maps.find((m) => m.map === k)?.robots ?? []);
@@ -77,7 +84,7 @@ export function attention({ robots, maps, separations, quality, counts, contradi
     found.push({ kind: "alert", text: `The disk of the service has ${(counts.free_bytes / 1e9).toFixed(1)} GB left.`, help: "Download what you need and free some space, or the service will refuse what robots send.", why: "", action: "Open downloads", do: { view: "files" } });
   const silent = robots.filter((robot) => stateOf(robot, robots, readOnly).kind === "alert");
   if (silent.length)
-    found.push({ kind: "alert", text: `${listed(silent.map((r) => r.robot))} ${silent.length > 1 ? "are silent, the first" : "is silent"} for ${duration(Math.max(...silent.map((r) => r.last_heard_s)))}.`, help: "If the work is done, nothing is wrong. If not, check power and network: a robot keeps what it sees and sends it later.", why: "", ...(silent.length > 1 ? { action: "Show the robots", do: { view: "fleet" } } : { action: "Show where it was", do: { robot: silent[0].session } }) });
+    found.push({ kind: "alert", text: `${listed(silent.map((r) => r.robot))} ${silent.length > 1 ? "have been silent, the first" : "has been silent"} for ${duration(Math.max(...silent.map((r) => r.last_heard_s)))}.`, help: "If the work is done, nothing is wrong. If not, check power and network: a robot keeps what it sees and sends it later.", why: "", ...(silent.length > 1 ? { action: "Show the robots", do: { view: "fleet" } } : { action: "Show where it was", do: { robot: silent[0].session } }) });
   const blamed = new Map();
   for (const c of contradicted) if (CONTRADICTIONS.includes(c.reason)) for (const name of new Set([c.robot_i, c.robot_j])) blamed.set(name, [...(blamed.get(name) ?? []), c]);
   const [worst] = [...blamed].sort((a, b) => b[1].length - a[1].length);

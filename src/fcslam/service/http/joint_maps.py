@@ -83,7 +83,7 @@ class FrontierSummary(Settings):
 class MapFrontiers(Settings):
     """The frontiers of a map, that with the largest gain first."""
 
-    map: int
+    map: int = Field(description="number of the map")
     frontiers: list[FrontierSummary]
 
 

@@ -1,5 +1,6 @@
 """The responses of the service, as OpenAPI describes them."""
 
+from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -57,7 +58,7 @@ class RobotState(Settings):
     epoch: int | None = Field(description="newest epoch of the robot")
     next: dict[str, int] = Field(description="by epoch, number of the first packet that is missing")
     correction: int = Field(description="version of the newest correction; -1: none")
-    map: int | None
+    map: int | None = Field(description="number of its map; null: none")
     refused: list[PacketRefusal]
 
 
@@ -71,14 +72,14 @@ class FleetSummary(Settings):
     map_age_s: float | None = Field(
         description="seconds since the map was drawn; null before that, and for a finished run"
     )
-    free_bytes: int | None = Field(description="free on the disk of the map; null as for its age")
-    packets: int
-    applied: int = Field(description="packets that took effect")
-    waiting: int = Field(description="packets that wait for an earlier one")
+    free_bytes: int | None = Field(description="bytes that are free on the disk of the map; null as for its age")
+    packets: int = Field(description="number of packets that arrived")
+    applied: int = Field(description="number of packets that took effect")
+    waiting: int = Field(description="number of packets that wait for an earlier one")
     worker_ready: bool = Field(description="whether packets and edits take effect now; no: the worker is starting")
     robots: list[str]
-    maps: int
-    metrics: dict[str, float | None]
+    maps: int = Field(description="number of maps")
+    metrics: dict[str, float | None] = Field(description="by name; `metrics.json` has their units")
 
 
 class SessionSummary(Settings):
@@ -86,17 +87,19 @@ class SessionSummary(Settings):
 
     robot: str
     session: str
-    epoch: int
-    packets: int
-    map: int | None
+    epoch: int = Field(description="number of the start, from 0")
+    packets: int = Field(description="number of packets that arrived without a gap")
+    map: int | None = Field(description="number of its map; null: not mapped yet")
     floor: str = Field(description="floor that it named; empty: none, or not mapped yet")
-    path_length_m: float
-    keyscans: int
+    path_length_m: float = Field(description="length of its path in the map, metres")
+    keyscans: int = Field(description="number of its poses in the map")
     color: str = Field(description="of the robot in all pictures, as #rrggbb")
     first_s: float | None = Field(description="stamp of the first pose in the map, seconds")
     last_s: float | None = Field(description="stamp of the last pose in the map, seconds")
-    T_map_base: Pose | None = Field(description="newest pose; it may be newer than the map")
-    T_map_odom: Pose | None
+    T_map_base: Pose | None = Field(
+        description="newest pose, x and y in metres, theta in radians; it may be newer than the map"
+    )
+    T_map_odom: Pose | None = Field(description="frame of its odometry in the map, x and y in metres, theta in radians")
     correction: int = Field(description="version of the newest correction; -1: none")
     quality: float = Field(description="how well other sessions support the pose, in [0, 1]; 0: no support")
     removed: bool = Field(description="whether an administrator removed it, so that its packets have no effect")
@@ -116,52 +119,84 @@ class ClosureSummary(Settings):
     """As in closures.csv."""
 
     robot_i: str
-    stamp_i: float
+    stamp_i: float = Field(description="of keyscan i, seconds")
     robot_j: str
-    stamp_j: float
+    stamp_j: float = Field(description="of keyscan j, seconds")
     channel: Channel
-    similarity: float
-    T_i_j: Pose
+    similarity: float = Field(description="share of common words, in [0, 1]")
+    T_i_j: Pose = Field(description="pose of j in i, x and y in metres, theta in radians")
     status: ClosureStatus
     reason: ReasonCode
-    value: float | None = Field(description="the measured value behind the reason, if it has one")
-    limit: float | None = Field(description="the limit that the value was compared with")
+    value: float | None = Field(
+        description="the measured value behind the reason, in the unit that the table of reasons gives; null: none"
+    )
+    limit: float | None = Field(description="the limit of the value, in its unit")
     setting: str = Field(description="the setting that holds the limit; empty without one")
     explanation: str = Field(description="the reason with its numbers, as one clause")
+
+
+class MapLayer(StrEnum):
+    """What is drawn over a map."""
+
+    PLAN = "plan"
+    CHANGES = "changes"
+    TAGS = "tags"
+    QUALITY = "quality"
 
 
 class MapSummary(Settings):
     """Which robots share a map."""
 
-    map: int
+    map: int = Field(description="number of the map, from 0")
     floor: str = Field(description="floor that its robots named; empty: none")
     robots: list[str]
-    zoom: int = Field(description="of the tiles that show every cell; deeper ones show nothing more")
+    zoom: int = Field(description="number of the zoom of the tiles that show every cell; deeper ones show nothing more")
     extent: tuple[float, float, float, float] | None = Field(
         description="lowest x and y, highest x and y that the map covers, in metres; null before there is a map"
     )
+    layers: list[MapLayer] = Field(description="what can be drawn over it")
     georeferenced: bool = Field(description="whether its place on the earth is known")
 
 
 class LearningRound(Settings):
     """A round of the federated training of the detector."""
 
-    round: int
+    round: int = Field(description="number of the round, from 1")
     version: str = Field(description="detector after the round")
     released: bool = Field(description="whether it was the best so far, so robots get it")
     robots: list[str] = Field(description="whose updates counted")
     left_out: str = Field(description="whose did not, and why")
     reason: str = Field(description="of the gate for releasing it or not; empty without a gate")
-    losses: dict[str, float]
+    losses: dict[str, float] = Field(description="by name, without a unit")
     measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
+
+
+class WallDirection(Settings):
+    """How a map's walls run."""
+
+    direction_rad: float = Field(description="of most walls, radians from the x axis, in [-pi/4, pi/4)")
+
+
+class MapShape(Settings):
+    """A shape that is drawn over a map, and its label."""
+
+    kind: Literal["plan", "missing", "new", "moved", "appeared", "disappeared", "tag", "good", "bad"] = Field(
+        description="line of the floor plan; wall that only the plan or only the scans have, or that moved; surface "
+        "that appeared or disappeared since the first day; tag; square metre as accurate as the certificate asks, "
+        "or not"
+    )
+    path: str = Field(description="data of an SVG path, metres of the map")
+    text: str = ""
+    x: float = Field(default=0.0, description="of the label, metres of the map")
+    y: float = Field(default=0.0, description="of the label, metres of the map")
 
 
 class MapSeparation(Settings):
     """Two maps that no closure joins."""
 
-    maps: tuple[int, int]
-    candidates: int = Field(description="closures between them that failed verification")
-    verified: int = Field(description="closures between them that passed it, and were not enough")
+    maps: tuple[int, int] = Field(description="numbers of both maps")
+    candidates: int = Field(description="number of closures between them that failed verification")
+    verified: int = Field(description="number of closures between them that passed it, and were not enough")
     reason: ReasonCode | None = Field(description="what keeps them apart; null if no two of their places look alike")
     explanation: str = Field(description="the binding reason, with its numbers")
 
@@ -197,7 +232,7 @@ class Finalized(Settings):
 class EditSummary(Settings):
     """An edit: what somebody changed about the mission by hand."""
 
-    number: int
+    number: int = Field(description="number of the edit, from 1")
     kind: str = Field(description="veto, removal, cut, pin, closure, placement, region or undo")
     content: dict[str, Any] = Field(description="what it names")
     author: str

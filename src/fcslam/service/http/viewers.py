@@ -1,5 +1,6 @@
 """Routes for viewers: the live run as numbers and as files."""
 
+import asyncio
 import hashlib
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
 from pydantic import Field
+from starlette.concurrency import run_in_threadpool
 
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import export_map
@@ -22,10 +24,13 @@ from fcslam.service.http.responses import (
     EditSummary,
     FleetSummary,
     LearningRound,
+    MapLayer,
     MapSeparation,
+    MapShape,
     MapSummary,
     RobotSummary,
     SessionSummary,
+    WallDirection,
     content,
     refusals,
 )
@@ -33,6 +38,7 @@ from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
 from fcslam.service.learning_rounds import read_rounds
 from fcslam.service.live_poses import live_scan
+from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
     all_sessions,
@@ -43,6 +49,7 @@ from fcslam.service.summaries import (
     newest_closures,
     run_of,
     sessions_of,
+    trajectories_zip,
 )
 from fcslam.untrusted import check_file, read_bytes
 from fcslam.wire.limits import MAXIMUM_EPOCH
@@ -62,6 +69,7 @@ MEDIA = {
     "yaml": "application/yaml",
     "svg": "image/svg+xml",
     "tif": "image/tiff",
+    "zip": "application/zip",
 }
 
 _ROWS = {"type": "array", "items": {"type": "object", "required": ["name", "value", "unit"]}}
@@ -165,11 +173,11 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get(
         "/maps/{k}.{suffix}", response_class=Response, responses={**refusals(400, 404), 200: content(*MEDIA.values())}
     )
-    def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif)$")]) -> Response:
-        """A map: picture, occupancy, what map_server needs to know of it, drawing, and GeoTIFF if its place on earth
-        is known.
+    def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif|zip)$")]) -> Response:
+        """A map: picture, occupancy, what map_server needs to know of it, both in one archive, drawing, and GeoTIFF if
+        its place on earth is known.
         """
-        if suffix not in ("svg", "tif"):
+        if suffix not in ("svg", "tif", "zip"):
             return _file(state, f"{map_stem(k)}.{suffix}", MEDIA[suffix])
         exported = export_map(_folder_of(state), k, suffix)
         if exported is None:
@@ -195,6 +203,22 @@ def map_router(state: ViewerState) -> APIRouter:
             raise HTTPException(404, f"there is no {map_stem(k)}") from error
         return _if_changed(request, tile, MEDIA["png"])
 
+    turn = asyncio.Lock()  # changes take as much memory as a map
+
+    @router.get("/maps/{k}/layers/{layer}", responses=refusals(400))
+    async def get_layer(k: Index, layer: MapLayer) -> list[MapShape]:
+        """What is drawn over a map: floor plan and deviations, changes since the first day, tags, certificate."""
+        async with turn:
+            return await run_in_threadpool(map_shapes, state.mission, k, layer)
+
+    @router.get("/maps/{k}/walls", responses=refusals(400, 404))
+    async def get_walls(k: Index) -> WallDirection:
+        """The direction of most walls of a map."""
+        folder = _folder_of(state)
+        _existing(state, f"{map_stem(k)}.pgm")
+        async with turn:
+            return await run_in_threadpool(walls_of, folder, k)
+
     @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
     def get_metrics() -> FileResponse:
         """All metrics with their units."""
@@ -218,6 +242,13 @@ def map_router(state: ViewerState) -> APIRouter:
     def get_pose_graph() -> FileResponse:
         """The pose graph."""
         return _file(state, POSE_GRAPH, TEXT)
+
+    @router.get(
+        f"/{TRAJECTORIES}.zip", response_class=Response, responses={**refusals(404), 200: content(MEDIA["zip"])}
+    )
+    def get_trajectories() -> Response:
+        """The poses of all sessions, a file each."""
+        return Response(trajectories_zip(_folder_of(state)), media_type=MEDIA["zip"])
 
     @router.get(
         "/trajectories/{session}.tum", response_class=Response, responses={**refusals(400, 404), 200: content(TEXT)}

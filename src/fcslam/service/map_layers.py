@@ -1,0 +1,133 @@
+"""What is known about a map besides its cells, as shapes that the page draws over it."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from fcslam.anchoring.anchors import PLAN_JSON, TAGS_JSON
+from fcslam.anchoring.walls import wall_direction
+from fcslam.errors import EvaluationError, SourceError
+from fcslam.maps.changes import APPEARED, DISAPPEARED
+from fcslam.maps.exports import outlines
+from fcslam.mission.map_changes import changes_of
+from fcslam.mission.mission_file import stored_mission
+from fcslam.runs import QUALITY
+from fcslam.runs.map_files import map_stem, parse_map
+from fcslam.service.http.responses import MapLayer, MapShape, WallDirection
+from fcslam.service.viewed_mission import ViewedMission, viewed_run
+from fcslam.untrusted import read_bytes, read_text
+
+TAG_M: Final = 0.15
+"""Half a side of the square that stands for a tag."""
+
+
+_FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: f"{QUALITY}.json"}
+
+
+def layers_of(mission: ViewedMission, k: int) -> list[MapLayer]:
+    """The layers that map ``k`` may have; all but the changes are of finished runs."""
+    folder = mission.run_folder
+    if folder is None:
+        return []
+    found = [layer for layer, name in _FILES.items() if (folder / name).is_file()]
+    ended_s = float("inf")
+    for first_s, last_s in sorted(
+        (float(robot.stamps.min()), float(robot.stamps.max()))
+        for robot in viewed_run(folder).trajectories.values()
+        if robot.map_index == k
+    ):
+        if first_s > ended_s:
+            return [*found, MapLayer.CHANGES]
+        ended_s = last_s if ended_s == float("inf") else max(ended_s, last_s)
+    return found
+
+
+def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape]:
+    """A layer of map ``k``; empty if there is nothing to draw.
+
+    Raises:
+        EvaluationError: a file of the run is broken.
+    """
+    folder = mission.run_folder
+    if folder is None:
+        return []
+    if layer is MapLayer.CHANGES:
+        return _changes(mission, folder, k)
+    try:
+        content = json.loads(read_text(folder / _FILES[layer], folder))
+        return _DRAWN[layer](content, k)
+    except FileNotFoundError:
+        return []
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise EvaluationError(f"{_FILES[layer]} cannot be shown ({error})") from error
+
+
+def walls_of(folder: Path, k: int) -> WallDirection:
+    """The direction of the walls of map ``k`` of a run folder, which has it.
+
+    Raises:
+        EvaluationError: the files of the map are broken.
+    """
+    stem = map_stem(k)
+    pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
+    return WallDirection(direction_rad=wall_direction(parse_map(stem, pgm, description)))
+
+
+def _changes(mission: ViewedMission, folder: Path, k: int) -> list[MapShape]:
+    try:
+        found = changes_of(viewed_run(folder), stored_mission(mission.store), None, None, k, mission.name)
+    except SourceError:  # there is no earlier day, or its robots sent no ranges
+        return []
+    masks = {APPEARED: found.appeared, DISAPPEARED: found.disappeared}
+    return [_shape(kind, outlines(mask, found.now)) for kind, mask in masks.items() if mask.any()]
+
+
+def _plan(content: Mapping[str, Any], k: int) -> list[MapShape]:
+    (report,) = [one for one in content["maps"] if one["map"] == k and one["aligned"]] or (None,)
+    if report is None:
+        return []
+    shapes = [_shape("plan", content["drawing"])] if "drawing" in content else []
+    for one in report["deviations"]:
+        (a, b), (c, d) = one["start"], one["end"]
+        text = f"moved by {one['by_m']:.2f} m" if one["kind"] == "moved" else ""
+        shapes.append(_shape(one["kind"], f"M{a} {b}L{c} {d}", text, (a + c) / 2, (b + d) / 2))
+    return shapes
+
+
+def _tags(content: Mapping[str, Any], k: int) -> list[MapShape]:
+    side = 2.0 * TAG_M
+    return [
+        _shape(
+            "tag",
+            f"M{one['x'] - TAG_M} {one['y'] - TAG_M}h{side}v{side}h{-side}z",
+            f"tag {one['number']}{' (moved, or there twice)' if one['doubtful'] else ''}",
+            one["x"],
+            one["y"],
+        )
+        for one in content["tags"]
+        if one["map"] == k
+    ]
+
+
+def _quality(content: Mapping[str, Any], k: int) -> list[MapShape]:
+    """A square for each cell of the certificate."""
+    certificate = content.get(str(k))
+    if certificate is None:
+        return []
+    side, paths = certificate["cell"], {"good": "", "bad": ""}
+    for cell in certificate["cells"]:
+        corner = f"M{cell['x'] - side / 2} {cell['y'] - side / 2}"
+        paths["good" if cell["good"] else "bad"] += f"{corner}h{side}v{side}h{-side}z"
+    return [_shape(kind, path) for kind, path in paths.items() if path]
+
+
+def _shape(kind: str, path: str, text: str = "", x: float = 0.0, y: float = 0.0) -> MapShape:
+    return MapShape.model_validate({"kind": kind, "path": path, "text": text, "x": x, "y": y})
+
+
+_DRAWN: Final[Mapping[MapLayer, Callable[[Mapping[str, Any], int], list[MapShape]]]] = {
+    MapLayer.PLAN: _plan,
+    MapLayer.TAGS: _tags,
+    MapLayer.QUALITY: _quality,
+}

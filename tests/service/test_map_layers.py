@@ -1,0 +1,114 @@
+"""Layers of a map: files of a run folder and days of a mission in, shapes in metres of the map out."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from fcslam.errors import EvaluationError
+from fcslam.maps.exports import outlines
+from fcslam.page.shown_run import ShownRun
+from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.service.http.responses import MapLayer
+from fcslam.service.map_layers import layers_of, map_shapes, walls_of
+from fcslam.service.summaries import map_summaries
+from tests.mission.test_map_changes import write_run
+
+PLAN = {
+    "drawing": "M0.00 0.00L4.00 0.00z",
+    "maps": [
+        {
+            "map": 0, "aligned": True,
+            "deviations": [
+                {"kind": "moved", "start": [1.0, 2.0], "end": [3.0, 2.0], "length_m": 2.0, "by_m": 0.32},
+                {"kind": "missing", "start": [0.0, 0.0], "end": [0.0, 4.0], "length_m": 4.0, "by_m": None},
+            ],
+        },
+        {"map": 1, "aligned": False, "reason": "the map has no walls"},
+    ],
+}  # fmt: skip
+TAGS = {
+    "tags": [
+        {"family": "4x4_50", "number": 7, "map": 0, "x": 1.0, "y": 2.0, "doubtful": True},
+        {"family": "4x4_50", "number": 8, "map": 1, "x": 5.0, "y": 5.0, "doubtful": False},
+    ]
+}
+QUALITY = {"0": {"cell": 1.0, "cells": [{"x": 0.5, "y": 0.5, "good": True}, {"x": 1.5, "y": 0.5, "good": False}]}}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Two days; the second one has another box."""
+    folder = write_run(tmp_path_factory.mktemp("runs") / "building", (0, 1))
+    for name, content in {"plan": PLAN, "tags": TAGS, "quality": QUALITY}.items():
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    with ShownRun(folder, "building") as shown:
+        yield shown
+
+
+def points(path):
+    return np.array([list(map(float, pair)) for pair in re.findall(r"(-?[\d.]+) (-?[\d.]+)", path)])
+
+
+def test_a_map_names_its_layers(run, tmp_path):
+    assert {*layers_of(run, 0)} == {"plan", "tags", "quality", "changes"}
+    assert map_summaries(run)[0].layers == layers_of(run, 0)
+    write_run(tmp_path / "one-day", (0,))
+    with ShownRun(tmp_path / "one-day", "one-day") as shown:
+        assert layers_of(shown, 0) == []
+        assert map_shapes(shown, 0, MapLayer.CHANGES) == []
+
+
+def test_a_plan_has_its_lines_and_what_differs_from_them(run):
+    plan, moved, missing = map_shapes(run, 0, MapLayer.PLAN)
+    assert (plan.kind, plan.path) == ("plan", PLAN["drawing"])
+    assert (moved.kind, moved.path, moved.text, moved.x, moved.y) == (
+        "moved", "M1.0 2.0L3.0 2.0", "moved by 0.32 m", 2.0, 2.0
+    )  # fmt: skip
+    assert (missing.kind, missing.text) == ("missing", "")
+    assert map_shapes(run, 1, MapLayer.PLAN) == []
+
+
+def test_tags_and_accuracy_are_those_of_the_map(run):
+    (tag,) = map_shapes(run, 0, MapLayer.TAGS)
+    assert (tag.kind, tag.text, tag.x, tag.y) == ("tag", "tag 7 (moved, or there twice)", 1.0, 2.0)
+    assert [(s.kind, s.path) for s in map_shapes(run, 0, MapLayer.QUALITY)] == [
+        ("good", "M0.0 0.0h1.0v1.0h-1.0z"), ("bad", "M1.0 0.0h1.0v1.0h-1.0z")
+    ]  # fmt: skip
+    assert map_shapes(run, 1, MapLayer.QUALITY) == []
+
+
+def test_changes_lie_where_boxes_came_and_went(run):
+    shapes = {shape.kind: points(shape.path) for shape in map_shapes(run, 0, MapLayer.CHANGES)}
+    for kind, box in (("appeared", (1.0, -1.0)), ("disappeared", (1.0, 1.0))):
+        assert np.abs(shapes[kind] - box).max() < 0.5
+
+
+def test_a_broken_file_is_named(run, tmp_path):
+    folder = write_run(tmp_path / "broken", (0,))
+    (folder / "plan.json").write_text('{"maps": [3]}')
+    with ShownRun(folder, "broken") as shown, pytest.raises(EvaluationError, match=r"plan\.json"):
+        map_shapes(shown, 0, MapLayer.PLAN)
+
+
+def test_outlines_run_through_the_middles_of_cells_and_around_holes():
+    mask = np.zeros((10, 12), bool)
+    mask[2:8, 3:9] = True
+    mask[4:6, 5:7] = False
+    occupancy = OccupancyMap(np.zeros(mask.shape, np.uint8), 0.5, (-1.0, 2.0))
+    path = outlines(mask, occupancy)
+    assert path.count("M") == path.count("z") == 2
+    found = points(path)
+    assert found.min(axis=0).tolist() == [0.75, 3.25]
+    assert found.max(axis=0).tolist() == [3.25, 5.75]
+
+
+def test_the_direction_of_walls_is_that_of_the_drawn_line(tmp_path):
+    cells = np.full((200, 200), Occupancy.FREE, np.uint8)
+    across = np.arange(1000) / 1000 * 190
+    cells[np.round(across * np.tan(0.2)).astype(int), np.round(across).astype(int)] = Occupancy.OCCUPIED
+    occupancy = OccupancyMap(cells, 0.05, (0.0, 0.0))
+    (tmp_path / "map.pgm").write_bytes(pgm_bytes(occupancy))
+    (tmp_path / "map.yaml").write_text(map_yaml(occupancy, "map.pgm"))
+    assert walls_of(tmp_path, 0).direction_rad == pytest.approx(0.2, abs=0.01)
