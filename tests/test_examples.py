@@ -107,7 +107,7 @@ def test_a_strategy_of_ones_own_aggregates(tmp_path):
     for robot in range(3):
         (tmp_path / f"robot{robot}").mkdir()
         for seed in range(2):
-            cv2.imwrite(str(tmp_path / f"robot{robot}" / f"{seed}.png"), textured(10 * robot + seed))
+            cv2.imwrite(str(tmp_path / f"robot{robot}" / f"{seed}.png"), textured(10 * robot + seed, 128, 96))
     said = start("own_strategy.py", "out", "robot0", "robot1", "robot2", cwd=tmp_path)
     assert said.count("leaves out the last") == 2
     assert (tmp_path / "out" / "detector.onnx").is_file()
