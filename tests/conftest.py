@@ -77,8 +77,8 @@ def postgres(postgres_server):
 
 @pytest.fixture(scope="session")
 def drawn() -> SimulatedFleet:
-    """Three robots, 15 m each, that meet."""
-    return small_fleet.draw(3)
+    """Three robots, 12 m each, that meet."""
+    return small_fleet.draw(3, 12.0)
 
 
 @pytest.fixture(scope="session")
