@@ -77,8 +77,8 @@ def postgres(postgres_server):
 
 @pytest.fixture(scope="session")
 def drawn() -> SimulatedFleet:
-    """Three robots, 15 m each, that meet."""
-    return small_fleet.draw(3)
+    """Three robots, 12 m each, that meet."""
+    return small_fleet.draw(3, 12.0)
 
 
 @pytest.fixture(scope="session")
@@ -99,9 +99,10 @@ def logs(drawn, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def brief_validation():
-    """Small views to validate networks on: validation takes most of a short training."""
+    """Few and small views to validate networks on: validation takes most of a short training."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fcslam.learning.trainer.VALIDATION_VIEW", (96, 96))
+        patch.setattr("fcslam.learning.stages.HELD_OUT_SHAPES", 2)
         yield
 
 

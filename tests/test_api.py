@@ -199,45 +199,6 @@ def test_a_folder_that_holds_no_run_is_refused(place, tmp_path):
     assert "\n" not in str(raised.value)
 
 
-USER_SCRIPT = """
-from pathlib import Path
-
-import fcslam
-
-def count(progress: fcslam.Progress) -> None:
-    print(progress.scans)
-
-try:
-    run: fcslam.Run = fcslam.map_recordings(["a.clf", Path("b.clf")], split=1, progress=count)
-except fcslam.InputError as error:
-    raise SystemExit(str(error))
-reveal_type(run.trajectories["a"].T_map_base)
-reveal_type(run.maps[0].origin_xy)
-reveal_type(run.metrics["maps"].value)
-reveal_type([closure.status for closure in run.closures])
-reveal_type(fcslam.open_run("runs/building"))
-fcslam.map_recordings("a.clf", spit=1)
-"""
-
-
-@pytest.mark.slow
-def test_type_checkers_know_the_api(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(USER_SCRIPT)
-    cache = f"--cache-dir={ROOT / '.mypy_cache' / 'api'}"
-    command = [sys.executable, "-m", "mypy", "--strict", cache, "--follow-imports=silent", script.name]
-    # in an own folder: the project's settings do not apply to its users
-    answer = subprocess.run(
-        command, cwd=tmp_path, env={"MYPYPATH": str(ROOT / "src")}, capture_output=True, text=True, check=False
-    )
-    revealed = [re.sub(r"\b\w+\.", "", kind) for kind in re.findall(r'Revealed type is "(.*)"', answer.stdout)]
-    assert revealed[1:] == ["tuple[float, float]", "float", "list[ClosureStatus]", "Run"]
-    assert revealed[0].startswith("ndarray[")
-    assert re.findall(r"^script.py:.* error: (.*)", answer.stdout, re.MULTILINE) == [
-        'Unexpected keyword argument "spit" for "map_recordings"; did you mean "split"?  [call-arg]'
-    ]
-
-
 @pytest.mark.slow
 def test_the_example_of_the_readme_prints_what_it_says(tmp_path, monkeypatch):
     text = (ROOT / "README.md").read_text(encoding="utf-8")

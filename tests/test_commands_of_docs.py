@@ -39,11 +39,11 @@ OTHER_PROGRAMS: dict[str, str] = LISTED["other programs"]
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGES_WITH_COMMANDS = [page for page in PAGES if page.name not in {"CHANGELOG.md", "CONTRIBUTING.md", "commands.md"}]
 
-SCANS = 120
-"""Of a sample log that the commands get."""
-ANNA, BEN, CLEO = "anna.clf", "ben.clf", "cleo.clf"
+SCANS, LONG_SCANS = 60, 120
+"""Of a sample log that the commands get. The long one has relations over 20 s."""
+ANNA, BEN, CLEO, LONG = "anna.clf", "ben.clf", "cleo.clf", "long.clf"
 LOGS = {
-    "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "building.clf.gz": ANNA, "monday.clf.gz": ANNA, "intel.clf.xz": ANNA,
+    "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "monday.clf.gz": ANNA, "building.clf.gz": LONG, "intel.clf.xz": LONG,
     "robot2.log": BEN, "robot2.clf": BEN, "tuesday.clf.gz": BEN,
     "robot3.log": CLEO, "today.clf.gz": CLEO,
 }  # fmt: skip
@@ -133,9 +133,9 @@ MADE = {
 def logs(tmp_path_factory):
     """The beginnings of the sample logs."""
     folder = tmp_path_factory.mktemp("logs")
-    for log in (ANNA, BEN, CLEO):
-        records = open_source(ROOT / "examples" / "logs" / f"{log}.xz").records()
-        write_carmen(folder / log, islice(records, SCANS))
+    for log in (ANNA, BEN, CLEO, LONG):
+        whole, scans = (ANNA, LONG_SCANS) if log == LONG else (log, SCANS)
+        write_carmen(folder / log, islice(open_source(ROOT / "examples" / "logs" / f"{whole}.xz").records(), scans))
     return folder
 
 

@@ -68,9 +68,12 @@ def commands(text: str) -> Iterator[tuple[str, bool]]:
     yield from ((line, False) for line in INLINE_COMMAND.findall(text))
 
 
+COMMAND = typer.main.get_command(app)
+
+
 def complaint(line: str, complete: bool) -> str:
     """The error of click for a command line; empty if it would run."""
-    command: click.Command = typer.main.get_command(app)
+    command: click.Command = COMMAND
     words = shlex.split(line.partition(">")[0], comments=True)
     context = click.Context(command, info_name=words.pop(0))
     while isinstance(command, click.Group):

@@ -55,7 +55,7 @@ def from_log(logs, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3", "run"])
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap"])
 def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path, name):
     assert run("record", logs[0], "-o", tmp_path / name) == 0
     assert run("map", f"robot={tmp_path / name}", "-o", tmp_path / "out") == 0

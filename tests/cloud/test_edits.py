@@ -28,7 +28,6 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
-from tests import small_fleet
 from tests.scripted import ALIAS, closures, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
@@ -110,26 +109,18 @@ def test_a_removal_parts_at_once_what_only_the_robot_joined(scripted):
     assert [correction.robot for correction in cloud.fleet.corrections()] == ["a", "c"]
     assert len(seen.graph) == 2 * len(POSES)
     assert len(seen.graph.edges) == 2 * (len(POSES) - 1)
-    honest = feed(scripted(*LIES), [packet for packet in with_liar() if packet.robot != "b"])
-    assert fingerprint(cloud.finalize()) == fingerprint(honest.finalize())
-
-
-@pytest.fixture(scope="module")
-def without_first(packets):
-    """The cloud of all packets but those of the first robot, and its result."""
-    cloud = feed(Cloud(FleetConfig(), 0), [packet for packet in packets if packet.robot != packets[0].robot])
-    return cloud, fingerprint(cloud.finalize())
 
 
 @pytest.mark.parametrize("when", ["before", "midway", "after"])
-def test_the_result_is_what_it_would_have_been_without_the_robot(packets, without_first, when):
-    removed, (without, expected) = packets[0].robot, without_first
-    cut = {"before": 0, "midway": len(packets) // 2, "after": len(packets)}[when]
-    cloud = feed(Cloud(FleetConfig(), 0), packets[:cut])
-    cloud.fleet.edit([Removal(removed)])
-    feed(cloud, packets[cut:])
+def test_the_result_is_what_it_would_have_been_without_the_robot(scripted, when):
+    honest = feed(scripted(*LIES), [packet for packet in with_liar() if packet.robot != "b"])
+    expected = fingerprint(honest.finalize())
+    cut = {"before": 0, "midway": -100, "after": None}[when]
+    cloud = feed(scripted(*LIES), with_liar()[:cut])
+    cloud.fleet.edit([Removal("b")])
+    feed(cloud, with_liar()[len(with_liar()[:cut]) :])
     assert fingerprint(cloud.finalize()) == expected
-    assert set(map_of(cloud.fleet.estimate())) == set(map_of(without.fleet.estimate()))
+    assert set(map_of(cloud.fleet.estimate())) == {"a", "c"}
 
 
 def test_only_the_named_session_is_removed(scripted):
@@ -164,18 +155,9 @@ def test_a_veto_that_is_undone_leaves_no_trace_in_the_result(scripted):
     assert fingerprint(cloud.finalize()) == fingerprint(feed(scripted(closures(A, B, PAIRS)), robots).finalize())
 
 
-@pytest.fixture(scope="module")
-def two():
-    """Packets of two robots on short ways."""
-    robots = small_fleet.draw(2, path_length_m=10.0).robots
-    return in_order(packet for robot in robots for packet in small_fleet.sent_by(robot))
-
-
-@pytest.fixture(scope="module")
-def plain(two):
-    """Their cloud and its result; who edits it undoes that."""
-    cloud = feed(Cloud(FleetConfig(), 0), two)
-    return cloud, cloud.finalize()
+WAY = rectangle(29)
+BEGUN = [*stream("a", WAY, start_s=0.0), *stream("b", WAY, start_s=1000.0)]
+SEEN = closures(("a", WAY), ("b", WAY), PAIRS[:4])
 
 
 def a_first_closure(result):
@@ -207,34 +189,30 @@ def told(result):
     return fingerprint(result), regions
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["veto", "cut", "pin", "closure", "rough closure", "placement", "region"])
-def test_an_edit_counts_whenever_it_is_made_and_its_undo_leaves_no_trace(plain, two, kind):
-    late, unedited = plain
+def test_an_edit_counts_whenever_it_is_made_and_its_undo_leaves_no_trace(scripted, kind):
+    midway, late = feed(scripted(SEEN), BEGUN[:-20]), feed(scripted(SEEN), BEGUN)
+    unedited = late.finalize()
     before, change = told(unedited), edits_that_can_be_undone(unedited)[kind]
-    midway = feed(Cloud(FleetConfig(), 0), two[: len(two) // 2])
     midway.fleet.edit([change])
-    edited = told(feed(midway, two[len(two) // 2 :]).finalize())
+    edited = told(feed(midway, BEGUN[-20:]).finalize())
     assert edited != before
     midway.fleet.edit([])
     assert told(midway.finalize()) == before
     late.fleet.edit([change])
     assert told(late.finalize()) == edited
-    late.fleet.edit([])
 
 
-@pytest.mark.slow
-def test_a_floor_by_hand_counts_as_one_that_the_robot_named(plain, two):
-    closure, _, _ = a_first_closure(plain[1])
-    session = closure.j.robot
+def test_a_floor_by_hand_counts_as_one_that_the_robot_named(packets):
+    two = [packet for packet in packets if packet.robot != "robot_3"]
+    assert set(map_of(feed(Cloud(FleetConfig(), 0), two).finalize()).values()) == {0}
     cloud = Cloud(FleetConfig(), 0)
-    cloud.fleet.edit([FloorLabel(session, "2")])
+    cloud.fleet.edit([FloorLabel("robot_2", "2")])
     result = feed(cloud, two).finalize()
-    own = next(robot for robot in result.robots if robot.robot == session)
-    assert {robot.robot: robot.floor for robot in result.robots if robot.map_index == own.map_index} == {session: "2"}
+    assert {robot.robot: robot.floor for robot in result.robots if robot.map_index == 1} == {"robot_2": "2"}
     named = [
         replace(packet, body=replace(packet.body, floor="2"))
-        if packet.robot == session and isinstance(packet.body, Hello)
+        if packet.robot == "robot_2" and isinstance(packet.body, Hello)
         else packet
         for packet in two
     ]

@@ -51,8 +51,8 @@ def fed(packets):
 
 @pytest.fixture(scope="module")
 def honest():
-    """Packets of three robots in a building in which a copy bends their paths and no closure shows it."""
-    robots = small_fleet.draw(3, 30.0, seed=5).robots
+    """Packets of two robots in a building in which a copy bends their paths and no closure shows it."""
+    robots = small_fleet.draw(2, 30.0, seed=5).robots
     return in_order(decode(encode(packet)) for robot in robots for packet in small_fleet.sent_by(robot))
 
 
@@ -80,14 +80,14 @@ def between(result, *, evil):
 
 def test_a_scaled_copy_gets_a_map_of_its_own(alone, attacked):
     found = attacked.finalize()
-    assert map_of(alone) == {"robot_1": 0, "robot_2": 0, "robot_3": 0}
+    assert map_of(alone) == {"robot_1": 0, "robot_2": 0}
     assert map_of(found) == map_of(alone) | {"evil": 1}
     now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
     for name in then:
         assert np.abs(now[name] - then[name])[:, :2].max() < 0.05
     honest_closures = between(found, evil=False)
     assert ClosureStatus.REVOKED not in {closure.status for closure in honest_closures}
-    assert sum(closure.status is ClosureStatus.ACCEPTED for closure in honest_closures) > 50
+    assert sum(closure.status is ClosureStatus.ACCEPTED for closure in honest_closures) > 30
     reasons = {closure.reason.code for closure in between(found, evil=True)}
     assert ReasonCode.PATHS_CONTRADICT in reasons
     assert reasons <= {ReasonCode.PATHS_CONTRADICT, ReasonCode.SEPARATED}

@@ -31,7 +31,7 @@ from tests.small_fleet import feed, fingerprint, in_order, map_of
 
 pytestmark = pytest.mark.slow
 
-SESSIONS, BETWEEN_S = 4, 1000.0
+SESSIONS, BETWEEN_S = 3, 1000.0
 ONE_A_SQUARE = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=6.0))
 FEW_ENOUGH_TO_MEET = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=4.0))
 """With still fewer places, sessions that meet are not joined any more."""
@@ -113,11 +113,11 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
 
 
 def test_packed_submaps_change_nothing_and_few_are_not_packed(forgetful, packets, monkeypatch):
-    monkeypatch.setattr(submaps, "READY", 2)
+    monkeypatch.setattr(submaps, "READY", 1)
     cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
     cache = cloud.fleet._recognition._submaps
     kinds = Counter(type(entry.submap) for entry in cache._entries.values())
-    assert kinds[Submap] == len(cache._ready) == 2
+    assert kinds[Submap] == len(cache._ready) == 1
     assert kinds[PackedSubmap] > 2
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 

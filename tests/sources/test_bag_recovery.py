@@ -20,7 +20,7 @@ from tests.sources.carmen_text import scans_of
 
 pytestmark = pytest.mark.slow
 
-SCANS = 400
+SCANS = 200
 
 
 @pytest.fixture(autouse=True)
@@ -204,7 +204,7 @@ def test_unpacking_ends_at_the_limit(compression):
 def test_damage_anywhere_never_breaks_the_reader(tmp_path, name):
     good = cut(saved(tmp_path / name, scans=60), 0.8).read_bytes()
     rng = random.Random(7)
-    for _ in range(150):
+    for _ in range(60):
         content = bytearray(good)
         for _ in range(rng.randint(1, 4)):
             content[rng.randrange(13, len(content))] ^= rng.randint(1, 255)

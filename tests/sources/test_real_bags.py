@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.runs import read_tum
 from fcslam.sources import Fault, open_source, write_bag
 from tests.sources.carmen_text import scans_of
 
@@ -50,22 +49,6 @@ def test_a_log_and_its_bag_are_the_same_to_the_last_bit(tmp_path, log, name):
         beyond = before.ranges_m >= before.laser.max_range_m
         np.testing.assert_array_equal(after.ranges_m, np.where(beyond, np.nan, before.ranges_m))
     assert bag.faults[Fault.TIME_REVERSAL].count == source.faults[Fault.TIME_REVERSAL].count
-
-
-def test_a_log_and_its_bag_give_the_same_trajectory(tmp_path):
-    log = DATA / "slam-benchmark/mit-csail.clf.xz"
-    trajectories = {}
-    for name in ("log", "run.bag", "run.mcap", "run.db3"):
-        recording = log if name == "log" else tmp_path / name
-        if name != "log":
-            assert main(["record", str(log), "-o", str(recording)]) == 0
-        output = tmp_path / f"from_{name}"
-        assert main(["map", f"robot={recording}", "--output", str(output)]) == 0
-        trajectories[name] = read_tum(output / "trajectories" / "robot.tum")
-    stamps, poses = trajectories.pop("log")
-    for other_stamps, other_poses in trajectories.values():
-        np.testing.assert_allclose(other_stamps, stamps, atol=1e-9)
-        assert np.hypot(*(other_poses - poses)[:, :2].T).max() < 1e-3
 
 
 @pytest.mark.parametrize(("bag", "mean_m"), [("fr079", 0.07), ("mit-csail", 0.03)])

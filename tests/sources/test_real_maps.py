@@ -57,7 +57,7 @@ def test_scans_lie_on_one_another_only_by_the_right_conventions(log: str, turned
     assert blur(scans) < 0.85 * blur([turned(scan) for scan in scans])
 
 
-@pytest.mark.parametrize("log", LOGS)
+@pytest.mark.parametrize("log", LOGS[:2])
 def test_the_map_confirms_the_wheels(log):
     source = open_source(DATA / log)
     (trajectory,) = run_mission([source], MissionConfig()).trajectories.values()
