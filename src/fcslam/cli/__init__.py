@@ -6,10 +6,11 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 import typer
+from typer.core import TyperGroup
 
 import fcslam
 from fcslam.cli import (
@@ -49,8 +50,22 @@ RECORDINGS, LEARNING, SETUP = "Simulation and comparison", "Learning", "Setup"
 COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
 
+
+class _Commands(TyperGroup):
+    """The commands. Who asks for one of ``fcslam tools`` without it is told where it is."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        group = self.commands.get("tools")
+        if args and args[0] not in self.commands and isinstance(group, click.Group) and args[0] in group.commands:
+            ctx.fail(f"No such command '{args[0]}'. Did you mean 'tools {args[0]}'?")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
     name=PROGRAM,
+    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
