@@ -54,9 +54,7 @@ COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 class _Commands(TyperGroup):
     """The commands. Who asks for one of ``fcslam tools`` without it is told where it is."""
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         group = self.commands.get("tools")
         if args and args[0] not in self.commands and isinstance(group, click.Group) and args[0] in group.commands:
             ctx.fail(f"No such command '{args[0]}'. Did you mean 'tools {args[0]}'?")
