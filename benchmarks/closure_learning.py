@@ -64,7 +64,7 @@ from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
+from fcslam.learning.federated.client import FederatedClient, RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.held_out import PlacePoints
@@ -367,14 +367,13 @@ def federated(
     for building, learner in learners:
         name = f"{building}-{learner.robot}"
         (folder / name).mkdir()
-        noise = seeded_noise(name, settings.training.seed)
-        client = RobotClient(name, folder / name, folder / name, noise, revisits=revisits_of(arm, learner, seed))
+        client = RobotClient(name, folder / name, folder / name, revisits=revisits_of(arm, learner, seed))
         is_poisoned = arm == "poisoned" and building in POISONED and learner.robot == LIAR
         clients.append(PoisonedClient(client, "reversed") if is_poisoned else client)
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
         evaluate_fn=lambda _weights: {},  # without metrics the last version counts, as in the other arms
-        on_round=lambda row, _best: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
+        on_round=lambda row: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
     )
     state = Coordinator(in_process_grid(clients), settings, start, folder / "rounds", hooks).run()
     return weights_to_network(state.average, settings.training.encoder)

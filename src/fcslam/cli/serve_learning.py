@@ -51,8 +51,6 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
         raise ServiceError(
             f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes or heads"
         )
-    if settings.federated.privacy.noise_multiplier:
-        raise ServiceError(f"{config}: robots report on held-out pairs without noise; set noise_multiplier to 0")
     require_training_libraries("flwr", extra="federated")
     return FleetLearningPlan(data / "learning", settings)
 

@@ -100,15 +100,13 @@ def _card(
     asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
     best = next((row for row in rows if int(row["round"]) == state.best_round), {})
     sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
-    private = f"epsilon {rows[-1]['epsilon']} at delta {settings.privacy.delta:g}" if rows else "nothing was sent"
     lines = [
         f"# Detector {version}",
         "",
         f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
         f"{state.best_round}. How often each was asked: {asked or 'never'}.",
         "",
-        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB. Privacy of all that a robot has seen: "
-        f"{private}.",
+        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB.",
         "",
         f"| {judged_on} | |",
         "|---|---|",

@@ -38,7 +38,6 @@ from fcslam.learning.federated.messages import (
     reply_sender,
     request_config,
 )
-from fcslam.learning.federated.privacy import epsilon
 from fcslam.learning.federated.replies import RoundReplies, printable_line, read_replies
 from fcslam.learning.federated.screening import screen, update_length
 from fcslam.learning.federated.settings import FederatedSettings
@@ -153,7 +152,6 @@ class Coordinator:
 
         length = update_length(replies.weights, sent.weights)
         following = self._next_state(trained, weights, candidate.weights, comparison, decision, length)
-        privacy = self._settings.privacy
         report = RoundReport(
             round_number=following.rounds_done,
             version=candidate.version,
@@ -168,7 +166,6 @@ class Coordinator:
             bytes_down=(Counter(trained.times_asked) - Counter(state.times_asked)).total() * sent.size_bytes,
             bytes_up=replies.bytes_up,
             seconds=self._hooks.clock() - started,
-            epsilon=epsilon(privacy.noise_multiplier, max(following.times_asked.values()), privacy.delta),
         )
         return following, report
 

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.config import dump
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import OutputError
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.artifacts import DETECTOR, write_federated_artifacts
-from fcslam.learning.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
@@ -84,8 +83,6 @@ def run_job(
         TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
         OutputError: a file cannot be written.
     """
-    if job.settings.privacy.noise_multiplier and not job.public:
-        raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
     images = read_public_images(job.public)
     _write_config(job, job.output / CONFIG_FILE)
     initial = prepare_initial_weights(job.start, job.output, job.settings, options, callbacks.stage, images)

@@ -21,7 +21,7 @@ import torch
 
 from fcslam.errors import FcslamError, TrainingError
 from fcslam.learning.code_training import CodeInputs
-from fcslam.learning.federated.client import RobotClient, secret_noise
+from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
 from fcslam.learning.federated.live_settings import RobotLearningSettings
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str]) -> int:
     threading.Thread(target=_listen, args=(idle,), daemon=True).start()
     try:
         shown = Credentials() if given.credentials is None else read_credentials(given.credentials)
-        client = RobotClient(given.name, given.keyframes, given.cache, secret_noise)
+        client = RobotClient(given.name, given.keyframes, given.cache)
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
         link = partial(_IdleLink, robot, given.server, given.name, shown.token, shown.ca, shown.own)

@@ -42,22 +42,6 @@ class ScreeningSettings(Settings):
     )
 
 
-class PrivacySettings(Settings):
-    """Differential privacy: noise that a robot adds to its update before the update leaves it."""
-
-    clip_norm: float = Field(
-        default=1.0, gt=0.0, description="largest norm of an update; longer updates are scaled down to it"
-    )
-    noise_multiplier: float = Field(
-        default=0.0,
-        ge=0.0,
-        description="standard deviation of the noise, as a multiple of clip_norm; 0 for neither clipping nor noise",
-    )
-    delta: float = Field(
-        default=1e-5, gt=0.0, lt=1.0, description="probability with which the privacy loss may exceed epsilon"
-    )
-
-
 class FederatedSettings(Settings):
     """Settings of a federated training run."""
 
@@ -129,9 +113,6 @@ class FederatedSettings(Settings):
     screening: ScreeningSettings = Field(
         default_factory=ScreeningSettings, description="thresholds above which an update is refused"
     )
-    privacy: PrivacySettings = Field(
-        default_factory=PrivacySettings, description="differential privacy of the robots' images"
-    )
     training: TrainingSettings = Field(
         default_factory=TrainingSettings,
         description="training on each robot; its steps are replaced by rounds times local_steps",
@@ -139,8 +120,8 @@ class FederatedSettings(Settings):
 
     @model_validator(mode="after")
     def _variances_stay_positive(self) -> Self:
-        if self.normalisation == "averaged" and (self.strategy == "fedadam" or self.privacy.noise_multiplier > 0.0):
-            raise ValueError("FedAdam and noise can make variances negative; set normalisation to frozen")
+        if self.normalisation == "averaged" and self.strategy == "fedadam":
+            raise ValueError("FedAdam can make variances negative; set normalisation to frozen")
         return self
 
     @model_validator(mode="after")

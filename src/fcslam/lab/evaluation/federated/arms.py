@@ -10,7 +10,7 @@ from pydantic import Field
 
 from fcslam.config import Settings, parse
 from fcslam.lab.evaluation.federated.poison import Poison, PoisonedClient
-from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
+from fcslam.learning.federated.client import FederatedClient, RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.networks import weights_to_network, weights_version
@@ -94,9 +94,7 @@ def train_arm(context: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork
     if not arm.together:
         return [_train_centrally(context, name, _all_examples(context), settings.client_training())]
     clients: list[FederatedClient] = [
-        RobotClient(
-            robot, Path(robot), folder / robot, seeded_noise(robot, context.seed), context.options.device, images=own
-        )
+        RobotClient(robot, Path(robot), folder / robot, context.options.device, images=own)
         for robot, own in context.images.items()
     ]
     if arm.poison is not None:
