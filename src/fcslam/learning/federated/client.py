@@ -99,7 +99,6 @@ class RobotClient:
         plan = LocalTrainingPlan(
             first_step=round_number * settings.local_steps,
             steps=settings.local_steps,
-            proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
             compatible=settings.compatible,
             frozen_statistics=frozen,
         )

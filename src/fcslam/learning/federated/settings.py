@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from fcslam.config import Settings
 from fcslam.learning.settings import TrainingSettings
 
-StrategyName = Literal["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"]
+StrategyName = Literal["fedavg", "fedmedian"]
 Normalisation = Literal["averaged", "frozen"]
 TrainedLayers = Literal["all", "codes", "heads"]
 
@@ -64,11 +64,6 @@ class FederatedSettings(Settings):
     deadline_s: float = Field(
         default=3600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
     )
-    proximal: float = Field(
-        default=0.01,
-        ge=0.0,
-        description="strength of FedProx's proximal term, which holds robots to the global weights",
-    )
     compatible: float = Field(
         default=0.0,
         ge=0.0,
@@ -79,8 +74,7 @@ class FederatedSettings(Settings):
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="share of Nesterov's momentum kept between rounds, at most 1 - 1/N for N robots; 0 for off; "
-        "fedadam and krum do not use it",
+        description="share of Nesterov's momentum kept between rounds, at most 1 - 1/N for N robots; 0 for off",
     )
     smoothing: float = Field(
         default=0.8,
@@ -89,11 +83,6 @@ class FederatedSettings(Settings):
         description="share of earlier rounds in the moving average of which versions are made; "
         "decreases with the learning rate",
     )
-    server_rate: float = Field(default=0.003, gt=0.0, description="server learning rate of FedAdam")
-    trimmed: float = Field(
-        default=0.2, ge=0.0, lt=0.5, description="share of the updates that FedTrimmedAvg removes at each end"
-    )
-    malicious: int = Field(default=1, ge=0, description="number of poisoned robots that Krum must tolerate")
     normalisation: Normalisation = Field(
         default="averaged",
         description="batch statistics: averaged over the robots like weights, or frozen at their initial values",
@@ -117,12 +106,6 @@ class FederatedSettings(Settings):
         default_factory=TrainingSettings,
         description="training on each robot; its steps are replaced by rounds times local_steps",
     )
-
-    @model_validator(mode="after")
-    def _variances_stay_positive(self) -> Self:
-        if self.normalisation == "averaged" and self.strategy == "fedadam":
-            raise ValueError("FedAdam can make variances negative; set normalisation to frozen")
-        return self
 
     @model_validator(mode="after")
     def _revisits_leave_statistics(self) -> Self:
