@@ -48,9 +48,7 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
     config = data / LEARNING_FILE
     settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
     if not settings.federated.on_revisits:
-        raise ServiceError(
-            f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes or heads"
-        )
+        raise ServiceError(f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes")
     require_training_libraries("flwr", extra="federated")
     return FleetLearningPlan(data / "learning", settings)
 

@@ -112,20 +112,18 @@ def train_layers(
         settings: of the whole run; the learning rate falls towards the end of its steps.
         plan: which steps are done, and how.
         on_step: called with the number of steps done.
-        optimiser_state: result of an earlier local training, to continue it. If it is that of other layers, these
-            begin without moments.
+        optimiser_state: result of an earlier local training, to continue it.
 
     Raises:
         TrainingError: ``optimiser_state`` belongs to another network, or training diverged.
     """
     freeze_all_but(network, layer_names(network, layers))
     optimiser = continued_optimiser(network, optimiser_state)
-    is_new = not any(optimiser.state.get(value) for value in network.parameters() if value.requires_grad)
     sums: dict[str, float] = {}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
         for group in optimiser.param_groups:
-            group["lr"] = local_rate(settings, step, done, is_new)
+            group["lr"] = local_rate(settings, step, done, optimiser_state is None)
         total, losses = losses_of(step)
         descend(network, optimiser, total, step)
         for name, loss in losses.items():

@@ -19,7 +19,7 @@ from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.federated.weights import trained_names  # noqa: E402
 from fcslam.learning.local_training import layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, VotedImage  # noqa: E402
+from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.untrusted import read_arrays  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -219,29 +219,3 @@ def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path):
     assert not same(found, update("b", RevisitExamples(images[::-1], [pair])))
     with pytest.raises(TrainingError, match="there are none"):
         update("c", RevisitExamples(images))
-
-
-def test_heads_are_trained_on_revisits_and_votes(start, tmp_path):
-    images = [textured(seed, 96, 96) for seed in range(2)]
-    points = np.random.default_rng(1).uniform(8, 88, (30, 2)).astype(np.float32)
-    pair = RevisitPair((0, 1), (points, points), np.full((30, 3), np.nan))
-    votes = VotedImage(0, points, np.arange(30) < 15)
-    heads = settings(trained="heads", normalisation="frozen")
-
-    def changed(name, voted):
-        revisits = RevisitExamples(images, [pair], voted=voted)
-        client = RobotClient(name, tmp_path, tmp_path / name, revisits=revisits)
-        weights = start
-        for round_number in range(2):
-            update = client.train(weights, round_number, "run", heads)
-            weights = {**weights, **update.weights}
-        assert ("votes" in update.losses) is bool(voted)
-        return {name for name, array in weights.items() if not np.array_equal(array, start[name])}
-
-    network = KeypointNetwork("light")
-    codes, keypoints = (layer_names(network, each) for each in (network.code_layers, network.point_layers))
-    both, without = changed("a", [votes]), changed("b", [])
-    assert both <= codes | keypoints
-    assert both & codes
-    assert both & keypoints
-    assert without <= codes

@@ -20,7 +20,6 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
-from fcslam.learning.point_training import train_points
 from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
@@ -75,7 +74,7 @@ class RobotClient:
     images_settings: TrainingSettings | None = None
     """Settings with which the images were read; None if they were given."""
     revisits: RevisitExamples = field(default_factory=RevisitExamples)
-    """Points that were seen again, on which ``codes`` and ``heads`` are trained."""
+    """Points that were seen again, on which ``codes`` are trained."""
     inputs: CodeInputs = field(default_factory=CodeInputs)
     """Inputs from the images of ``revisits``."""
     held_out: HeldOutPairs = field(default_factory=HeldOutPairs)
@@ -112,10 +111,6 @@ class RobotClient:
             trained = train_codes(
                 start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
             )
-            if settings.trained == "heads" and self.revisits.voted:
-                codes, moments = trained.network.state_dict(), trained.optimiser_state
-                points = train_points(codes, self.revisits, training, plan, device, on_step, legacy, moments)
-                trained = points._replace(losses=trained.losses | points.losses)
         else:
             images = self._labelled_images(weights, settings).train
             trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)

@@ -83,7 +83,7 @@ class LiveRounds(FederatedSettings):
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
     trained: TrainedLayers = Field(
         default="codes",
-        description="layers that robots train: codes, those of the descriptors; or heads, also those of the keypoints",
+        description="layers that robots train: codes, those of the descriptors",
     )
     compatible: float = Field(
         default=4.0,

@@ -88,8 +88,8 @@ class LearningRobot:
         self._client.inputs = CodeInputs()
         revisits = examples.revisits
         tell(
-            f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own, "
-            f"{len(revisits.voted)} with voted keypoints; {len(examples.held_out.revisits)} pairs held out"
+            f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
+            f"{len(examples.held_out.revisits)} pairs held out"
         )
 
 

@@ -9,7 +9,7 @@ from fcslam.learning.settings import TrainingSettings
 
 StrategyName = Literal["fedavg", "fedmedian"]
 Normalisation = Literal["averaged", "frozen"]
-TrainedLayers = Literal["all", "codes", "heads"]
+TrainedLayers = Literal["all", "codes"]
 
 
 class ScreeningSettings(Settings):
@@ -49,7 +49,7 @@ class FederatedSettings(Settings):
     local_steps: int = Field(
         default=10,
         ge=1,
-        description="optimiser steps of each robot in a round; of each head, with trained: heads",
+        description="optimiser steps of each robot in a round",
     )
     judge_every: int = Field(
         default=5,
@@ -89,9 +89,8 @@ class FederatedSettings(Settings):
     )
     trained: TrainedLayers = Field(
         default="all",
-        description="layers that robots train: all; codes, those of the descriptors alone, so that keypoints stay as "
-        "they are; or heads, those of the descriptors and of the keypoints, on what a robot saw again; codes and heads "
-        "need frozen batch statistics",
+        description="layers that robots train: all; or codes, those of the descriptors alone, so that keypoints stay "
+        "as they are, on what a robot saw again, which needs frozen batch statistics",
     )
     collapse: float = Field(
         default=0.15,
