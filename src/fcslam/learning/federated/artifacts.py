@@ -12,9 +12,9 @@ from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
 from fcslam.learning.federated.checkpoint import CoordinatorState
 from fcslam.learning.federated.history import LOSS, ROUNDS_FILE, Row
 from fcslam.learning.federated.networks import weights_to_network
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 
-DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md", "rounds.png"
+INT8, CARD, PICTURE = "detector-int8.onnx", "card.md", "rounds.png"
 SHOWN_METRICS: Final = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",

@@ -9,7 +9,7 @@ from typing import Final
 from fcslam.config import dump
 from fcslam.errors import OutputError
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.artifacts import DETECTOR, write_federated_artifacts
+from fcslam.learning.federated.artifacts import write_federated_artifacts
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
@@ -17,7 +17,7 @@ from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.live_settings import GateSettings
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.public_images import calibration_images, public_evaluation, read_public_images
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 from fcslam.learning.federated.strategies import StrategyFactory
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.stages import StageCallback
@@ -39,11 +39,8 @@ class FederatedJob:
     """Folders of images that the server may read; without any, the robots evaluate."""
     strategy: StrategyFactory | None = None
     """Makes a strategy of your own; None: the one that the settings name."""
-
     gate: GateSettings | None = None
     """Decides on releases by pairs that robots hold out; None: every version that is not worse is released."""
-    fallback: Callable[[str], Weights | None] = lambda _version: None
-    """As in ``CoordinatorHooks``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +91,7 @@ def run_job(
 
     version = partial(weights_version, encoder=encoder)
     evaluate = public_evaluation(images, encoder, options.device)
-    hooks = CoordinatorHooks(
-        version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.fallback, job.strategy
-    )
+    hooks = CoordinatorHooks(version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.strategy)
     state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
     _write_config(job, job.output / CONFIG_FILE, again=True)
     judged_on = (

@@ -1,11 +1,14 @@
 """Settings of federated training."""
 
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from fcslam.config import Settings
 from fcslam.learning.settings import TrainingSettings
+
+DETECTOR: Final = "detector.onnx"
+"""File of the released detector in the output folder."""
 
 StrategyName = Literal["fedavg", "fedmedian"]
 Normalisation = Literal["averaged", "frozen"]
