@@ -3,7 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/federated.py --study FOLDER
 
 Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained and measured; the same command goes on
-where it was interrupted, and given several times at once it shares the work out. `--until together` leaves out all but
+where it was interrupted. `--until together` leaves out all but
 the comparison itself. Five robots that see different things: a floor of a tower, a drive through a town, photographs
 from the web, and two simulated ones, by day and with lamps off, with few images each, as a robot alone would hardly
 lack others' if it had many. All begin from one small detector that was trained on synthetic shapes and on photographs
