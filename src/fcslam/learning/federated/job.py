@@ -16,7 +16,7 @@ from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.live_settings import GateSettings
 from fcslam.learning.federated.networks import weights_to_network, weights_version
-from fcslam.learning.federated.public_images import calibration_images, public_evaluation, read_public_images
+from fcslam.learning.federated.public_images import public_evaluation, read_public_images
 from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 from fcslam.learning.federated.strategies import StrategyFactory
 from fcslam.learning.federated.weights import Weights
@@ -74,7 +74,7 @@ def run_job(
         wait: as in ``CoordinatorHooks``.
 
     Returns:
-        The files for the user: the detector in float32 and int8, the picture of the rounds, and the model card.
+        The files for the user: the detector, the picture of the rounds, and the model card.
 
     Raises:
         TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
@@ -101,7 +101,7 @@ def run_job(
     )
     if job.gate is not None:
         judged_on = "on revisits that no robot trained on, mean"
-    return write_federated_artifacts(state, job.output, job.settings, calibration_images(images), judged_on)
+    return write_federated_artifacts(state, job.output, job.settings, judged_on)
 
 
 def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:
