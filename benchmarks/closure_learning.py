@@ -221,10 +221,13 @@ def recorded(seed: int, robots: int, folder: Path) -> Path:
     settings = SimulationSettings(
         robots=robots, path_length_m=45.0, lighting=LIGHT, moved_furniture=0.5, camera=CameraSettings(rate_hz=2.0)
     )
-    place = folder / str(seed)
-    prepare_fleet_folder(place, settings, seed, resume=True)
-    for robot in simulate_fleet(settings, seed).robots:
-        record_robot(robot, place / robot.name, resume=True)
+    place, part = folder / str(seed), folder / f"{seed}.part"
+    if not place.exists():
+        shutil.rmtree(part, ignore_errors=True)
+        prepare_fleet_folder(part, settings, seed)
+        for robot in simulate_fleet(settings, seed).robots:
+            record_robot(robot, part / robot.name)
+        part.rename(place)
     return place
 
 

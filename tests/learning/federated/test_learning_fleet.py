@@ -96,10 +96,10 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
         robots=3, path_length_m=30.0, lighting=(Lighting.DAY, Lighting.EVENING),
         lidar=LidarSettings(rate_hz=5.0), camera=CameraSettings(rate_hz=3.0),
     )  # fmt: skip
-    prepare_fleet_folder(tmp_path / "sim", settings, 5, resume=False)
+    prepare_fleet_folder(tmp_path / "sim", settings, 5)
     robots = [robot.name for robot in simulate_fleet(settings, 5).robots]
     for robot in simulate_fleet(settings, 5).robots:
-        record_robot(robot, tmp_path / "sim" / robot.name, resume=False)
+        record_robot(robot, tmp_path / "sim" / robot.name)
     weak = weak_detector(tmp_path)
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "learning.yaml").write_text(yaml.safe_dump(SETTINGS))

@@ -167,43 +167,34 @@ class SimulatedRobot:
             return Readings(np.empty(0), np.empty((0, 3)))
         return self.readings
 
-    def items(
-        self, first_scan: int = 0, first_image: int = 0, first_odometry: int = 0
-    ) -> Generator[RecordedItem, None, None]:
+    def items(self) -> Generator[RecordedItem, None, None]:
         """Scans, images and odometry in the order of time; a scan or an image is followed by the true pose.
-
-        Scans before number ``first_scan``, images before ``first_image`` and readings of the odometry before
-        ``first_odometry`` are skipped; true poses are not.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
         """
         odometry = self.odometry
         stamps = np.concatenate((self.stamps, self.image_stamps, odometry.stamps))
-        scans, count, end = self.scans(first_scan), len(self.stamps), len(self.stamps) + len(self.image_stamps)
-        with closing(self._images(first_image)) as images:
+        scans, count, end = self.scans(), len(self.stamps), len(self.stamps) + len(self.image_stamps)
+        with closing(self._images()) as images:
             for k in np.argsort(stamps, kind="stable"):
                 if k >= end:
-                    if k >= end + first_odometry:
-                        yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
+                    yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
                     continue
-                if first_scan <= k < count:
-                    yield next(scans)
-                elif k >= count + first_image:
-                    yield next(images)
+                yield next(scans) if k < count else next(images)
                 yield self._truth(float(stamps[k]))
 
     def _truth(self, stamp: float) -> GroundTruth:
         return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
 
-    def scans(self, first: int = 0) -> Iterator[LaserScan]:
-        """Scans from number ``first`` on; every call yields the same.
+    def scans(self) -> Iterator[LaserScan]:
+        """All scans; every call yields the same.
 
         Raises:
             SimulationError: MuJoCo is missing.
         """
         caster, settings, (laser,) = ray_caster(self.plan), self.settings.lidar, self.lasers
-        for k in range(first, len(self.stamps)):
+        for k in range(len(self.stamps)):
             rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
             sweep = settings.sweep(laser.beams)
             if sweep is not None:
@@ -215,7 +206,7 @@ class SimulatedRobot:
             ranges = simulate_ranges(met, laser, settings, rng)
             yield LaserScan(stamp, frozen(ranges, np.float32), laser, self.T_odom_base[k], sweep)
 
-    def _images(self, first: int) -> Generator[CameraImage, None, None]:
+    def _images(self) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
         if self.camera is None or self.decoration is None or settings is None:
             return
@@ -226,7 +217,7 @@ class SimulatedRobot:
         odometry = None if self.readings is None else self.readings.at(self.image_stamps)
         shape = (settings.height, settings.width, 1)
         with Camera(model, self.camera, light) as camera:
-            for k in range(first, len(self.image_stamps)):
+            for k in range(len(self.image_stamps)):
                 noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
                 picture = camera.take(poses[k]).astype(np.float32)
                 draw_tags(picture, self.camera, poses[k], self.tags, self.plan.segments)
@@ -235,7 +226,7 @@ class SimulatedRobot:
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
 
     def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
-        """A generator for each record, so that a recording can be resumed at any record."""
+        """A generator for each record, so that no record depends on another one."""
         return _generator(self.seed, purpose, self.number, record)
 
 
