@@ -8,7 +8,19 @@ import pytest
 from fcslam.cli import main
 from fcslam.sources import open_source
 
-COMMAND = ["tools", "simulate", "--building", "flat", "--path-length", "4", "--robots", "2", "--no-camera", "--seed", "2"]
+COMMAND = [
+    "tools",
+    "simulate",
+    "--building",
+    "flat",
+    "--path-length",
+    "4",
+    "--robots",
+    "2",
+    "--no-camera",
+    "--seed",
+    "2",
+]
 
 
 def files(folder):
