@@ -8,13 +8,12 @@ same three kinds of light, among other furniture. Each training fleet is mapped 
 come from estimated poses (`learning/revisits.py`). True poses serve the evaluation only.
 
 All networks start from the bundled one. Robots train the layers of the codes (`learning/code_training.py`), on pairs of
-their own keyframes that show the same points of their map; in one arm also those of the keypoints. Federated arms have
+their own keyframes that show the same points of their map. Federated arms have
 every robot of every building as a client, and a sixth of them trains in a round. Central training has as many steps as
 all robots together, and a robot alone as many as one that trains in every round.
 
 - homographies: as many pairs, each of two views of one image under a random homography, federated
 - own map: pairs of each robot's own keyframes, federated
-- keypoints too: that, and keypoints that other views of the robot's map show again or do not
 - poisoned: as own map, but one robot of five reverses its updates, ten times as long
 - central: pairs of one robot and across robots, whose images are in one place
 - alone: own map, one robot in each of three buildings; each of the networks is measured in every third building
@@ -64,7 +63,7 @@ from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.client import FederatedClient, RobotClient, seeded_noise
+from fcslam.learning.federated.client import FederatedClient, RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.held_out import PlacePoints
@@ -77,7 +76,7 @@ from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
-from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair, VotedImage, vote
+from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.revisits import Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
@@ -105,14 +104,13 @@ PAIRS_A_BUILDING = 120
 """Most pairs of views per building on which keypoint recall is measured."""
 ALONE = 3
 """Robots that train alone; each building of the test measures the network of one of them."""
-ARMS = ("bundled", "homographies", "own map", "keypoints too", "poisoned", "central", "alone")
-REPEATED = ("own map", "keypoints too")
+ARMS = ("bundled", "homographies", "own map", "poisoned", "central", "alone")
+REPEATED = ("own map",)
 """Arms with all training seeds; the others have the first."""
-LATER_DRIVEN = ("bundled", "own map", "keypoints too")
+LATER_DRIVEN = ("bundled", "own map")
 """Arms that are also measured on later drives."""
 COMPARED = (
     ("own map", "homographies"),
-    ("keypoints too", "own map"),
     ("own map", "alone"),
     ("own map", "central"),
     ("poisoned", "own map"),
@@ -148,7 +146,6 @@ class Learner:
     keyframes: tuple[TrainingExample, ...]
     """Its images, with its keypoints as labels."""
     pairs: tuple[RevisitPair, ...]
-    voted: tuple[VotedImage, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,10 +221,13 @@ def recorded(seed: int, robots: int, folder: Path) -> Path:
     settings = SimulationSettings(
         robots=robots, path_length_m=45.0, lighting=LIGHT, moved_furniture=0.5, camera=CameraSettings(rate_hz=2.0)
     )
-    place = folder / str(seed)
-    prepare_fleet_folder(place, settings, seed, resume=True)
-    for robot in simulate_fleet(settings, seed).robots:
-        record_robot(robot, place / robot.name, resume=True)
+    place, part = folder / str(seed), folder / f"{seed}.part"
+    if not place.exists():
+        shutil.rmtree(part, ignore_errors=True)
+        prepare_fleet_folder(part, settings, seed)
+        for robot in simulate_fleet(settings, seed).robots:
+            record_robot(robot, part / robot.name)
+        part.rename(place)
     return place
 
 
@@ -251,21 +251,18 @@ def fleet_of(drives: dict[str, MappedDrive]) -> Fleet:
     learners = []
     for name, drive in drives.items():
         frames, poses = drive.keyframes, drive.T_own_base
-        found = revisits_in_map(frames, poses)
-        pairs = [pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in found.pairs]
-        voted = [vote(k, frames[k].features.keypoints_px, each) for k, each in enumerate(found.sightings)]
+        pairs = [pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses)]
         keyframes = tuple(
             TrainingExample(f.image, Labels(f.features.keypoints_px, ranked(len(f.features.scores))))
             for f in drive.keyframes
         )
-        votes = tuple(each for each in voted if each is not None)
-        learners.append(Learner(name, keyframes, tuple(pairs), votes))
+        learners.append(Learner(name, keyframes, tuple(pairs)))
     largest = max(np.bincount([drive.map_index for drive in drives.values()]).argmax(), 0)
     joint = [drive for drive in drives.values() if drive.map_index == largest]
     frames = [frame for drive in joint for frame in drive.keyframes]
     poses = np.concatenate([drive.T_map_base for drive in joint])
     everything = [
-        pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses).pairs
+        pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses)
     ]
     return Fleet(tuple(learners), RevisitExamples([frame.image for frame in frames], everything))
 
@@ -303,7 +300,7 @@ def revisits_of(arm: str, learner: Learner, seed: int) -> RevisitExamples:
     if arm == "homographies":
         return homography_pairs(learner, seed)
     images = [example.image for example in learner.keyframes]
-    return RevisitExamples(images, learner.pairs, learner.voted)
+    return RevisitExamples(images, learner.pairs)
 
 
 def joined(fleets: Sequence[Fleet]) -> RevisitExamples:
@@ -323,9 +320,8 @@ def trained(
     """The networks of an arm, one or several, of which the mean counts; None for the bundled one."""
     if arm == "bundled":
         return [None]
-    layers = "heads" if arm == "keypoints too" else "codes"
     training = settings.training.model_copy(update={"seed": seed})
-    settings = settings.model_copy(update={"trained": layers, "training": training})
+    settings = settings.model_copy(update={"training": training})
     start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings, ExecutionOptions(), lambda *_: None)
     learners = [(k, learner) for k, fleet in enumerate(fleets) for learner in fleet.learners]
     steps = settings.rounds * settings.local_steps
@@ -367,14 +363,13 @@ def federated(
     for building, learner in learners:
         name = f"{building}-{learner.robot}"
         (folder / name).mkdir()
-        noise = seeded_noise(name, settings.training.seed)
-        client = RobotClient(name, folder / name, folder / name, noise, revisits=revisits_of(arm, learner, seed))
+        client = RobotClient(name, folder / name, folder / name, revisits=revisits_of(arm, learner, seed))
         is_poisoned = arm == "poisoned" and building in POISONED and learner.robot == LIAR
         clients.append(PoisonedClient(client, "reversed") if is_poisoned else client)
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
         evaluate_fn=lambda _weights: {},  # without metrics the last version counts, as in the other arms
-        on_round=lambda row, _best: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
+        on_round=lambda row: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
     )
     state = Coordinator(in_process_grid(clients), settings, start, folder / "rounds", hooks).run()
     return weights_to_network(state.average, settings.training.encoder)

@@ -228,7 +228,7 @@ def learner(
     """Images with their pairs; without positions in a map."""
     pairs = []
     for each in predicted:
-        rows = correspond_predicted(features[each.i], features[each.j], each.pixels, each.shown).rows
+        rows = correspond_predicted(features[each.i], features[each.j], each.pixels, each.shown)
         if len(rows) >= FEWEST_SHARED:
             points = (features[k].keypoints_px[column] for k, column in zip((each.i, each.j), rows.T, strict=True))
             pairs.append(RevisitPair((each.i, each.j), tuple(points), np.full((len(rows), 3), np.nan)))

@@ -17,7 +17,6 @@ import common
 import numpy as np
 
 from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureReport, ClosureScope, closure_metrics, evaluate_closures
-from fcslam.metrics.closures import ClosureCriteria
 
 SETS = {"log": "", "closures": "", "stage": ""}
 COUNTS = {**SETS, "all": "", "covered": "", "coverage": ".1%", "wrong": "", "precision": ".2%", "revisits": "",
@@ -39,7 +38,7 @@ def main() -> None:
         for name, parts in common.SPLITS.items():
             run = Path(place) / name
             common.run_fcslam("map", common.log_path(folder, name), "--output", run, "--split", parts)
-            reports[name] = evaluate_closures(run, common.relations_path(folder, name), ClosureCriteria())
+            reports[name] = evaluate_closures(run, common.relations_path(folder, name))
     report.say(
         "Stages are cumulative: what was verified was a candidate, what was accepted was verified. Rejected and "
         "revoked closures stand beside them. A robot reports only closures that it accepts."

@@ -9,6 +9,7 @@ import json
 import math
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -104,7 +105,8 @@ def simulated(folder: Path, *arguments: object) -> Path:
     """A fleet that `fcslam tools simulate` records into ``folder``; one that is there already is taken as it is."""
     # The true map is written last.
     if not (folder / "ground_truth" / "map.yaml").exists():
-        run_fcslam("tools", "simulate", *arguments, "--resume", "--output", folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        run_fcslam("tools", "simulate", *arguments, "--output", folder)
     return folder
 
 

@@ -1,44 +1,29 @@
-"""Does the exported detector say what the trained one says, and what does int8 cost?
+"""Does the exported detector say what the trained one says?
 
     FCSLAM_DATA=/path/to/data python benchmarks/export_agreement.py --training FOLDER
 
-FOLDER is what `fcslam tools train` wrote: its two ONNX files, and the checkpoint that they were made from, for which
-torch is needed (`fcslam[train]`). Images: those of the scenes of `benchmarks/homography.py` at 640 x 480. Bits are
-compared at the 1000 strongest keypoints of the float32 file, the same positions for all, so that only the logits
-differ. Then both files on the pairs of the scenes; intervals are 95 % by paired bootstrap over pairs.
+FOLDER is what `fcslam tools train` wrote: its ONNX file, and the checkpoint it was made from, for which torch is needed
+(`fcslam[train]`). Images: those of the scenes of `benchmarks/homography.py` at 640 x 480. Bits are compared at the 1000
+strongest keypoints of the file, the same positions for both, so that only the logits differ.
 """
 
-import importlib.util
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import common
 import numpy as np
-from homography import SCENES, SEED
+from homography import SCENES
 
 from fcslam.features.dense import Logits, Probabilities, sample_codes
 from fcslam.features.detector import GreyImage, OnnxConfig, OnnxDetector
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
-from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors, frame, one_thread
-from fcslam.lab.evaluation.detectors.homography import (
-    LARGE,
-    MATCHED,
-    MATCHING_NMS_PX,
-    HomographyReport,
-    evaluate_homography,
-)
-from fcslam.lab.evaluation.detectors.measures import difference, mean
+from fcslam.lab.evaluation.detectors.evaluated_detectors import frame, one_thread
+from fcslam.lab.evaluation.detectors.homography import LARGE, MATCHED
 from fcslam.lab.evaluation.detectors.scenes import Scene, find_scenes
 
 Network = Callable[[GreyImage], tuple[Probabilities, Logits]]
 BITS = {"compared": "s", "images": "d", "codes": "d", "bits that differ, %": ".4f", "in the worst image, %": ".4f",
         "largest difference of a score": ".6f"}  # fmt: skip
-MEASURES = {"repeatability": "repeatability"} | {
-    f"{title}, NMS {nms_px}": f"{name}_nms{nms_px}"
-    for nms_px in MATCHING_NMS_PX
-    for title, name in (("MMA@3", "accuracy_3px"), ("e=3", "homography_3px"), ("score", "score"))
-}
 
 
 def main() -> None:
@@ -51,20 +36,12 @@ def main() -> None:
     report = common.Report(__file__, __doc__ or "", chosen)
     folder = common.recordings(*SCENES, kind="vision")
     scenes = find_scenes([folder / name for name in SCENES])
-    paths = [chosen.training / name for name in ("detector.onnx", "detector-int8.onnx")]
-    floating, small = (OnnxDetector(OnnxConfig(weights=path, most_features=MATCHED)) for path in paths)
-    images = _images(scenes)
+    exported = OnnxDetector(OnnxConfig(weights=chosen.training / "detector.onnx", most_features=MATCHED))
     with one_thread():
-        compared = {f"float32 and int8, {small.version}": small.infer}
-        if importlib.util.find_spec("torch"):
-            trained = _trained(chosen.training / "joint" / "checkpoint.npz", floating.version)
-            compared = {f"torch and float32, {floating.version}": trained} | compared
-        else:
-            report.say("Torch is not installed, so the checkpoint was not compared; install fcslam[train].")
-        rows = (_bits_row(name, floating, other, images) for name, other in compared.items())
-        report.table("Bits", BITS, rows)
-    measured = evaluate_homography(scenes, choose_detectors([EvaluatedDetectorKind.ONNX], paths, []))
-    report.table("On the scenes", {"": "s"} | dict.fromkeys(MEASURES, "s"), _scene_rows(measured))
+        trained = _trained(chosen.training / "joint" / "checkpoint.npz", exported.version)
+        report.table(
+            "Bits", BITS, [_bits_row(f"torch and the file, {exported.version}", exported, trained, _images(scenes))]
+        )
     report.write()
 
 
@@ -103,14 +80,6 @@ def _bits_row(name: str, reference: OnnxDetector, other: Network, images: Sequen
         codes += len(found.scores)
         largest = max(largest, float(np.abs(scores - reference.infer(image)[0]).max()))
     return name, len(images), codes, float(np.mean(shares)), max(shares), largest
-
-
-def _scene_rows(measured: HomographyReport) -> Iterator[tuple[str, ...]]:
-    floating, small = (measured.of(name) for name in measured.detectors)
-    for name in measured.detectors:
-        yield name, *(f"{mean(measured.of(name), measure):.3f}" for measure in MEASURES.values())
-    gaps = (difference(small, floating, measure, SEED) for measure in MEASURES.values())
-    yield "int8 less float32", *(f"{gap.mean:+.3f} [{gap.low:+.3f}, {gap.high:+.3f}]" for gap in gaps)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Federated training against training in one place and against robots that train alone, and against poison and noise.
+"""Federated training against training in one place and against robots that train alone, and against poison.
 
     FCSLAM_DATA=/path/to/data python benchmarks/federated.py --study FOLDER
 
 Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained and measured; the same command goes on
-where it was interrupted, and given several times at once it shares the work out. `--until together` leaves out all but
+where it was interrupted. `--until together` leaves out all but
 the comparison itself. Five robots that see different things: a floor of a tower, a drive through a town, photographs
 from the web, and two simulated ones, by day and with lamps off, with few images each, as a robot alone would hardly
 lack others' if it had many. All begin from one small detector that was trained on synthetic shapes and on photographs
@@ -24,7 +24,7 @@ than others' images.
 
 Gap: central minus the arm, in points, on the same pairs and seeds, with 95 % by paired bootstrap over pairs. Closed:
 (arm - local) / (central - local), where central - local is clearly above 0; of alone: the same with alone for local.
-Lost, to poison: together minus the arm; to noise: frozen minus the arm. Intervals are over pairs, not over seeds, and
+Lost, to poison: together minus the arm. Intervals are over pairs, not over seeds, and
 pairs of one image resemble one another, so they are somewhat too narrow; most so where an arm has one seed.
 """
 
@@ -40,12 +40,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, points, robots, run
 
-from fcslam.learning.federated.privacy import epsilon
-from fcslam.learning.federated.settings import FederatedSettings, PrivacySettings
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from training_fleet import Rows
 
     from fcslam.lab.evaluation.federated.study import StudyResults
@@ -65,22 +63,18 @@ ROBUST: dict[str, dict[str, Any]] = {
     "screened": {},
     "median": {"strategy": "fedmedian", **TRUSTING},
 }
-NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3, "noise-01": 1e-2}
-"""Multipliers that leave something to measure; with 10, which promises something, training diverges at once."""
 KEPT = {"compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
-CLIP_NORM = 3.0
 AT_HOME = {"arm": "s", "images": "s", "pairs": "d", "homographies, %": ".1f", "below central": "s",
            "below together": "s", "MMA, %": ".1f", "below central ": "s", "below together ": "s"}  # fmt: skip
 LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
 LOSSES = {"arm": "s"} | LOST
-PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
 KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "below together": "s",
            "old and new, MMA, %": ".1f", "below together ": "s"}  # fmt: skip
 REFUSED = {"arm": "s", "updates of honest robots": "d", "refused": "d", "of the poisoned one": "s"}
 SEEDS, PAIRS, IMAGES, TRAINED = 3, 2000, 64, 16
 COMPARED = ("start", "central", "wide", "local", "alone", "together", "plain", "frozen", *KEPT)
-"""Arms without poison and noise."""
+"""Arms without poison."""
 
 
 def arms() -> dict[str, Any]:
@@ -92,16 +86,9 @@ def arms() -> dict[str, Any]:
         **{f"{name}-reversed": {"settings": how, **poisoned} for name, how in ROBUST.items()},
         "wide": {"together": False, "settings": {"training": WIDE}, **few},
         "frozen": {"settings": {"normalisation": "frozen"}, **few},
-        **{name: {"settings": private(multiplier), **few} for name, multiplier in NOISE.items()},
         **{name: {"settings": {"compatible": strength}, **few} for name, strength in KEPT.items()},
         "plain": {"settings": {"server_momentum": 0.0}, **few},
     }
-
-
-def private(multiplier: float) -> dict[str, Any]:
-    """Settings with noise; what is mostly noise would be screened out."""
-    privacy = {"clip_norm": CLIP_NORM, "noise_multiplier": multiplier}
-    return {"normalisation": "frozen", "privacy": privacy, **TRUSTING}
 
 
 def main() -> None:
@@ -127,10 +114,8 @@ def main() -> None:
     if poisoned := list(poison_rows(unpoisoned)):
         report.table("One of five robots poisoned", LOSSES, poisoned)
     report.table("Updates that screening refused", REFUSED, refused_rows(folder / "study", known))
-    if known.issuperset(NOISE):
-        report.table("Noise for privacy", PRIVATE, private_rows(compare(findings, "frozen")))
     report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(unpoisoned))
-    report.picture("Gap to central training by arm; beside it, if there was noise, what that costs", draw(below))
+    report.picture("Gap to central training by arm", draw(below))
     report.write()
 
 
@@ -218,19 +203,9 @@ def refused_rows(study: Path, known: Set[str]) -> Iterator[tuple[object, ...]]:
         yield arm, updates, honest, " ".join(f"{len(rows) - counted[name]} of {len(rows)}" for name in bad)
 
 
-def private_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
-    for arm, noise in {"frozen": 0.0, **NOISE}.items():
-        yield arm, noise, promised(noise), *lost(rows, arm)
-
-
 def lost(rows: "Rows", arm: str) -> list[object]:
     """Both measures of an arm, and how far they are below the one it is compared to."""
     return [cell for row in (rows[measure, arm] for measure in TITLES) for cell in (100 * row.mean, points(row.gap))]
-
-
-def promised(noise: float) -> float:
-    """Epsilon after all rounds."""
-    return epsilon(noise, ROUNDS, PrivacySettings().delta)
 
 
 def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
@@ -241,38 +216,24 @@ def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
 
 
 def draw(rows: "Rows") -> Figure:
-    """Gaps with intervals by arm; where there is noise, accuracy against epsilon beside them."""
+    """Gaps with intervals by arm."""
     names = [arm for arm in ("local", "alone", *arms()) if ("mma_3px", arm) in rows]
-    noisy = set(NOISE) <= set(names)
-    figure = Figure(figsize=(11 if noisy else 7, 4.5), layout="constrained")
-    panels = figure.subplots(1, 2 if noisy else 1, squeeze=False)[0]
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    panel = figure.subplots()
     for offset, (measure, title) in zip((-0.15, 0.15), TITLES.items(), strict=True):
         gaps = np.array([rows[measure, arm].gap for arm in names]) * 100
         at, spread = np.arange(len(names)) + offset, np.abs(gaps[:, 1:].T - gaps[:, 0])
-        panels[0].errorbar(gaps[:, 0], at, xerr=spread, fmt="o", capsize=2, label=title)
-    panels[0].axvline(0.0, color="black", linewidth=1)
-    panels[0].axvline(2.0, color="grey", linewidth=1, linestyle=":")
-    panels[0].set_yticks(range(len(names)), names)
-    panels[0].invert_yaxis()
-    panels[0].set_xscale("symlog", linthresh=5.0)
-    panels[0].set_xticks(ticks := (-5, -2, 0, 2, 5, 10, 30), [str(tick) for tick in ticks])
-    panels[0].set_xlabel("points below central training, 95 %")
-    if noisy:
-        draw_noise(panels[1], rows)
-    for panel, corner in zip(panels, ("lower left", "lower right"), strict=False):
-        panel.grid(alpha=0.3)
-        panel.legend(frameon=False, loc=corner)
+        panel.errorbar(gaps[:, 0], at, xerr=spread, fmt="o", capsize=2, label=title)
+    panel.axvline(0.0, color="black", linewidth=1)
+    panel.axvline(2.0, color="grey", linewidth=1, linestyle=":")
+    panel.set_yticks(range(len(names)), names)
+    panel.invert_yaxis()
+    panel.set_xscale("symlog", linthresh=5.0)
+    panel.set_xticks(ticks := (-5, -2, 0, 2, 5, 10, 30), [str(tick) for tick in ticks])
+    panel.set_xlabel("points below central training, 95 %")
+    panel.grid(alpha=0.3)
+    panel.legend(frameon=False, loc="lower left")
     return figure
-
-
-def draw_noise(panel: "Axes", rows: "Rows") -> None:
-    for measure, title in TITLES.items():
-        curve = [(promised(noise), 100 * rows[measure, arm].mean) for arm, noise in NOISE.items()]
-        line = panel.plot(*zip(*curve, strict=True), "o-", label=title)[0]
-        panel.axhline(100 * rows[measure, "frozen"].mean, color=line.get_color(), linestyle="--", linewidth=1)
-    panel.set_xscale("log")
-    panel.set_xlabel("epsilon; dashed: without noise")
-    panel.set_ylabel("%")
 
 
 if __name__ == "__main__":

@@ -195,7 +195,7 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     training = TrainingSettings(label_copies=1)
     settings = FederatedSettings(local_steps=steps, rounds=count, judge_every=1, training=training)
     fleet = [
-        client.RobotClient(name, drawn(folder / name, 5, seed), folder / "labels" / name, client.secret_noise)
+        client.RobotClient(name, drawn(folder / name, 5, seed), folder / "labels" / name)
         for seed, name in enumerate(ROBOTS)
     ]
     start = network_to_weights(KeypointNetwork("light"))

@@ -159,7 +159,7 @@ def train(grid: RobotGrid, settings: FederatedSettings) -> list[tuple[RoundRepor
     rounds: list[tuple[RoundReport, float]] = []
     spent = time.process_time()
 
-    def note(report: RoundReport, _best: Weights) -> None:
+    def note(report: RoundReport) -> None:
         nonlocal spent
         now = time.process_time()
         rounds.append((report, now - spent))

@@ -3,7 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/federated_shipped.py --study FOLDER
 
 Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained and measured; the same command goes on
-where it was interrupted, and given several times at once it shares the work out. The robots are those of federated.py,
+where it was interrupted. The robots are those of federated.py,
 with three times as many images; settings are the defaults, but for the number of rounds. Kept is training together with
 `compatible: 30`, so that places which robots stored before are still matched.
 

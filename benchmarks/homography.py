@@ -1,6 +1,6 @@
 """Detectors on scenes with known homographies, corrected and legacy ground truth.
 
-    FCSLAM_DATA=/path/to/data python benchmarks/homography.py [--weights detector.onnx detector-int8.onnx ...]
+    FCSLAM_DATA=/path/to/data python benchmarks/homography.py [--weights detector.onnx ...]
 
 Four scenes of the Oxford affine set and one of HPatches, at most 640 pixels wide: 25 pairs, so differences of a few
 hundredths are chance; intervals are 95 % by bootstrap over pairs, those of differences paired. NMS 0: keypoints as the

@@ -33,11 +33,11 @@ def robots(vision: Path, folder: Path) -> dict[str, Path]:
 
 
 def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> "StudyResults":
-    """Train and measure whatever is missing of a study in a folder; ``content`` is of ``StudySettings``."""
+    """Train and measure whatever is missing of a study in a folder; ``content``: further fields of ``Study``."""
     import torch
 
-    from fcslam.lab.evaluation.federated.study import Study, StudySettings, run_study
-    from fcslam.learning.trainer import ExecutionOptions
+    from fcslam.lab.evaluation.federated.study import Arm, Study, run_study
+    from fcslam.learning.federated.settings import FederatedSettings
 
     torch.set_num_threads(1)
 
@@ -45,7 +45,9 @@ def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> 
         if done == of:
             print(f"{datetime.now(UTC):%H:%M:%S} {name}: {of}", flush=True)
 
-    return run_study(Study(fleet, folder, StudySettings.model_validate(content), ExecutionOptions(), watch))
+    settings = FederatedSettings.model_validate(content["federated"])
+    arms = {name: Arm(**arm) for name, arm in content["arms"].items()}
+    return run_study(Study(fleet, folder, **{**content, "federated": settings, "arms": arms}, on_progress=watch))
 
 
 def compare(findings: "StudyResults", against: str) -> "Rows":

@@ -41,12 +41,10 @@ OWN = {
     "page/report.py": "files of the package",
     "page/routes.py": "files of the package",
     "service": "the folder of the service",
-    "lab/simulation/recording.py": "the settings that this process writes",
     "sources/logs/carmen_writer.py": "the log that this process writes",
     "sources/bags/mcap_records.py": "the recording that this process writes",
     "sources/recording/writer.py": "the recording that this process writes",
     "storage": "the folder of the service or of this user",
-    "lab/evaluation/federated": "the folder of this user's training",
     "wire/prediction.py": "files of the package",
 }
 """Where files of this user are read that nobody else wrote, by module or folder, and which ones."""

@@ -11,7 +11,7 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import demo, demo_learning
 from fcslam.learning.federated import job
-from fcslam.learning.federated.client import RobotClient, seeded_noise
+from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.history import RoundReport
 
 
@@ -34,7 +34,7 @@ def test_a_detector_is_taken_if_a_round_passed_the_gate(released, tmp_path, monk
         return [task.output / "detector.onnx"]
 
     def learner(source, config, folder):
-        return RobotClient(source.name, folder, folder, seeded_noise(source.name, config.seed))
+        return RobotClient(source.name, folder, folder)
 
     monkeypatch.setattr(job, "run_job", run_job)
     monkeypatch.setattr(demo_learning, "_learner", learner)

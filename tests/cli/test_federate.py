@@ -80,12 +80,11 @@ def test_a_run_folder_holds_everything(run, fleet):
 
 
 @pytest.mark.slow
-def test_the_delivered_detectors_run(run, fleet, tmp_path):
+def test_the_delivered_detector_runs(run, fleet, tmp_path):
     run, _ = run
-    for name in ("detector.onnx", "detector-int8.onnx"):
-        arguments = ["tools", "extract", str(fleet / "one"), "--output", str(tmp_path / name)]
-        assert main([*arguments, "--detector", str(run / name)]) == 0
-        assert len(list((tmp_path / name).rglob("*.npz"))) == 3
+    arguments = ["tools", "extract", str(fleet / "one"), "--output", str(tmp_path / "out")]
+    assert main([*arguments, "--detector", str(run / "detector.onnx")]) == 0
+    assert len(list((tmp_path / "out").rglob("*.npz"))) == 3
 
 
 @pytest.mark.slow

@@ -58,12 +58,6 @@ def test_a_bad_recording_leaves_no_folder(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.rglob("runs/*")) == []
 
 
-def test_resuming_needs_the_folder(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["tools", "simulate", "--no-camera", "--resume"]) == 2
-    assert "give --output" in capsys.readouterr().err
-
-
 def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, capsys):
     logs = [str(save(tmp_path / f"{name}.log", drive(scans))) for name, scans in (("a", 40), ("b", 19))]
     assert main(["map", *logs, "-o", str(tmp_path / "run"), "--quiet"]) == 0

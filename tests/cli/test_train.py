@@ -60,7 +60,7 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
     arguments = ["tools", "train", str(photos), "-o", str(output), "--config", str(settings)]
     assert main(arguments) == 0
     captured = capsys.readouterr()
-    made = ["detector.onnx", "detector-int8.onnx", "training.png", "card.md"]
+    made = ["detector.onnx", "training.png", "card.md"]
     assert captured.out.split() == [str(output / name) for name in made]
     assert "5 images" in captured.err
     assert "2 left out" in captured.err

@@ -1,4 +1,4 @@
-"""ONNX files: the same answers as torch at any size, int8 nearly so, and what is written in them."""
+"""ONNX files: the same answers as torch at any size, and what is written in them."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ pytest.importorskip("onnx", reason="needs fcslam[train]")
 runtime = pytest.importorskip("onnxruntime", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError  # noqa: E402
-from fcslam.learning.export import detector_version, export_onnx, quantise_onnx  # noqa: E402
+from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
 
@@ -41,19 +41,6 @@ def test_the_file_says_what_torch_says_at_any_size(encoder, tmp_path):
         assert ((logits >= 0) != (maps.code_logits.numpy() >= 0)).mean() < 0.005
     assert metadata == {"fcslam_format": "1", "fcslam_version": detector_version(net)}
     assert sorted(file.name for file in tmp_path.iterdir()) == ["detector.onnx"]
-
-
-@pytest.mark.slow
-def test_int8_is_smaller_and_nearly_the_same(tmp_path):
-    net = network("light")
-    export_onnx(net, tmp_path / "detector.onnx")
-    quantise_onnx(tmp_path / "detector.onnx", tmp_path / "small.onnx", [textured(seed) for seed in range(4)])
-    image = textured(9).astype(np.float32) / 255
-    (_, logits), _ = answers(tmp_path / "detector.onnx", image)
-    (_, rounded), metadata = answers(tmp_path / "small.onnx", image)
-    assert ((logits >= 0) != (rounded >= 0)).mean() < 0.06
-    assert (tmp_path / "small.onnx").stat().st_size < 0.5 * (tmp_path / "detector.onnx").stat().st_size
-    assert metadata["fcslam_version"] == f"{detector_version(net)}-int8"
 
 
 def test_other_weights_have_another_version():

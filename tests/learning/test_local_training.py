@@ -18,7 +18,7 @@ from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, local_
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.training_step import LegacyDetector, ProximalTerm, reduced_precision  # noqa: E402
+from fcslam.learning.training_step import LegacyDetector, reduced_precision  # noqa: E402
 
 SMALL = TrainingSettings(steps=40, pairs=1, side_px=64, points=32)
 CPU = torch.device("cpu")
@@ -93,21 +93,6 @@ def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(exampl
     assert not [name for name in changed if "running" in name]
     norms = {name.removesuffix("running_var") for name in start if name.endswith("running_var")}
     assert all(f"{norm}weight" in changed for norm in norms)
-
-
-def test_the_pull_is_half_its_strength_times_the_squared_distance(start):
-    network = network_from_state("light", start)
-    weights = {name: value.detach().clone() for name, value in network.named_parameters()}
-    pull = ProximalTerm(3.0, weights)
-    assert pull.loss(network).item() == 0.0
-    count = 0
-    with torch.no_grad():
-        for value in network.parameters():
-            value.add_(0.5)
-            count += value.numel()
-    assert pull.loss(network).item() == pytest.approx(0.5 * 3.0 * 0.25 * count, rel=1e-5)
-    pull.loss(network).backward()
-    assert all(torch.allclose(value.grad, torch.full_like(value, 1.5)) for value in network.parameters())
 
 
 def bits(network):

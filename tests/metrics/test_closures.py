@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from fcslam.geometry import se2
 from fcslam.metrics.closures import (
-    ClosureCriteria,
+    BRIDGE_S,
     PoseReference,
     RelationReference,
     closure_errors,
@@ -17,7 +17,6 @@ from fcslam.metrics.closures import (
 )
 from fcslam.metrics.relations import PoseTable
 
-CRITERIA = ClosureCriteria()
 STEP_S, STEPS = 0.4, 60
 
 
@@ -44,7 +43,7 @@ def fleet(seed, frames=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
 def placed(run, truth, rows, components=None, frame=(0.0, 0.0, 0.0)):
     rows = np.asarray(rows)
     components = np.zeros(len(rows), dtype=np.int64) if components is None else np.asarray(components)
-    return PoseReference(run, CRITERIA.bridge_s, rows, se2.compose(frame, truth[rows]), components)
+    return PoseReference(run, BRIDGE_S, rows, se2.compose(frame, truth[rows]), components)
 
 
 def matrix(pose):
@@ -63,7 +62,7 @@ def test_true_closures_have_no_error_in_whatever_frames(seed, frame_1, frame_2, 
     pairs = np.random.default_rng(seed).integers(0, 2 * STEPS, (20, 2))
     T_i_j = se2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
     single = RelationReference(
-        run, CRITERIA.bridge_s, np.column_stack((rows[:-1], rows[1:])), se2.between(truth[rows[:-1]], truth[rows[1:]])
+        run, BRIDGE_S, np.column_stack((rows[:-1], rows[1:])), se2.between(truth[rows[:-1]], truth[rows[1:]])
     )
     for reference in (placed(run, truth, rows, frame=frame_reference), single):
         errors = closure_errors(pairs, T_i_j, run, reference)
@@ -83,7 +82,7 @@ def test_told_from_the_other_end_a_closure_gets_the_same_verdict(seed):
     ends = rng.choice(rows, (40, 2))
     for reference in (
         placed(run, truth, rows),
-        RelationReference(run, CRITERIA.bridge_s, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]])),
+        RelationReference(run, BRIDGE_S, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]])),
     ):
         there = closure_errors(pairs, T_i_j, run, reference)
         back = closure_errors(pairs[:, ::-1], se2.inverse(T_i_j), run, reference)
@@ -123,7 +122,7 @@ def test_a_gap_is_bridged_up_to_one_second(gap, covered):
     ):
         errors = closure_errors(np.array([[i, j]]), T_i_j, run, reference)
         assert errors.covered.tolist() == [covered]
-        assert errors.correct(CRITERIA).tolist() == [covered]
+        assert errors.correct.tolist() == [covered]
 
 
 def test_of_several_relations_the_nearest_counts():
@@ -157,10 +156,10 @@ def test_a_closure_that_is_off_is_found_wrong(off, wrong):
     T_i_j = se2.between(truth[closures[:, 0]], truth[closures[:, 1]])
     T_i_j[1] = se2.compose(T_i_j[1], (off[0], off[1], np.radians(off[2])))
     errors = closure_errors(closures, T_i_j, run, placed(run, truth, np.arange(0, len(truth), 2)))
-    everything = precision(errors, np.ones(3, dtype=bool), CRITERIA)
+    everything = precision(errors, np.ones(3, dtype=bool))
     assert (everything.closures, everything.covered, everything.wrong) == (3, 3, wrong)
     assert everything.precision == pytest.approx(1.0 - wrong / 3.0)
-    assert precision(errors, np.array([True, False, True]), CRITERIA).wrong == 0
+    assert precision(errors, np.array([True, False, True])).wrong == 0
     assert everything.translation_m[1] == pytest.approx(np.hypot(off[0], off[1]), abs=1e-9)
     assert everything.rotation_deg[1] == pytest.approx(abs(off[2]), abs=1e-6)
 
@@ -168,7 +167,7 @@ def test_a_closure_that_is_off_is_found_wrong(off, wrong):
 def test_nothing_is_told_of_no_closures():
     truth, run = fleet(8)
     errors = closure_errors(np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), run, placed(run, truth, [0, 1]))
-    nothing = precision(errors, np.zeros(0, dtype=bool), CRITERIA)
+    nothing = precision(errors, np.zeros(0, dtype=bool))
     assert (nothing.closures, nothing.covered, nothing.wrong) == (0, 0, 0)
     assert np.isnan([nothing.precision, nothing.coverage, *nothing.translation_m, *nothing.rotation_deg]).all()
 
@@ -184,6 +183,5 @@ def test_revisits_by_hand():
         [[10, 50], [12, 48], [13, 50], [48, 9], [50, 90 - 78], [30, 5], [5, 10], [28, 8], [30, 70], [10, 11]]
     )
     expected = [True, True, False, True, True, True, False, False, False, False]
-    assert revisits_found(np.array(revisits), correct, run, 2.0).tolist() == expected
-    assert not revisits_found(np.array(revisits), np.empty((0, 2), dtype=np.int64), run, 2.0).any()
-    assert revisits_found(np.array(revisits), correct, run, 100.0).tolist() == [True] * 10
+    assert revisits_found(np.array(revisits), correct, run).tolist() == expected
+    assert not revisits_found(np.array(revisits), np.empty((0, 2), dtype=np.int64), run).any()

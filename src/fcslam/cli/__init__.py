@@ -163,7 +163,7 @@ tools.command(
     epilog=examples(
         "fcslam tools simulate --building office --no-camera",
         "fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3",
-        "fcslam tools simulate --robots 20 --building office -o office --resume",
+        "fcslam tools simulate --robots 20 --building office -o office",
     ),
 )(simulate.simulate)
 tools.command(

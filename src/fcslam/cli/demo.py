@@ -65,7 +65,7 @@ def demo(
     _check_libraries(settings)
     fleet = simulate_fleet(settings, seed)
     _prepare(output)
-    prepare_fleet_folder(output / RECORDINGS, settings, seed, resume=False)
+    prepare_fleet_folder(output / RECORDINGS, settings, seed)
     console = notices(quiet)
     stages = _Stages(console, 5 if learn else 4)
     stages.begin(f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")

@@ -81,7 +81,7 @@ def learn_together(
 
 def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotClient":
     """A robot that drove its recording, with what it saw again."""
-    from fcslam.learning.federated.client import RobotClient, seeded_noise
+    from fcslam.learning.federated.client import RobotClient
     from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
     from fcslam.learning.federated.own_examples import own_examples
     from fcslam.robot.backend import RobotBackend
@@ -96,7 +96,4 @@ def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotC
     robot.finish()
     settings = RobotLearningSettings(held_out=HeldOutSettings(every=HELD_OUT))
     examples = own_examples(keyframes, settings)
-    noise = seeded_noise(source.name, config.seed)
-    return RobotClient(
-        source.name, keyframes, folder / "cache", noise, revisits=examples.revisits, held_out=examples.held_out
-    )
+    return RobotClient(source.name, keyframes, folder / "cache", revisits=examples.revisits, held_out=examples.held_out)

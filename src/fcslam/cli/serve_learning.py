@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from fcslam.cli.learning_options import LEARNING_FILE
-from fcslam.learning.federated.live_settings import RELEASE, RELEASES
+from fcslam.learning.federated.live_settings import RELEASE
+from fcslam.learning.federated.settings import DETECTOR
 
 if TYPE_CHECKING:
     from fcslam.learning.federated.live_settings import FleetLearningSettings
@@ -44,15 +45,11 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
     if not learn:
         return None
     if store is not None:
-        raise ServiceError("--learn follows missions in --data; leave out --store")
+        raise ServiceError("--learn works with missions in --data; leave out --store")
     config = data / LEARNING_FILE
     settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
     if not settings.federated.on_revisits:
-        raise ServiceError(
-            f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes or heads"
-        )
-    if settings.federated.privacy.noise_multiplier:
-        raise ServiceError(f"{config}: robots report on held-out pairs without noise; set noise_multiplier to 0")
+        raise ServiceError(f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes")
     require_training_libraries("flwr", extra="federated")
     return FleetLearningPlan(data / "learning", settings)
 
@@ -73,13 +70,13 @@ def learning_beside(plan: FleetLearningPlan, state: "ServiceState") -> Iterator[
 
     log = logging.getLogger("fcslam.service")
 
-    def announce(event: str, number: int) -> None:
+    def announce(event: str, _number: int) -> None:
         if event != RELEASE:
             return
         try:
-            file = state.missions.detectors.announce((plan.output / RELEASES / f"{number}.onnx").read_bytes())
+            file = state.missions.detectors.announce((plan.output / DETECTOR).read_bytes())
         except (FcslamError, OSError) as error:
-            log.error("release %d of learning cannot be announced: %s", number, error)
+            log.error("a release of learning cannot be announced: %s", error)
         else:
             log.warning("robots are to use detector %s from now on", file.version)
 

@@ -29,7 +29,7 @@ def simulate(
     *,
     output: Annotated[
         Path | None,
-        output_option("Folder for the recordings. It must be new or empty, except with --resume.", RECORDINGS),
+        output_option("Folder for the recordings. It must be new or empty.", RECORDINGS),
     ] = None,
     robots: Annotated[int | None, typer.Option(min=1, max=100, help="Number of robots.", show_default="3")] = None,
     seed: BuildingSeed = 1,
@@ -62,19 +62,13 @@ def simulate(
             "--scanner. Can be repeated. Each simulation writes its own to simulation.yaml.",
         ),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue an interrupted simulation in --output with the same settings.")
-    ] = False,
 ) -> None:  # fmt: skip
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
-    from fcslam.errors import OutputError
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.odometry import KINDS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
-    if resume and output is None:
-        raise OutputError("--resume continues a simulation in its folder; give --output")
     settings = SimulationSettings(lidar=SCANNERS[scanner or Scanner.INSTANT])
     settings = chosen_settings(settings, config)
     given = {
@@ -93,19 +87,12 @@ def simulate(
         settings = settings.model_copy(update={"camera": None})
     fleet = simulate_fleet(settings, seed)
     output = output or new_folder(RECORDINGS)
-    prepare_fleet_folder(output, settings, seed, resume)
-    try:
-        record_fleet(fleet, output, seed, notices(), resume)
-    except OutputError as error:
-        raise OutputError(f"{error}; to continue, repeat the command with --resume --output {output}") from error
+    prepare_fleet_folder(output, settings, seed)
+    record_fleet(fleet, output, seed, notices())
 
 
-def record_fleet(
-    fleet: "SimulatedFleet", output: Path, seed: int, console: "Console", resume: bool = False
-) -> list[Path]:
+def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Console") -> list[Path]:
     """Write a recording of each robot and the truth into the folder ``output``; returns the recordings.
-
-    With ``resume``, unfinished recordings are continued.
 
     Raises:
         SimulationError: MuJoCo or a GL library is missing.
@@ -125,7 +112,7 @@ def record_fleet(
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             watch = _Watch(display.start("simulating", total))
             jobs = [
-                pool.submit(record_robot, robot, place, watch, resume)
+                pool.submit(record_robot, robot, place, watch)
                 for robot, place in zip(fleet.robots, recordings, strict=True)
             ]
             try:

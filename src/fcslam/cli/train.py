@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 QUICK = {"steps": 20, "shape_steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
 QUICK_IMAGES = 4
-"""Images of ``--quick``: labelling one, and finding the ranges of int8 with it, takes vgg some seconds."""
+"""Images of ``--quick``: labelling one takes vgg some seconds."""
 FIGURES = ("repeatability", "mma_3px", "shift_repeatability")
 
 

@@ -40,7 +40,6 @@ OPERATORS: Final = frozenset(
         "ConstantOfShape",
         "Conv",
         "DepthToSpace",
-        "DequantizeLinear",
         "Div",
         "Equal",
         "Exp",
@@ -51,7 +50,6 @@ OPERATORS: Final = frozenset(
         "MaxPool",
         "Mul",
         "Pad",
-        "QuantizeLinear",
         "ReduceMean",
         "Relu",
         "Reshape",
@@ -67,7 +65,7 @@ OPERATORS: Final = frozenset(
         "Unsqueeze",
     ]
 )
-"""Operators of the exported networks, in float and int8; none repeats a part of the graph."""
+"""Operators of the exported networks; none repeats a part of the graph."""
 
 _FIELDS: Final[dict[str, dict[str, tuple[int, str]]]] = {
     "Model": {"graph": (7, "Graph"), "functions": (25, "bytes")},

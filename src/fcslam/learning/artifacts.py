@@ -1,11 +1,11 @@
-"""The files of a finished training run: the detector as ONNX files, its model card, its training curve."""
+"""The files of a finished training run: the detector as an ONNX file, its model card, its training curve."""
 
 from pathlib import Path
 
 from fcslam.config import dump
 from fcslam.errors import OutputError
 from fcslam.learning.curve import draw_curves, read_curves
-from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
+from fcslam.learning.export import detector_version, export_onnx
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages
@@ -23,15 +23,13 @@ SHOWN_METRICS = {
 def write_training_artifacts(
     network: KeypointNetwork, folder: Path, settings: TrainingSettings, images: TrainingImages, teacher: Path | None
 ) -> list[Path]:
-    """Write `detector.onnx`, `detector-int8.onnx`, `training.png` and `card.md`; returns their paths.
+    """Write `detector.onnx`, `training.png` and `card.md`; returns their paths.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    floating, small = folder / "detector.onnx", folder / "detector-int8.onnx"
-    export_onnx(network, floating)
-    quantise_onnx(floating, small, [example.image for example in images.train])
-    picture, card = folder / "training.png", folder / "card.md"
+    detector, picture, card = (folder / name for name in ("detector.onnx", "training.png", "card.md"))
+    export_onnx(network, detector)
     curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
     try:
         draw_curves(curves, picture)
@@ -41,7 +39,7 @@ def write_training_artifacts(
         raise OutputError(
             f"{folder}: cannot be written ({error}); free disk space and run the command again"
         ) from error
-    return [floating, small, picture, card]
+    return [detector, picture, card]
 
 
 def _card(

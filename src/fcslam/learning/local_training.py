@@ -14,7 +14,6 @@ from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import Encoder, TrainingSettings
 from fcslam.learning.training_step import (
     LegacyDetector,
-    ProximalTerm,
     create_optimiser,
     descend,
     get_optimiser_state,
@@ -34,8 +33,6 @@ class LocalTrainingPlan:
     first_step: int
     """Counted from 0 over the whole run."""
     steps: int
-    proximal: float = 0.0
-    """Strength of FedProx's proximal term; 0 for none."""
     compatible: float = 0.0
     """Weight of the loss that keeps codes compatible with those of a legacy detector; 0 for none."""
     frozen_statistics: bool = False
@@ -81,7 +78,6 @@ def local_training(
     network.train()
     if plan.frozen_statistics:
         freeze_statistics(network)
-    proximal = proximal_term(network, plan)
     legacy_detector = None
     if legacy is not None and plan.compatible > 0.0:
         legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, legacy).to(device))
@@ -91,9 +87,7 @@ def local_training(
     for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
         done = step - plan.first_step + 1
         rate = local_rate(settings, step, done, optimiser_state is None)
-        losses = training_step(
-            network, optimiser, batch.to(device), settings, step, rate, proximal=proximal, legacy=legacy_detector
-        )
+        losses = training_step(network, optimiser, batch.to(device), settings, step, rate, legacy=legacy_detector)
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss)
         on_step(done)
@@ -118,36 +112,24 @@ def train_layers(
         settings: of the whole run; the learning rate falls towards the end of its steps.
         plan: which steps are done, and how.
         on_step: called with the number of steps done.
-        optimiser_state: result of an earlier local training, to continue it. If it is that of other layers, these
-            begin without moments.
+        optimiser_state: result of an earlier local training, to continue it.
 
     Raises:
         TrainingError: ``optimiser_state`` belongs to another network, or training diverged.
     """
     freeze_all_but(network, layer_names(network, layers))
-    proximal = proximal_term(network, plan)
     optimiser = continued_optimiser(network, optimiser_state)
-    is_new = not any(optimiser.state.get(value) for value in network.parameters() if value.requires_grad)
     sums: dict[str, float] = {}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
         for group in optimiser.param_groups:
-            group["lr"] = local_rate(settings, step, done, is_new)
+            group["lr"] = local_rate(settings, step, done, optimiser_state is None)
         total, losses = losses_of(step)
-        if proximal is not None:
-            total = total + proximal.loss(network)
         descend(network, optimiser, total, step)
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss.detach())
         on_step(done)
     return local_result(network, optimiser, sums, plan)
-
-
-def proximal_term(network: KeypointNetwork, plan: LocalTrainingPlan) -> ProximalTerm | None:
-    """The plan's proximal term for the present weights; None without one."""
-    if plan.proximal <= 0.0:
-        return None
-    return ProximalTerm(plan.proximal, {name: value.detach().clone() for name, value in network.named_parameters()})
 
 
 def continued_optimiser(

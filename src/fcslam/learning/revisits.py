@@ -10,7 +10,7 @@ which: also where codes disagree, as only those pairs can teach anything.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,35 +72,6 @@ class Keyframe:
         return cls(image, features, camera, surroundings, positions, placed)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """How often other keyframes show the keypoints of one, found again or not."""
-
-    shown: NDArray[np.int64]
-    """Keyframes that show each keypoint, shape (K,)."""
-    found: NDArray[np.int64]
-    """Those of them in which it is a keypoint again, shape (K,)."""
-
-
-class MapRevisits(NamedTuple):
-    """Points that keyframes of one map share."""
-
-    pairs: list[tuple[int, int, NDArray[np.int64]]]
-    """The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
-    least ``FEWEST_SHARED``."""
-    sightings: list[Sightings]
-    """By keyframe, of all pairs whose poses fit."""
-
-
-class Correspondences(NamedTuple):
-    """Which keypoints of two keyframes are the same points of the building."""
-
-    rows: NDArray[np.int64]
-    """Shape (M, 2): numbers of the keypoints in the first and in the second keyframe."""
-    shown: NDArray[np.bool_]
-    """Which keypoints of the first keyframe the second one shows, shape (K,), found again or not."""
-
-
 def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Where the second keyframe shows the keypoints of the first.
 
@@ -124,23 +95,30 @@ def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tu
     return pixels, shown
 
 
-def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> Correspondences:
-    """Find the keypoints that two keyframes share, given the estimated pose of the second base in the first, (3,)."""
+def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> NDArray[np.int64]:
+    """Find the keypoints that two keyframes share, given the estimated pose of the second base in the first, (3,).
+
+    Returns:
+        Numbers of the keypoints in the first and in the second keyframe, shape (M, 2).
+    """
     pixels, shown = predict(first, second, T_first_second)
     return correspond_predicted(first.features, second.features, pixels, shown)
 
 
 def correspond_predicted(
     first: ImageFeatures, second: ImageFeatures, pixels: FloatArray, shown: NDArray[np.bool_]
-) -> Correspondences:
+) -> NDArray[np.int64]:
     """Find the keypoints that two images share.
 
     Args:
         first, second: keypoints of both images.
         pixels: where the second image shows the K keypoints of the first, some pixels off, shape (K, 2).
         shown: which of them it shows, shape (K,).
+
+    Returns:
+        Numbers of the keypoints in the first and in the second image, shape (M, 2).
     """
-    none = Correspondences(np.empty((0, 2), np.int64), np.zeros(len(shown), np.bool_))
+    none = np.empty((0, 2), np.int64)
     asked = np.flatnonzero(shown & (len(second.keypoints_px) > 0))
     if len(asked) < FEWEST_ALIKE:
         return none
@@ -157,36 +135,29 @@ def correspond_predicted(
     back = np.asarray(cKDTree(corrected).query(others)[1])
     found = np.flatnonzero(np.isfinite(distances))
     found = found[back[nearest[found]] == found]
-    return Correspondences(np.column_stack((asked[found], nearest[found])), shown)
+    return np.column_stack((asked[found], nearest[found]))
 
 
-def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> MapRevisits:
+def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> list[tuple[int, int, NDArray[np.int64]]]:
     """Find what keyframes of one map show again, from whatever time.
 
     Args:
         frames: N keyframes.
         T_map_base: their estimated poses in the map, shape (N, 3), metres and radians.
+
+    Returns:
+        The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
+        least ``FEWEST_SHARED``.
     """
     pairs = []
-    shown, found = ([np.zeros(len(frame.features.keypoints_px), np.int64) for frame in frames] for _ in range(2))
     for i, first in enumerate(frames):
         between = se2.between(T_map_base[i], T_map_base[i + 1 :])
         near = (np.hypot(*between[:, :2].T) <= FARTHEST_M) & (np.abs(between[:, 2]) <= WIDEST_RAD)
         for k in np.flatnonzero(near).tolist():
-            j, T_first_second = i + 1 + k, between[k]
-            rows, shown_there = correspond(first, frames[j], T_first_second)
-            back, shown_here = correspond(frames[j], first, se2.inverse(T_first_second))
-            # A keypoint without a position is found only from the other side.
-            for number, mask, ours, theirs in (
-                (i, shown_there, rows[:, 0], back[:, 1]), (j, shown_here, back[:, 0], rows[:, 1]),
-            ):  # fmt: skip
-                seen = np.union1d(ours, theirs)
-                mask[seen] = True
-                shown[number] += mask
-                found[number][seen] += 1
+            rows = correspond(first, frames[i + 1 + k], between[k])
             if len(rows) >= FEWEST_SHARED:
-                pairs.append((i, j, rows))
-    return MapRevisits(pairs, [Sightings(*each) for each in zip(shown, found, strict=True)])
+                pairs.append((i, i + 1 + k, rows))
+    return pairs
 
 
 def _offsets_of_alike(

@@ -26,20 +26,6 @@ DECAY_SHARE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class ProximalTerm:
-    """FedProx's proximal term: half the strength times the squared distance from given weights."""
-
-    strength: float
-    weights: Mapping[str, Tensor]
-    """By the parameters' names."""
-
-    def loss(self, network: KeypointNetwork) -> Tensor:
-        """The term for the present weights of the network."""
-        terms = [(value - self.weights[name]).square().sum() for name, value in network.named_parameters()]
-        return 0.5 * self.strength * torch.stack(terms).sum()
-
-
-@dataclass(frozen=True, slots=True)
 class LegacyDetector:
     """An earlier detector whose codes are still in use, so the codes of the trained one should match them."""
 
@@ -103,7 +89,6 @@ def training_step(
     step: int,
     rate: float,
     bits: TeacherBits | None = None,
-    proximal: ProximalTerm | None = None,
     legacy: LegacyDetector | None = None,
 ) -> dict[str, Tensor]:
     """Do one step in place; batch, network and optimiser are on one device.
@@ -116,7 +101,6 @@ def training_step(
         step: number of the step in the whole run, from 0.
         rate: learning rate.
         bits: the teacher's, if there is a teacher.
-        proximal: added to the objective.
         legacy: the detector whose codes are still in use, if there is one.
 
     Returns:
@@ -131,8 +115,6 @@ def training_step(
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     shift = grid_shift(settings.encoder, settings.seed, step)
     total, losses = objective(maps, batch, settings.loss, step / settings.steps, shift, bits)
-    if proximal is not None:
-        total = total + proximal.loss(network)
     if legacy is not None:
         losses["former"] = legacy.loss(maps, batch)
         total = total + legacy.strength * losses["former"]

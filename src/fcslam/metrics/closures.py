@@ -5,7 +5,7 @@ after. The run's own trajectory bridges this gap; over such a short time it is a
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,16 @@ Mask = NDArray[np.bool_]
 """Selection, shape (K,) for K closures."""
 
 
-@dataclass(frozen=True, slots=True)
-class ClosureCriteria:
-    """Thresholds for covered closures, wrong closures and found revisits."""
-
-    bridge_s: float = 1.0
-    """Largest time between an end of a closure and a reference pose that covers it."""
-    wrong_m: float = 0.5
-    """A covered closure with a larger translation error is wrong."""
-    wrong_deg: float = 10.0
-    """A covered closure with a larger rotation error is wrong."""
-    reach_m: float = 2.0
-    """A closure finds a revisit if both ends are within this path length of it: the spacing of places."""
-    within_gap_s: float = 60.0
-    """Shortest time between two passes of one robot that count as a revisit."""
+BRIDGE_S: Final = 1.0
+"""Largest time between an end of a closure and a reference pose that covers it."""
+WRONG_M: Final = 0.5
+"""A covered closure with a larger translation error is wrong."""
+WRONG_DEG: Final = 10.0
+"""A covered closure with a larger rotation error is wrong."""
+REACH_M: Final = 2.0
+"""A closure finds a revisit if both ends are within this path length of it: the spacing of places."""
+WITHIN_GAP_S: Final = 60.0
+"""Shortest time between two passes of one robot that count as a revisit."""
 
 
 class ReferenceMotion(NamedTuple):
@@ -124,9 +120,10 @@ class ClosureErrors:
         """Closures with a reference, shape (K,)."""
         return np.isfinite(self.translation_m)
 
-    def correct(self, criteria: ClosureCriteria) -> Mask:
+    @property
+    def correct(self) -> Mask:
         """Covered closures that are not wrong, shape (K,)."""
-        return (self.translation_m <= criteria.wrong_m) & (self.rotation_deg <= criteria.wrong_deg)
+        return (self.translation_m <= WRONG_M) & (self.rotation_deg <= WRONG_DEG)
 
 
 def closure_errors(pairs: Rows, T_i_j: FloatArray, run: PoseTable, reference: Reference) -> ClosureErrors:
@@ -166,10 +163,10 @@ class Precision:
         return _share(self.covered - self.wrong, self.covered)
 
 
-def precision(errors: ClosureErrors, members: Mask, criteria: ClosureCriteria) -> Precision:
+def precision(errors: ClosureErrors, members: Mask) -> Precision:
     """Precision of the closures selected by ``members``, shape (K,)."""
     judged = members & errors.covered
-    wrong = judged & ~errors.correct(criteria)
+    wrong = judged & ~errors.correct
     middle_and_most = [_median_and_maximum(spread[judged]) for spread in (errors.translation_m, errors.rotation_deg)]
     return Precision(int(members.sum()), int(judged.sum()), int(wrong.sum()), *middle_and_most)
 
@@ -187,14 +184,13 @@ class Recall:
         return _share(self.found, self.revisits)
 
 
-def revisits_found(revisits: Rows, correct: Rows, run: PoseTable, reach_m: float) -> Mask:
+def revisits_found(revisits: Rows, correct: Rows, run: PoseTable) -> Mask:
     """Find which revisits are detected by a correct closure.
 
     Args:
         revisits: pairs of rows of ``run``, shape (R, 2).
         correct: ends of the correct closures as pairs of rows, shape (C, 2), in either order.
         run: poses of the run.
-        reach_m: largest path length between the ends of a closure and of a revisit, on the same robots.
 
     Returns:
         Shape (R,).
@@ -203,7 +199,7 @@ def revisits_found(revisits: Rows, correct: Rows, run: PoseTable, reach_m: float
     both_ways = np.concatenate((correct, correct[:, ::-1]))
     found = np.zeros(len(revisits), dtype=np.bool_)
     for k, ends in enumerate(revisits):
-        near = np.abs(metres[both_ways] - metres[ends]) <= reach_m
+        near = np.abs(metres[both_ways] - metres[ends]) <= REACH_M
         found[k] = np.any(np.all(near & (robots[both_ways] == robots[ends]), axis=1))
     return found
 

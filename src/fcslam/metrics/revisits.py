@@ -7,27 +7,19 @@ Walls in between are ignored.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.metrics.closures import Recall, Rows, path_lengths, revisits_found
+from fcslam.metrics.closures import WITHIN_GAP_S, Recall, Rows, path_lengths, revisits_found
 from fcslam.metrics.relations import PoseTable
 
-
-@dataclass(frozen=True, slots=True)
-class RevisitCriteria:
-    """Definition of a revisit."""
-
-    every_m: float = 1.0
-    """Path length between the poses that are tested."""
-    radius_m: float = 2.0
-    """Largest distance of the other path."""
-    turn_deg: float = 180.0
-    """Largest difference of the headings; 180: any."""
-    within_gap_s: float = 60.0
-    """Shortest time between two passes of one robot."""
+EVERY_M: Final = 1.0
+"""Path length between the poses that are tested."""
+RADIUS_M: Final = 2.0
+"""Largest distance of the other path."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,23 +31,29 @@ class Revisits:
     numbers: NDArray[np.int64]
     """Number of the pass's revisit, shape (P,)."""
 
-    def recall(self, correct: Rows, truth: PoseTable, reach_m: float) -> Recall:
-        """Recall of the ``correct`` closures (C, 2), with both ends within ``reach_m`` of path length of a pass."""
-        found = revisits_found(self.passes, correct, truth, reach_m)
+    def recall(self, correct: Rows, truth: PoseTable) -> Recall:
+        """Recall of the ``correct`` closures (C, 2), with both ends within ``REACH_M`` of path length of a pass."""
+        found = revisits_found(self.passes, correct, truth)
         return Recall(len(np.unique(self.numbers)), len(np.unique(self.numbers[found])))
 
 
-def find_revisits(truth: PoseTable, criteria: RevisitCriteria, between_robots: bool) -> Revisits:
-    """Find all revisits of other robots' paths, or of the robots' own paths; ``truth`` has one coordinate frame."""
+def find_revisits(truth: PoseTable, between_robots: bool, turn_deg: float = 180.0) -> Revisits:
+    """Find all revisits of other robots' paths, or of the robots' own paths.
+
+    Args:
+        truth: poses in one coordinate frame.
+        between_robots: whether the paths are those of other robots.
+        turn_deg: largest difference of the headings; 180: any.
+    """
     robots = np.unique(truth.robots).tolist()
     pairs = [(a, b) for a in robots for b in robots if (a != b) == between_robots]
     rows_of = {robot: np.flatnonzero(truth.robots == robot) for robot in robots}
-    asked_of = {robot: _sampled(rows_of[robot], path_lengths(truth), criteria.every_m) for robot in robots}
+    asked_of = {robot: _sampled(rows_of[robot], path_lengths(truth), EVERY_M) for robot in robots}
     asked = [(row, rows_of[b]) for a, b in pairs for row in asked_of[a].tolist()]
     found = [
         (row, nearest, number)
         for number, (row, others) in enumerate(asked)
-        for nearest in _passes(row, others, truth, criteria)
+        for nearest in _passes(row, others, truth, turn_deg)
     ]
     table = np.array(found, dtype=np.int64).reshape(-1, 3)
     return Revisits(table[:, :2], table[:, 2])
@@ -69,13 +67,13 @@ def _sampled(rows: NDArray[np.int64], metres: NDArray[np.float64], every_m: floa
     return sampled
 
 
-def _passes(row: int, others: NDArray[np.int64], truth: PoseTable, criteria: RevisitCriteria) -> Iterator[int]:
+def _passes(row: int, others: NDArray[np.int64], truth: PoseTable, turn_deg: float) -> Iterator[int]:
     """Row of the nearest pose of each pass of the path ``others`` (M,) near the pose ``row``."""
     away = truth.T_map_base[others] - truth.T_map_base[row]
     distance = np.hypot(away[:, 0], away[:, 1])
-    near = (distance <= criteria.radius_m) & (np.abs(se2.wrap_angle(away[:, 2])) <= np.radians(criteria.turn_deg))
+    near = (distance <= RADIUS_M) & (np.abs(se2.wrap_angle(away[:, 2])) <= np.radians(turn_deg))
     if truth.robots[row] == truth.robots[others[0]]:
-        near &= np.abs(truth.stamps[others] - truth.stamps[row]) > criteria.within_gap_s
+        near &= np.abs(truth.stamps[others] - truth.stamps[row]) > WITHIN_GAP_S
     places = np.flatnonzero(near)
     for stretch in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
         if len(stretch):

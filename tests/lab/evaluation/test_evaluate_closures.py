@@ -13,12 +13,10 @@ from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.closures import ClosureScope, closure_metrics, closure_rows, evaluate_closures
 from fcslam.lab.evaluation.fleet.relation_graph import build_relation_graph
 from fcslam.lab.evaluation.fleet.relations import pose_table, write_metrics
-from fcslam.metrics.closures import ClosureCriteria
 from fcslam.metrics.relations import Relations, write_relations
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, RobotTrajectory, Run
 
-CRITERIA = ClosureCriteria()
 ROUND = 50
 """Steps of one round; both robots go round twice, one behind the other."""
 
@@ -83,7 +81,7 @@ def test_stages_are_counted_by_hand(tmp_path, relations):
         closure((0, 41), (1, 90), CANDIDATE),
     ]
     within = [closure((1, 6), (1, 54), ACCEPTED), closure((1, 7), (1, 58), REVOKED)]
-    report = evaluate_closures(write(tmp_path / "run", [*between, *within]), relations, CRITERIA)
+    report = evaluate_closures(write(tmp_path / "run", [*between, *within]), relations)
     counts = {
         (kind.value, status.value): (score.graph.closures, score.graph.covered, score.graph.wrong, score.single.covered)
         for (kind, status), score in report.scores.items()
@@ -102,9 +100,9 @@ def test_stages_are_counted_by_hand(tmp_path, relations):
     }
 
 
-def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations):
+def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations, monkeypatch):
     def recall(*closures):
-        report = evaluate_closures(write(tmp_path / "run", closures), relations, CRITERIA)
+        report = evaluate_closures(write(tmp_path / "run", closures), relations)
         stages = ((ClosureScope.FLEET, CANDIDATE), (ClosureScope.FLEET, VERIFIED), (ClosureScope.FLEET, ACCEPTED))
         return [report.scores[stage].recall for stage in stages], report
 
@@ -118,8 +116,8 @@ def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations):
     assert [r.found for r in found] == [0, 0, 0]
     # within a robot 60 s are asked for, and 50 steps last 20 s
     assert report.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 0
-    shorter = ClosureCriteria(within_gap_s=15.0)
-    longer = evaluate_closures(write(tmp_path / "run", [closure((1, 6), (1, 56), ACCEPTED)]), relations, shorter)
+    monkeypatch.setattr("fcslam.lab.evaluation.fleet.closures.WITHIN_GAP_S", 15.0)
+    longer = evaluate_closures(write(tmp_path / "run", [closure((1, 6), (1, 56), ACCEPTED)]), relations)
     assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 2
     assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.found == 1
     assert longer.scores[ClosureScope.ROBOT, REVOKED].recall is None
@@ -130,7 +128,7 @@ def test_what_no_relations_join_is_not_covered(tmp_path):
     write_relations(tmp_path / "relations", relations_between(ends))
     closures = [closure((0, 70), (1, 20), ACCEPTED), closure((0, 20), (1, 70), ACCEPTED, (5.0, 0.0, 0.0))]
     closures += [closure((0, 45), (1, 45), ACCEPTED), closure((1, 57), (1, 68), ACCEPTED)]
-    report = evaluate_closures(write(tmp_path / "run", closures), tmp_path / "relations", CRITERIA)
+    report = evaluate_closures(write(tmp_path / "run", closures), tmp_path / "relations")
     score = report.scores[ClosureScope.FLEET, ACCEPTED]
     assert (score.graph.closures, score.graph.covered, score.graph.wrong) == (3, 1, 0)
     assert score.graph.coverage == pytest.approx(1.0 / 3.0)
@@ -145,7 +143,7 @@ def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
     T_1_2 = np.array(true.T_1_2)
     T_1_2[-1] += (3.0, 0.0, 0.0)
     write_relations(tmp_path / "bad", Relations(true.stamps, T_1_2))
-    report = evaluate_closures(run, tmp_path / "bad", CRITERIA)
+    report = evaluate_closures(run, tmp_path / "bad")
     graph = report.relations
     assert np.flatnonzero(~graph.holds).tolist() == [len(true) - 1]
     assert graph.residual_m[-1] == pytest.approx(3.0, abs=1e-3)
@@ -157,7 +155,7 @@ def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
     values = {metric.name: metric.value for metric in closure_metrics(report)}
     assert values["relations_contradicted"] == 1
     assert values["inter_robot_accepted_covered"] == 2
-    assert evaluate_closures(run, relations, CRITERIA).relations.holds.all()
+    assert evaluate_closures(run, relations).relations.holds.all()
 
 
 def test_where_nothing_tells_which_relation_is_false_none_counts(tmp_path):
@@ -166,7 +164,7 @@ def test_where_nothing_tells_which_relation_is_false_none_counts(tmp_path):
     T_1_2[-1] += (3.0, 0.0, 0.0)
     write_relations(tmp_path / "relations", Relations(true.stamps, T_1_2))
     run = write(tmp_path / "run", [closure((0, 11), (1, 11), ACCEPTED)])
-    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    report = evaluate_closures(run, tmp_path / "relations")
     assert np.flatnonzero(~report.relations.holds).tolist() == [len(true) - 2, len(true) - 1]
     assert report.relations.component_sizes.tolist() == [20, 20]
     assert np.isnan(report.relations.residual_m[-2:]).all()
@@ -181,7 +179,7 @@ def test_stamps_with_five_digits_are_found(tmp_path):
     ]
     (tmp_path / "relations").write_text("\n".join(lines))
     run = write(tmp_path / "run", [closure((0, 70), (1, 20), ACCEPTED)])
-    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    report = evaluate_closures(run, tmp_path / "relations")
     assert report.stamps_in_run == len(report.relations.stamps)
     assert report.scores[ClosureScope.FLEET, ACCEPTED].graph.covered == 1
 
@@ -191,7 +189,7 @@ def test_a_stamp_that_the_run_lacks_still_joins_the_others(tmp_path):
     stamps = np.where(true.stamps == stamp(1, 10), 5.0, true.stamps)
     write_relations(tmp_path / "relations", Relations(stamps, true.T_1_2))
     run = write(tmp_path / "run", [closure((0, 11), (0, 61), ACCEPTED)])
-    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    report = evaluate_closures(run, tmp_path / "relations")
     assert report.stamps_in_run == 2
     assert report.scores[ClosureScope.ROBOT, ACCEPTED].graph.covered == 1
     assert report.scores[ClosureScope.ROBOT, ACCEPTED].chain == (2, 2)
@@ -215,18 +213,18 @@ def test_robots_of_one_clock_are_told_apart_by_name():
 
 
 def test_a_run_without_closures_and_a_foreign_recording(tmp_path, relations):
-    report = evaluate_closures(write(tmp_path / "run", []), relations, CRITERIA)
+    report = evaluate_closures(write(tmp_path / "run", []), relations)
     assert all(score.graph.closures == 0 for score in report.scores.values())
     (tmp_path / "foreign").write_text("1 2 0 0 0 0 0 0\n")
     with pytest.raises(EvaluationError, match="same recording"):
-        evaluate_closures(tmp_path / "run", tmp_path / "foreign", CRITERIA)
+        evaluate_closures(tmp_path / "run", tmp_path / "foreign")
     (tmp_path / "empty_handed").write_text(f"{stamp(0, 1)} {stamp(0, 1)} 0 0 0 0 0 0\n")
     with pytest.raises(EvaluationError, match="same recording"):
-        evaluate_closures(tmp_path / "run", tmp_path / "empty_handed", CRITERIA)
+        evaluate_closures(tmp_path / "run", tmp_path / "empty_handed")
 
 
 def test_metrics_are_unique_names_and_json_without_nan(tmp_path, relations):
-    metrics = closure_metrics(evaluate_closures(write(tmp_path / "run", []), relations, CRITERIA))
+    metrics = closure_metrics(evaluate_closures(write(tmp_path / "run", []), relations))
     assert len({metric.name for metric in metrics}) == len(metrics)
     write_metrics(metrics, tmp_path / "table.json")
     values = {row["name"]: row["value"] for row in json.loads((tmp_path / "table.json").read_text())}
@@ -254,7 +252,7 @@ def test_the_optimised_graph_averages_what_scatters():
 def test_no_accepted_closure_of_a_real_fleet_is_wrong(tmp_path):
     logs = Path(os.environ["FCSLAM_DATA"]) / "lidar" / "slam-benchmark"
     assert main(["map", str(logs / "fr079.clf.xz"), "--split", "3", "--output", str(tmp_path / "run")]) == 0
-    report = evaluate_closures(tmp_path / "run", logs / "fr079.relations.gz", CRITERIA)
+    report = evaluate_closures(tmp_path / "run", logs / "fr079.relations.gz")
     assert report.relations.holds.all()
     for within in ClosureScope:
         score = report.scores[within, ACCEPTED]

@@ -210,7 +210,7 @@ def test_nothing_found_scores_nothing(scenes, tmp_path):
 def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     arguments = ["evaluate", "homography", str(scenes), "--detector", "orb", "--detector", "fast"]
-    assert main([*arguments, "--csv", str(tmp_path / "t.csv"), "--figures", str(tmp_path / "figures")]) == 0
+    assert main([*arguments, "--csv", str(tmp_path / "t.csv")]) == 0
     out = capsys.readouterr().out
     for title in ("I. Repeatability", "II. Homography estimation", "orb less the others", "3 pairs, corrected"):
         assert title in out
@@ -219,8 +219,6 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
     assert [(row["detector"], row["scene"]) for row in rows].count(("orb", "i_dim")) == 2
     assert all(0.0 <= float(row["repeatability"]) <= 1.0 for row in rows)
     assert {row["accuracy_3px_nms8"] == "" for row in rows if row["detector"] == "fast"} == {True}
-    names = sorted(path.name for path in (tmp_path / "figures").iterdir())
-    assert names == ["i_dim.png", "matching_accuracy.png", "v_turn.png"]
 
 
 @pytest.mark.slow
@@ -234,7 +232,6 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
         (["{scenes}", "--detector", "{empty}"], "cannot read the features"),
         (["{scenes}", "--detector", "onnx", "--detector", "{empty}/n.onnx"], "cannot read the network weights"),
         (["{scenes}", "--detector", "orb", "--csv", "{empty}/none/t.csv"], "cannot write the table"),
-        (["{scenes}", "--detector", "orb", "--figures", "{scenes}/i_dim/1.png"], "cannot write the figures"),
     ],
 )
 def test_mistakes_are_told_in_one_line(scenes, tmp_path, capsys, arguments, message):

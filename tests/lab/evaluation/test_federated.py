@@ -1,8 +1,6 @@
 """The study of federated training: it compares like with like, resumes, and its arithmetic is right."""
 
-import fcntl
 import shutil
-from threading import Lock, Thread
 
 import cv2
 import numpy as np
@@ -13,7 +11,6 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.errors import EvaluationError  # noqa: E402
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.lab.evaluation.federated.pairs import (  # noqa: E402
     MEASURES,
@@ -24,36 +21,30 @@ from fcslam.lab.evaluation.federated.pairs import (  # noqa: E402
 )
 from fcslam.lab.evaluation.federated.poison import PoisonedClient  # noqa: E402
 from fcslam.lab.evaluation.federated.report import report  # noqa: E402
-from fcslam.lab.evaluation.federated.study import Study, StudyResults, StudySettings, run_study  # noqa: E402
+from fcslam.lab.evaluation.federated.study import Arm, Study, StudyResults, run_study  # noqa: E402
 from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
 from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.trainer import ExecutionOptions  # noqa: E402
 from tests.learning.federated.fakes import Fake  # noqa: E402
 
 TINY = {
-    "federated": {
-        "rounds": 2,
-        "local_steps": 2,
-        "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
-    },
-    "arms": {"averaged": {}, "bad": {"settings": {"strategy": "fedmedian"}, "poison": "nan"}},
-    "seeds": 2,
-    "pairs": 4,
+    "rounds": 2,
+    "local_steps": 2,
+    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
 }
+ARMS = {"averaged": Arm(), "bad": Arm(settings={"strategy": "fedmedian"}, poison="nan")}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def brief(brief_validation):
     """Short validation, and one export of each network: several studies train the same ones."""
-    files, lock = {}, Lock()
+    files = {}
 
     def export_once(network, path):
-        with lock:  # the exporter has globals, and two studies may run in threads
-            if (version := detector_version(network)) not in files:
-                export_onnx(network, path)
-                files[version] = path.read_bytes()
+        if (version := detector_version(network)) not in files:
+            export_onnx(network, path)
+            files[version] = path.read_bytes()
         path.write_bytes(files[version])
 
     with pytest.MonkeyPatch.context() as patch:
@@ -72,7 +63,8 @@ def robots(tmp_path_factory):
 
 
 def study(robots, folder, watch=lambda *_: None, **changes):
-    return Study(robots, folder, StudySettings.model_validate(TINY | changes), ExecutionOptions(), watch)
+    given = {"arms": ARMS, "seeds": 2, "local_seeds": 2, "pairs": 4} | changes
+    return Study(robots, folder, FederatedSettings.model_validate(TINY), on_progress=watch, **given)
 
 
 @pytest.fixture(scope="module")
@@ -112,91 +104,17 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
     assert not np.array_equal(start, whole.measured["central"][:1], equal_nan=True)
     for name, values in whole.measured.items():
         assert np.array_equal(values, torn.measured[name], equal_nan=True)
-    assert run_study(study(robots, tmp_path / "torn", lambda *_: pytest.fail("all is done"))).robots == (
-        "north",
-        "south",
-    )
-    for changed in ({"pairs": 6}, {"arms": {"averaged": {"poison": "nan"}}}):
-        with pytest.raises(EvaluationError, match="another study"):
-            run_study(study(robots, tmp_path / "torn", **changed))
+    again = run_study(study(robots, tmp_path / "torn", lambda *_: pytest.fail("all is done")))
+    assert again.robots == ("north", "south")
 
 
 @pytest.mark.system
-def test_arms_and_seeds_may_be_added_to_a_study(finished, robots, tmp_path):
+def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
-    run_study(study(robots, tmp_path, seeds=1, arms={"averaged": {"seeds": 1}}))
-    told = []
-    arms = {"averaged": {}, "frozen": {"settings": {"normalisation": "frozen"}, "seeds": 1}}
-    found = run_study(study(robots, tmp_path, lambda name, *_: told.append(name), seeds=2, arms=arms))
-    assert {name: len(values) for name, values in found.measured.items()} == {
-        "start": 1, "central": 2, "local": 2, "alone": 2, "averaged": 2, "frozen": 1,
-    }  # fmt: skip
-    assert "frozen, seed 1" in told
-    assert "central, seed 1" not in told
-    with pytest.raises(EvaluationError, match="another study"):
-        run_study(study(robots, tmp_path, seeds=2, arms={"averaged": {"poison": "nan", "seeds": 1}}))
-
-
-def test_nobody_reads_what_a_study_is_while_another_begins_it(robots, tmp_path, monkeypatch):
-    begun = study(robots, tmp_path)
-    monkeypatch.setattr("fcslam.lab.evaluation.federated.study._files_of_arms", lambda _: {})
-    run_study(begun)
-    content = (tmp_path / "study.yaml").read_bytes()
-    with (tmp_path / "study.lock").open("w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        (tmp_path / "study.yaml").write_bytes(b"")
-        waiting = Thread(target=run_study, args=(begun,), daemon=True)
-        waiting.start()
-        waiting.join(0.5)
-        assert waiting.is_alive()
-        assert not (tmp_path / "study.yaml").read_bytes()
-        (tmp_path / "study.yaml").write_bytes(content)
-    waiting.join(60.0)
-    assert not waiting.is_alive()
-    assert (tmp_path / "study.yaml").read_bytes() == content
-
-
-@pytest.mark.system
-def test_robots_own_networks_may_have_fewer_seeds_and_images(finished, robots, tmp_path):
-    with_shapes(finished, tmp_path)
-    settings = {"local_seeds": 1, "trained": 3, "arms": {}}
-    found = run_study(study(robots, tmp_path, **settings))
-    assert {name: len(values) for name, values in found.measured.items()} == {
-        "start": 1, "central": 2, "local": 1, "alone": 1,
-    }  # fmt: skip
-    assert len(list((tmp_path / "labels").rglob("*.npz"))) == 2 * 3
-    assert all(np.isfinite(row.gap.mean) for row in report(found))
-    more = run_study(study(robots, tmp_path, **settings | {"local_seeds": 2}))
-    assert len(more.measured["local"]) == 2
-    without = run_study(study(robots, tmp_path, **settings | {"local_seeds": 0}))
-    assert set(without.measured) == {"start", "central"}
-    rows = report(without)
-    assert all(np.isfinite(row.gap.mean) for row in rows)
-    assert all(np.isnan([row.closed, row.closed_alone]).all() for row in rows)
-
-
-@pytest.mark.slow
-def test_two_at_one_study_share_the_work_out(finished, robots, tmp_path):
-    with_shapes(finished, tmp_path)
-    told, found = [], []
-
-    def work(watch):
-        found.append(run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": {}})))
-
-    helper = Thread(target=work, args=(lambda name, *_: told.append((2, name)),))
-
-    def begin(name, *_):
-        told.append((1, name))
-        if name == "central, seed 1" and not helper.ident:
-            helper.start()
-
-    work(begin)
-    helper.join()
-    trained = {name: {who for who, each in told if each == name} for _, name in told if ", seed" in name}
-    assert all(len(by) == 1 for by in trained.values())
-    assert {who for by in trained.values() for who in by} == {1, 2}
-    for name, values in found[0].measured.items():
-        assert np.array_equal(values, found[1].measured[name], equal_nan=True)
+    arms = {"frozen": Arm(settings={"normalisation": "frozen"}, seeds=1)}
+    found = run_study(study(robots, tmp_path, arms=arms, local_seeds=1))
+    shapes = {name: values.shape[:2] for name, values in found.measured.items()}
+    assert shapes == {"start": (1, 1), "central": (2, 1), "local": (1, 2), "alone": (1, 2), "frozen": (1, 1)}
 
 
 @pytest.mark.slow
@@ -227,18 +145,12 @@ def test_every_network_sees_as_many_samples(finished, robots, tmp_path):
     def watch(name, done, of):
         steps[name] = of
 
-    wide = {"together": False, "settings": {"training": TINY["federated"]["training"] | {"pairs": 2}}}
-    run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": {}, "wide": wide}))
+    wide = Arm(together=False, settings={"training": TINY["training"] | {"pairs": 2}})
+    run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": Arm(), "wide": wide}))
     assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
     assert steps["alone-north, seed 1"] == 2 * 2
     assert steps["averaged, seed 1"] == 2
     assert steps["wide, seed 1"] == 2 * 2
-
-
-@pytest.mark.parametrize("name", ["start", "central", "local-north", "alone", "a/b"])
-def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
-    with pytest.raises(EvaluationError, match=name):
-        run_study(study(robots, tmp_path, arms={name: {}}))
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ def test_every_room_has_a_door_and_lies_in_the_building(building):
 @pytest.mark.parametrize("seed", range(10))
 def test_the_default_building_is_large_enough_for_a_fleet(seed):
     plan = draw_floor_plan(np.random.default_rng(seed))
-    assert plan.floor_m2 >= 300.0
+    assert np.prod(plan.size_m) >= 300.0
     assert len(plan.rooms) >= 8
 
 

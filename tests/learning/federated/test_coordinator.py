@@ -12,7 +12,6 @@ from fcslam.errors import OutputError, TrainingError
 from fcslam.lab.evaluation.federated.poison import PoisonedClient
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, read_state, write_state
 from fcslam.learning.federated.history import ROUNDS_FILE
-from fcslam.learning.federated.privacy import epsilon
 from fcslam.learning.federated.settings import FederatedSettings
 from tests.learning.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
 
@@ -34,44 +33,23 @@ def ragged(seed):
     return answer
 
 
-def by_hand(strategy, answers, before, memory):
+def by_hand(strategy, answers, before):
     """The result that a strategy should give for the answers, by an independent implementation."""
-    stacked = {name: np.stack([answer[name].astype(np.float64) for answer in answers]) for name in before}
-    mean = {name: np.average(stack, axis=0) for name, stack in stacked.items()}
-    if strategy in ("fedavg", "fedprox"):
-        return mean
-    if strategy == "fedmedian":
-        return {name: np.median(stack, axis=0) for name, stack in stacked.items()}
-    if strategy == "fedtrimmedavg":
-        return {name: np.sort(stack, axis=0)[1:-1].mean(axis=0) for name, stack in stacked.items()}
-    if strategy == "krum":
-        flat = np.stack([np.concatenate([answer[name].ravel() for name in before]) for answer in answers])
-        distances = np.square(flat[:, None] - flat[None]).sum(-1)
-        nearest = np.sort(distances, axis=1)[:, 1 : 1 + len(answers) - 1 - 2]
-        return answers[int(np.argmin(nearest.sum(axis=1)))]
-    step = memory["round"] = memory.get("round", 0) + 1
-    new = {}
-    for name in before:
-        change = mean[name] - before[name]
-        m = memory[f"m{name}"] = 0.9 * memory.get(f"m{name}", 0.0) + 0.1 * change
-        v = memory[f"v{name}"] = 0.99 * memory.get(f"v{name}", 0.0) + 0.01 * change**2
-        rate = 0.003 * np.sqrt(1 - 0.99 ** (step + 1)) / (1 - 0.9 ** (step + 1))
-        new[name] = before[name] + rate * m / (np.sqrt(v) + 1e-3)
-    return new
+    merge = {"fedavg": np.mean, "fedmedian": np.median}[strategy]
+    return {name: merge(np.stack([answer[name].astype(np.float64) for answer in answers]), axis=0) for name in before}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strategy", ["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"])
+@pytest.mark.parametrize("strategy", ["fedavg", "fedmedian"])
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
     robots = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(5)]
     chosen = settings(strategy=strategy, rounds=3, normalisation="frozen", server_momentum=share)
     state, _ = run(robots, tmp_path, chosen, start=TRAINED)
-    weights, memory = TRAINED, {}
-    momentum = dict.fromkeys(TRAINED if strategy not in ("fedadam", "krum") else (), 0.0)
+    weights, momentum = TRAINED, dict.fromkeys(TRAINED, 0.0)
     for round_number in range(3):
         answers = [robot.answer(weights, round_number) for robot in robots]
-        merged = by_hand(strategy, answers, weights, memory)
+        merged = by_hand(strategy, answers, weights)
         for name, before in momentum.items():
             momentum[name] = merged[name] - weights[name] + share * before
             merged[name] = merged[name] + share * momentum[name]
@@ -128,7 +106,7 @@ def test_what_is_judged_and_released_is_a_mean_of_rounds(tmp_path):
     assert reports[-1].version == version(state.best)
 
 
-@pytest.mark.parametrize("strategy", ["fedavg", "fedadam"])
+@pytest.mark.parametrize("strategy", ["fedavg", "fedmedian"])
 @pytest.mark.parametrize("moment", ["in training", "after a round"])
 def test_a_killed_server_ends_as_if_it_had_not_been(strategy, moment, tmp_path):
     chosen = settings(strategy=strategy, rounds=4, normalisation="frozen", server_momentum=0.5, smoothing=0.8)
@@ -340,14 +318,7 @@ def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
     assert same(alone.weights, together.weights)
 
 
-def test_epsilon_counts_what_was_asked_even_of_those_left_out(tmp_path):
-    private = {"clip_norm": 1.0, "noise_multiplier": 5.0, "delta": 1e-6}
-    chosen = settings(rounds=3, normalisation="frozen", privacy=private)
-    _, reports = run([Fake("good"), Fake("bad", answer=refuses)], tmp_path, chosen, start=TRAINED)
-    assert [report.epsilon for report in reports] == [epsilon(5.0, rounds, 1e-6) for rounds in (1, 2, 3)]
-
-
-def test_epsilon_counts_what_a_server_asked_before_it_was_killed(tmp_path):
+def test_robots_that_were_asked_before_a_kill_are_counted(tmp_path):
     def kills(_weights, _round):
         raise KeyboardInterrupt
 
@@ -396,9 +367,3 @@ def test_a_checkpoint_of_a_version_without_some_setting_is_told_as_such(tmp_path
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
     with pytest.raises(TrainingError, match="is not a checkpoint"):
         run([Fake("a")], tmp_path)
-
-
-def test_noise_that_would_turn_variances_negative_is_refused():
-    with pytest.raises(ValueError, match="frozen"):
-        settings(privacy={"noise_multiplier": 1.0})
-    settings(privacy={"noise_multiplier": 1.0}, normalisation="frozen")

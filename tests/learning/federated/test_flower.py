@@ -16,9 +16,6 @@ from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.strategies import create_strategy
-from tests.learning.federated.fakes import START, Fake, run, settings
-
-STRATEGIES = ("fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum")
 
 
 def test_the_installed_version_is_supported_and_the_one_that_is_required():
@@ -50,7 +47,7 @@ def test_our_grids_implement_all_of_flowers_grid(grid):
     assert not grid.__abstractmethods__
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("strategy", ["fedavg", "fedmedian"])
 def test_a_strategy_asks_every_node_of_a_selection(strategy):
     chosen = create_strategy(FederatedSettings(strategy=strategy, normalisation="frozen"))
     flower.InProcessGrid({name: flower.ClientApp() for name in "abc"})
@@ -58,18 +55,6 @@ def test_a_strategy_asks_every_node_of_a_selection(strategy):
     messages = list(chosen.configure_train(1, arrays, flower.ConfigRecord(), flower.NodeSelection([2, 4])))
     assert sorted(message.metadata.dst_node_id for message in messages) == [2, 4]
     assert all({ARRAYS_KEY, CONFIG_KEY} <= message.content.keys() for message in messages)
-
-
-def test_the_moments_of_fedadam_can_be_read_and_restored(tmp_path):
-    trained = {name: array for name, array in START.items() if name != "a.running_var"}
-    state, _ = run([Fake("a")], tmp_path, settings(strategy="fedadam", normalisation="frozen"), start=trained)
-    kept = {name: array for name, array in state.strategy_state.items() if name.startswith(("m_t/", "v_t/"))}
-    assert {name.partition("/")[2] for name in kept} == trained.keys()
-    adam = create_strategy(FederatedSettings(strategy="fedadam", normalisation="frozen"))
-    assert flower.strategy_moments(adam) == {"m_t": {}, "v_t": {}}
-    flower.restore_moments(adam, {"m_t": {"a": np.ones(2)}, "v_t": {}})
-    assert flower.strategy_moments(adam)["m_t"].keys() == {"a"}
-    assert flower.strategy_moments(create_strategy(FederatedSettings())) == {"m_t": {}, "v_t": {}}
 
 
 def test_a_message_arrives_as_it_was_sent():

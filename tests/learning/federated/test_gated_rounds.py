@@ -1,4 +1,4 @@
-"""Rounds behind the release gate: only a version that passes is released, and one taken back is left behind."""
+"""Rounds behind the release gate: only a version that passes is released."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.learning.federated.live_settings import GateSettings
+from fcslam.learning.federated.live_settings import FleetLearningSettings, GateSettings
 from tests.learning.federated.fakes import START, Fake, run, settings, version
 
 CODES = {"trained": "codes", "normalisation": "frozen"}
@@ -64,21 +64,6 @@ def test_a_robot_whose_report_is_no_report_does_not_count(tmp_path):
     assert "numbers that no pair can have" in reports[0].left_out["judging by r2"]
 
 
-def test_after_a_version_was_taken_back_training_goes_on_from_the_one_before(tmp_path):
-    released = []
-
-    def fallback(best):
-        return TRAINED if best in released[1:2] else None
-
-    def on_release(weights):
-        released.append(version(weights))
-
-    state, _ = gated([Judge(f"r{k}") for k in range(3)], tmp_path, rounds=3, fallback=fallback, on_release=on_release)
-    assert len(released) == 3
-    assert float(state.best["a.weight"][0, 0]) == pytest.approx(1.1)
-    assert float(state.weights["a.weight"][0, 0]) == pytest.approx(1.1), "one step from the start, not three"
-
-
 def test_a_release_survives_a_kill_between_the_checkpoint_and_its_announcement(tmp_path):
     fleet, released = [Judge(f"r{k}") for k in range(3)], []
 
@@ -91,3 +76,9 @@ def test_a_release_survives_a_kill_between_the_checkpoint_and_its_announcement(t
     assert not reports, "the round is done"
     assert [version(weights) for weights in released] == [version(state.best)]
     assert state.best_round == 1
+
+
+def test_one_setting_of_training_leaves_the_others_of_the_recipe():
+    settings = FleetLearningSettings.model_validate({"federated": {"training": {"seed": 2}}})
+    assert settings.federated.training.seed == 2
+    assert settings.federated.training.learning_rate == FleetLearningSettings().federated.training.learning_rate == 1e-3

@@ -96,10 +96,10 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
         robots=3, path_length_m=30.0, lighting=(Lighting.DAY, Lighting.EVENING),
         lidar=LidarSettings(rate_hz=5.0), camera=CameraSettings(rate_hz=3.0),
     )  # fmt: skip
-    prepare_fleet_folder(tmp_path / "sim", settings, 5, resume=False)
+    prepare_fleet_folder(tmp_path / "sim", settings, 5)
     robots = [robot.name for robot in simulate_fleet(settings, 5).robots]
     for robot in simulate_fleet(settings, 5).robots:
-        record_robot(robot, tmp_path / "sim" / robot.name, resume=False)
+        record_robot(robot, tmp_path / "sim" / robot.name)
     weak = weak_detector(tmp_path)
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "learning.yaml").write_text(yaml.safe_dump(SETTINGS))
@@ -129,26 +129,10 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
             assert len(again) >= 0.9 * len(places[robot, weak]), "old places are described again"
         service.send_signal(signal.SIGINT)
         service.wait(LIMIT_S)
-        # How much a few rounds gain depends on the speed of the machine; of two versions, only one can be the worse.
-        kept = [in_use_of(tmp_path, released=a, before=b) for a, b in ((version, weak), (weak, version))]
-        assert kept != [0, 0]
     finally:
         for process in everyone:
             process.kill()
             process.wait()
-
-
-def in_use_of(folder, released, before):
-    """The number of the version in use after the mission judged a released one: 1, or 0 if it is taken back."""
-    from fcslam.learning.federated.fleet_learning import MissionJudge
-    from fcslam.learning.federated.live_settings import FleetLearningSettings
-    from fcslam.learning.federated.releases import Releases
-
-    releases = Releases.opened(folder / f"releases-{released}", b"", before)
-    releases.add(released, b"", {})
-    settings = FleetLearningSettings(gate={"fewest_places": 20})
-    MissionJudge(folder / "data", settings, releases, lambda *_: None).step()
-    return releases.in_use
 
 
 def rows(rounds):

@@ -10,7 +10,7 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector, network_file  # noqa: E402
-from fcslam.learning.export import export_onnx, quantise_onnx  # noqa: E402
+from fcslam.learning.export import export_onnx  # noqa: E402
 from fcslam.learning.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network  # noqa: E402
 from fcslam.learning.federated.onnx_weights import with_batch_statistics  # noqa: E402
@@ -131,9 +131,8 @@ def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_
 @pytest.mark.slow
 def test_another_network_is_refused_by_name(tmp_path):
     export_onnx(lived_in("light"), tmp_path / "light.onnx")
-    quantise_onnx(tmp_path / "light.onnx", tmp_path / "int8.onnx", [np.full((64, 64), 128, np.uint8)])
     (tmp_path / "text.onnx").write_text("hello")
     tiny_network(tmp_path / "tiny.onnx")
-    for name, encoder in (("light", "vgg"), ("int8", "light"), ("text", "light"), ("tiny", "light")):
+    for name, encoder in (("light", "vgg"), ("text", "light"), ("tiny", "light")):
         with pytest.raises(TrainingError, match=name):
             read_detector_weights(tmp_path / f"{name}.onnx", encoder)

@@ -3,7 +3,6 @@
 import typer
 
 from fcslam.cli.evaluate.closures import closures
-from fcslam.cli.evaluate.federated import federated
 from fcslam.cli.evaluate.fleet import fleet
 from fcslam.cli.evaluate.homography import homography
 from fcslam.cli.evaluate.places import places
@@ -40,4 +39,3 @@ app.command(
         "fcslam evaluate places corridor --features onnx --train-on photos --verify",
     )
 )(places)
-app.command(epilog=examples("fcslam evaluate federated robot1 robot2 robot3 -o study"))(federated)

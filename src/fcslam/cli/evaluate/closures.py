@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.lab.evaluation.fleet.closures import ClosureReport
-    from fcslam.metrics.closures import ClosureCriteria, Precision
+    from fcslam.metrics.closures import Precision
 
 
 def closures(
@@ -24,18 +24,16 @@ def closures(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.fleet.closures import closure_metrics, evaluate_closures
     from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.metrics.closures import ClosureCriteria
 
-    criteria = ClosureCriteria()
     with ProgressDisplay(notices()) as display:
         display.start("evaluating")
-        report = evaluate_closures(run, reference, criteria)
-    _show_closures(report, criteria)
+        report = evaluate_closures(run, reference)
+    _show_closures(report)
     if csv is not None:
         write_metrics(closure_metrics(report), csv)
 
 
-def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None:
+def _show_closures(report: "ClosureReport") -> None:
     from rich.table import Table
 
     counts = Table("closures", "all", "covered", "wrong", "precision", "revisits found")
@@ -52,12 +50,13 @@ def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None
     console = answers()
     console.print(counts)
     console.print(errors)
-    _explain_closures(console, report, criteria)
+    _explain_closures(console, report)
 
 
-def _explain_closures(console: "Console", report: "ClosureReport", criteria: "ClosureCriteria") -> None:
+def _explain_closures(console: "Console", report: "ClosureReport") -> None:
     """Print the reference and the definitions behind the tables."""
     from fcslam.lab.evaluation.fleet.closures import closure_metrics
+    from fcslam.metrics.closures import BRIDGE_S, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
     from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S
 
     value = {metric.name: metric.value for metric in closure_metrics(report)}
@@ -68,10 +67,10 @@ def _explain_closures(console: "Console", report: "ClosureReport", criteria: "Cl
         f"Residuals of the relations: median {value['relation_residual_translation_median']:.3f} m, "
         f"{value['relation_residual_rotation_median']:.2f} deg; maximum "
         f"{value['relation_residual_translation_max']:.3f} m, {value['relation_residual_rotation_max']:.2f} deg.",
-        f"Wrong: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg. Errors: median / maximum; up "
-        f"to {criteria.bridge_s:g} s to the relations' stamps are bridged by the run's own trajectory.",
-        f"Revisits: relations over more than {criteria.within_gap_s:g} s within a robot, {ACROSS_ROBOTS_GAP_S:g} s "
-        f"between robots; found if a correct closure ends within {criteria.reach_m:g} m of path at both sides.",
+        f"Wrong: off by more than {WRONG_M:g} m or {WRONG_DEG:g} deg. Errors: median / maximum; up "
+        f"to {BRIDGE_S:g} s to the relations' stamps are bridged by the run's own trajectory.",
+        f"Revisits: relations over more than {WITHIN_GAP_S:g} s within a robot, {ACROSS_ROBOTS_GAP_S:g} s "
+        f"between robots; found if a correct closure ends within {REACH_M:g} m of path at both sides.",
         "Chain: relations from one end to the other, median / maximum; a long one adds its own error.",
         "One relation: closures that a single relation covers.",
         "A robot reports only closures that it accepts, so candidates within robots are not known.",

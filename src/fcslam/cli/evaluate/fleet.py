@@ -149,20 +149,20 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
 def _explanations(report: "FleetReport") -> "Iterator[str]":
     from fcslam.lab.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
     from fcslam.lab.evaluation.fleet.closures import ClosureScope
+    from fcslam.metrics.closures import REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
     from fcslam.metrics.grid import TOLERANCE_M
-    from fcslam.metrics.revisits import RevisitCriteria
+    from fcslam.metrics.revisits import EVERY_M, RADIUS_M
 
-    asked, criteria = RevisitCriteria(), report.criteria
     scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
     yield f"Truth: {report.truth}, at {covered} of {scans} scans."
     yield "ATE: root mean square, each map moved onto the truth as a whole, no scale; 'alone': each robot by itself."
     yield "Relative poses: drawn evenly from pairs of scans less than 5 m apart in truth, 2,000 at most."
-    yield f"Wrong, of closures and joins: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg."
+    yield f"Wrong, of closures and joins: off by more than {WRONG_M:g} m or {WRONG_DEG:g} deg."
     counts = ", ".join(_revisits(report, within) for within in ClosureScope)
     yield (
-        f"Recall: share of revisits found: {counts}. At every {asked.every_m:g} m of each path there is one for each "
-        f"robot whose path passes within {asked.radius_m:g} m (its own: over {asked.within_gap_s:g} s away), found "
-        f"if a correct closure ends within {criteria.reach_m:g} m of path at both sides. Like heading: within "
+        f"Recall: share of revisits found: {counts}. At every {EVERY_M:g} m of each path there is one for each "
+        f"robot whose path passes within {RADIUS_M:g} m (its own: over {WITHIN_GAP_S:g} s away), found "
+        f"if a correct closure ends within {REACH_M:g} m of path at both sides. Like heading: within "
         f"{LIKE_HEADING_DEG:g} deg. At 100 %: by the closures more similar than every wrong one of their channel."
     )
     yield "A robot reports only closures that it accepts, so candidates within robots are not all known."

@@ -43,12 +43,10 @@ def homography(
         ),
     ] = HomographyGroundTruth.CORRECTED,
     csv: Annotated[Path | None, typer.Option(help="Write all measures of all pairs to this CSV file.")] = None,
-    figures: Annotated[Path | None, typer.Option(help="Draw matches and curves into this folder.")] = None,
 ) -> None:
     """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-    from fcslam.lab.evaluation.detectors.figures import draw_figures
     from fcslam.lab.evaluation.detectors.homography import evaluate_homography
     from fcslam.lab.evaluation.detectors.measures import write_pairs
     from fcslam.lab.evaluation.detectors.scenes import find_scenes
@@ -61,8 +59,6 @@ def homography(
     with ProgressDisplay(notices()) as display:
         evaluated = display.start("evaluating", len(found) * len(detectors))
         report = evaluate_homography(found, detectors, ground_truth, evaluated)
-        if figures is not None:
-            draw_figures(figures, report, found, detectors, ground_truth, display.start("drawing", len(found)))
     if csv is not None:
         write_pairs(report, csv)
     _show(answers(), report, ground_truth)

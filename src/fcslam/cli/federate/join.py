@@ -35,7 +35,7 @@ def join(
     require_training_libraries("flwr", extra="federated")
     from fcslam.errors import PacketError, TrainingError
     from fcslam.learning.federated import launch
-    from fcslam.learning.federated.client import RobotClient, secret_noise
+    from fcslam.learning.federated.client import RobotClient
     from fcslam.learning.federated.fleet_robot import RobotLink
     from fcslam.wire.checks import check_name
     from fcslam.wire.keys import Credentials, read_credentials
@@ -56,5 +56,5 @@ def join(
 
     found = Credentials() if credentials is None else read_credentials(credentials)
     link = RobotLink(server, robot, found.token, found.ca)
-    client = RobotClient(robot, images, output / "labels", secret_noise, compute_budget().device)
+    client = RobotClient(robot, images, output / "labels", compute_budget().device)
     launch.join(link, client, print_once)

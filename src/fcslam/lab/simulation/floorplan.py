@@ -115,11 +115,6 @@ class FloorPlan:
     terrain: Terrain | None = None
     """The ground of a yard; None for a building, whose floor is level."""
 
-    @property
-    def floor_m2(self) -> float:
-        """Floor area, including the area under walls."""
-        return self.size_m[0] * self.size_m[1]
-
 
 def draw_floor_plan(rng: np.random.Generator, building: Building = Building.DEFAULT) -> FloorPlan:
     """Draw a building, by default about 22 m by 17 m; the same generator state gives the same one."""

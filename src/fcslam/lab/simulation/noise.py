@@ -6,27 +6,13 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.lab.simulation.options import LidarKind, Scanner
+from fcslam.lab.simulation.options import Scanner
 from fcslam.records import Beams, FloatArray, LaserModel, Sweep
-
-_CYCLE: Final = 4
-"""Scans in a cycle of an interleaved LiDAR."""
-_JITTER: Final = 0.03
-"""Share by which the speed of a jittering LiDAR's motor is off."""
-_OVERLAPPING: Final = 0.2
-"""Share of its scans that end with the direction of their first beam."""
-_MISSING: Final = 0.2
-"""Share of its scans whose last beam is missing."""
-_T_BASE_FRONT: Final = (0.2, 0.0, 0.0)
-_T_BASE_REAR: Final = (-0.2, 0.0, np.pi)
 
 
 class LidarSettings(Settings):
     """The simulated LiDAR."""
 
-    kind: LidarKind = Field(
-        default=LidarKind.STEADY, description="kind of LiDAR: steady, interleaved, jittering or front-rear"
-    )
     beams: int = Field(default=360, ge=8, description="beams of one scan of the LiDAR")
     field_of_view_rad: float = Field(
         default=2.0 * np.pi, gt=0.0, le=2.0 * np.pi, description="angle that a scan covers, centred ahead [rad]"
@@ -45,17 +31,14 @@ class LidarSettings(Settings):
         "0: it measures all beams of a scan at once",
     )
 
-    def models(self, T_base_laser: tuple[float, float, float]) -> tuple[LaserModel, ...]:
-        """Geometry and mounting of each laser; a single one is mounted at ``T_base_laser``.
+    def model(self, T_base_laser: tuple[float, float, float]) -> LaserModel:
+        """Geometry of the laser, mounted at ``T_base_laser``.
 
         The first and the last beam of less than a full turn are its edges.
         """
-        two = self.kind is LidarKind.FRONT_REAR
-        view_rad = min(self.field_of_view_rad, np.pi) if two else self.field_of_view_rad
-        full = view_rad >= 2.0 * np.pi
-        increment = view_rad / (self.beams if full else self.beams - 1)
-        mountings = (_T_BASE_FRONT, _T_BASE_REAR) if two else (T_base_laser,)
-        return tuple(LaserModel(self.beams, -0.5 * view_rad, increment, self.max_range_m, at) for at in mountings)
+        full = self.field_of_view_rad >= 2.0 * np.pi
+        increment = self.field_of_view_rad / (self.beams if full else self.beams - 1)
+        return LaserModel(self.beams, -0.5 * self.field_of_view_rad, increment, self.max_range_m, T_base_laser)
 
     def sweep(self, beams: Beams) -> Sweep | None:
         """Times of the beams of a scan, whose stamp is that of the first one measured; None if it has all at once."""
@@ -65,13 +48,8 @@ class LidarSettings(Settings):
         return Sweep(0.0, duration_s) if self.spin > 0 else Sweep(duration_s, 0.0)
 
 
-_AT_ONCE: Final = LidarSettings(rate_hz=10.0)
-
 SCANNERS: Final = {
-    Scanner.INSTANT: _AT_ONCE,
-    Scanner.INTERLEAVED: _AT_ONCE.model_copy(update={"kind": LidarKind.INTERLEAVED}),
-    Scanner.JITTERING: _AT_ONCE.model_copy(update={"kind": LidarKind.JITTERING}),
-    Scanner.FRONT_REAR: _AT_ONCE.model_copy(update={"kind": LidarKind.FRONT_REAR}),
+    Scanner.INSTANT: LidarSettings(rate_hz=10.0),
     Scanner.RPLIDAR_A1: LidarSettings(beams=1454, rate_hz=5.5, range_noise_m=0.02, dropout=0.03, spin=-1),
     Scanner.LD19: LidarSettings(beams=450, rate_hz=10.0, range_noise_m=0.015, dropout=0.02, spin=-1),
     Scanner.UTM_30LX: LidarSettings(
@@ -80,21 +58,6 @@ SCANNERS: Final = {
     ),
 }  # fmt: skip
 """The settings of each scanner."""
-
-
-def scan_beams(kind: LidarKind, laser: LaserModel, number: int, rng: np.random.Generator) -> Beams:
-    """The beams of scan ``number`` of ``laser``; only those of a jittering LiDAR are random."""
-    count, first, increment = laser.beams
-    if kind is LidarKind.INTERLEAVED:
-        step = number % _CYCLE
-        return Beams(count - (step > 0), first + increment * step / _CYCLE, increment)
-    if kind is LidarKind.JITTERING:
-        measured = count + round(count * rng.uniform(-_JITTER, _JITTER))
-        full = count * increment > 2.0 * np.pi - 0.5 * increment
-        adapted = 2.0 * np.pi / measured if full else (count - 1) * increment / (measured - 1)
-        overlapping, missing = full and rng.random() < _OVERLAPPING, rng.random() < _MISSING
-        return Beams(measured + overlapping - missing, first, adapted)
-    return laser.beams
 
 
 def simulate_ranges(

@@ -12,26 +12,11 @@ class Building(StrEnum):
     CORRIDOR = "corridor"
     YARD = "yard"
     """Outdoors, between buildings."""
-    RAMP = "ramp"
-    """Outdoors, between two walls: down and up again."""
 
     @property
     def is_outdoors(self) -> bool:
         """Whether it has a terrain instead of a level floor."""
-        return self in (Building.YARD, Building.RAMP)
-
-
-class LidarKind(StrEnum):
-    """Kinds of LiDAR, by what varies from scan to scan."""
-
-    STEADY = "steady"
-    """The beams never vary."""
-    INTERLEAVED = "interleaved"
-    """As a SICK: scans in cycles of four, each a quarter of an increment further, the first with one beam more."""
-    JITTERING = "jittering"
-    """As an RPLIDAR: number and increment of the beams follow the motor; now and then a beam is missing."""
-    FRONT_REAR = "front-rear"
-    """Two LiDARs of half a turn at most, one at the front and one at the rear."""
+        return self is Building.YARD
 
 
 class Scanner(StrEnum):
@@ -39,12 +24,6 @@ class Scanner(StrEnum):
 
     INSTANT = "instant"
     """10 Hz, 360 beams, 12 m."""
-    INTERLEAVED = "interleaved"
-    """The same, of the kind ``LidarKind.INTERLEAVED``."""
-    JITTERING = "jittering"
-    """The same, of the kind ``LidarKind.JITTERING``."""
-    FRONT_REAR = "front-rear"
-    """Two of them, of the kind ``LidarKind.FRONT_REAR``."""
     RPLIDAR_A1 = "rplidar-a1"
     """Low-cost, 5.5 Hz, 8,000 beams a second, 12 m; clockwise."""
     LD19 = "ld19"

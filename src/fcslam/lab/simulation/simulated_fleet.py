@@ -19,11 +19,10 @@ from fcslam.errors import SimulationError
 from fcslam.lab.simulation.decoration import Decoration, decorate
 from fcslam.lab.simulation.floorplan import FloorPlan, doors_after, draw_floor_plan, move_furniture, with_closed_doors
 from fcslam.lab.simulation.lighting import light_of
-from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, scan_beams, simulate_ranges
+from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, simulate_ranges
 from fcslam.lab.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 from fcslam.lab.simulation.outdoor_rays import OutdoorRayCaster
-from fcslam.lab.simulation.ramp import draw_ramp
 from fcslam.lab.simulation.route import TURN_RATE_RAD_S, Schedule, draw_goals, plan_route, schedule
 from fcslam.lab.simulation.scene import bare_model, furnished_model
 from fcslam.lab.simulation.sensors import Camera, RayCaster
@@ -83,7 +82,7 @@ class SimulationSettings(Settings):
     """A simulated fleet."""
 
     building: Building = Field(
-        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor, yard or ramp"
+        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor or yard"
     )
     robots: int = Field(default=3, ge=1, description="number of robots")
     path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
@@ -115,13 +114,7 @@ class SimulationSettings(Settings):
         default=SLOPE,
         ge=0.0,
         le=0.3,
-        description="root mean square slope of a yard in each direction, or steepest slope of a ramp",
-    )
-    bumps: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=1.0,
-        description="share of the ground of a yard or ramp that tilts a robot for one or two scans",
+        description="root mean square slope of a yard in each direction",
     )
     lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
     drift: OdometryNoiseSettings | None = Field(
@@ -138,11 +131,10 @@ class SimulatedRobot:
     """One robot with its route. Its sensor records are computed on demand."""
 
     name: str
-    lasers: tuple[LaserModel, ...]
-    """Several lasers scan in turn."""
+    lasers: tuple[LaserModel]
     camera: CameraModel | None
     stamps: FloatArray
-    """Stamps of the scans of all lasers, shape (N,), seconds."""
+    """Stamps of the scans, shape (N,), seconds."""
     T_building_base: FloatArray
     """True poses at these stamps, shape (N, 3)."""
     T_odom_base: FloatArray
@@ -175,46 +167,35 @@ class SimulatedRobot:
             return Readings(np.empty(0), np.empty((0, 3)))
         return self.readings
 
-    def items(
-        self, first_scan: int = 0, first_image: int = 0, first_odometry: int = 0
-    ) -> Generator[RecordedItem, None, None]:
+    def items(self) -> Generator[RecordedItem, None, None]:
         """Scans, images and odometry in the order of time; a scan or an image is followed by the true pose.
-
-        Scans before number ``first_scan``, images before ``first_image`` and readings of the odometry before
-        ``first_odometry`` are skipped; true poses are not.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
         """
         odometry = self.odometry
         stamps = np.concatenate((self.stamps, self.image_stamps, odometry.stamps))
-        scans, count, end = self.scans(first_scan), len(self.stamps), len(self.stamps) + len(self.image_stamps)
-        with closing(self._images(first_image)) as images:
+        scans, count, end = self.scans(), len(self.stamps), len(self.stamps) + len(self.image_stamps)
+        with closing(self._images()) as images:
             for k in np.argsort(stamps, kind="stable"):
                 if k >= end:
-                    if k >= end + first_odometry:
-                        yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
+                    yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
                     continue
-                if first_scan <= k < count:
-                    yield next(scans)
-                elif k >= count + first_image:
-                    yield next(images)
+                yield next(scans) if k < count else next(images)
                 yield self._truth(float(stamps[k]))
 
     def _truth(self, stamp: float) -> GroundTruth:
         return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
 
-    def scans(self, first: int = 0) -> Iterator[LaserScan]:
-        """Scans from number ``first`` on; every call yields the same.
+    def scans(self) -> Iterator[LaserScan]:
+        """All scans; every call yields the same.
 
         Raises:
             SimulationError: MuJoCo is missing.
         """
-        caster, settings = ray_caster(self.plan), self.settings.lidar
-        for k in range(first, len(self.stamps)):
+        caster, settings, (laser,) = ray_caster(self.plan), self.settings.lidar, self.lasers
+        for k in range(len(self.stamps)):
             rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
-            number, index = divmod(k, len(self.lasers))
-            laser = self.lasers[index].with_beams(scan_beams(settings.kind, self.lasers[index], number, rng))
             sweep = settings.sweep(laser.beams)
             if sweep is not None:
                 times_s = np.linspace(sweep.first_s, sweep.last_s, laser.beam_count)
@@ -225,7 +206,7 @@ class SimulatedRobot:
             ranges = simulate_ranges(met, laser, settings, rng)
             yield LaserScan(stamp, frozen(ranges, np.float32), laser, self.T_odom_base[k], sweep)
 
-    def _images(self, first: int) -> Generator[CameraImage, None, None]:
+    def _images(self) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
         if self.camera is None or self.decoration is None or settings is None:
             return
@@ -236,7 +217,7 @@ class SimulatedRobot:
         odometry = None if self.readings is None else self.readings.at(self.image_stamps)
         shape = (settings.height, settings.width, 1)
         with Camera(model, self.camera, light) as camera:
-            for k in range(first, len(self.image_stamps)):
+            for k in range(len(self.image_stamps)):
                 noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
                 picture = camera.take(poses[k]).astype(np.float32)
                 draw_tags(picture, self.camera, poses[k], self.tags, self.plan.segments)
@@ -245,7 +226,7 @@ class SimulatedRobot:
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
 
     def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
-        """A generator for each record, so that a recording can be resumed at any record."""
+        """A generator for each record, so that no record depends on another one."""
         return _generator(self.seed, purpose, self.number, record)
 
 
@@ -293,7 +274,7 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     if settings.tags and (outdoors or not settings.camera):
         raise SimulationError("tags are on walls, for cameras; leave tags out, or simulate cameras in a building")
     building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
-    plan = _draw_plan(settings, building)
+    plan = draw_yard(building, settings.slope) if outdoors else draw_floor_plan(building, settings.building)
     _check_room(plan, settings)
     if outdoors:
         goals = draw_starts(plan, settings.robots, goals_rng)
@@ -314,16 +295,6 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
         robots.append(robot)
         left = found if settings.lasting_changes else plan
     return SimulatedFleet(plan, tuple(robots), tags)
-
-
-def _draw_plan(settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
-    match settings.building:
-        case Building.YARD:
-            return draw_yard(rng, settings.slope, settings.bumps)
-        case Building.RAMP:
-            return draw_ramp(rng, settings.slope, settings.bumps)
-        case building:
-            return draw_floor_plan(rng, building)
 
 
 def _moved(plan: FloorPlan, goals: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
@@ -357,8 +328,7 @@ def _robot(
     route = schedule(find_way(plan, goals, settings.path_length_m, rng), settings.turn_rate_rad_s)
     if settings.lidar.spin:
         route = route.eased()
-    lasers = settings.lidar.models(_T_BASE_LASER)
-    times = np.arange(0.0, route.duration_s, 1.0 / (settings.lidar.rate_hz * len(lasers)))
+    times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
     poses, camera = route.at(times), settings.camera
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
     stamps: FloatArray = frozen(np.round(first_stamp + times, 6))
@@ -366,7 +336,7 @@ def _robot(
     image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
     return SimulatedRobot(
         name=f"robot_{number + 1}",
-        lasers=lasers,
+        lasers=(settings.lidar.model(_T_BASE_LASER),),
         camera=camera.model() if camera else None,
         stamps=stamps,
         T_building_base=frozen(poses),

@@ -13,10 +13,6 @@ _LENGTHS_M = (20.0, 80.0)
 """Shortest and longest wave."""
 SLOPE = 0.01
 """Default root mean square slope in each direction."""
-BUMP_CELL_M = 0.5
-"""Side of the squares of ground that may be a bump: a robot at 0.5 m/s crosses one in a second."""
-_BUMP_RAD = 0.07
-"""Standard deviation of the pitch and roll on a bump."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,17 +21,11 @@ class Terrain:
 
     heights_m: FloatArray
     """Heights (H, W) at multiples of ``CELL_M``, from the south-west corner; rows go with y."""
-    bumps: FloatArray | None = None
-    """Tilt along x and y of a robot in each square of ``BUMP_CELL_M``, shape (H, W, 2), radians; mostly zero."""
 
     def slope(self, point: FloatArray) -> FloatArray:
-        """Slope (2,) along x and y of a robot at ``point`` (2,); on a bump, it differs from that of the ground."""
+        """Slope (2,) along x and y of the ground at ``point`` (2,)."""
         east, north = np.eye(2) * 0.5 * CELL_M
-        slope = np.array([self._height(point + step) - self._height(point - step) for step in (east, north)]) / CELL_M
-        if self.bumps is None:
-            return slope
-        column, row = np.clip(point / BUMP_CELL_M, 0, np.array(self.bumps.shape[1::-1]) - 1).astype(int)
-        return np.asarray(slope + self.bumps[row, column])
+        return np.array([self._height(point + step) - self._height(point - step) for step in (east, north)]) / CELL_M
 
     def _height(self, point: FloatArray) -> float:
         height, width = self.heights_m.shape
@@ -46,16 +36,13 @@ class Terrain:
         return float(below + up * (above - below))
 
 
-def draw_terrain(
-    size_m: tuple[float, float], rng: np.random.Generator, slope: float = SLOPE, bumps: float = 0.0
-) -> Terrain:
+def draw_terrain(size_m: tuple[float, float], rng: np.random.Generator, slope: float = SLOPE) -> Terrain:
     """Draw hills for an area from west to east and from south to north.
 
     Args:
         size_m: size of the area.
-        rng: source of the hills and bumps.
+        rng: source of the hills.
         slope: root mean square slope in each direction; most slopes are below twice this.
-        bumps: share of the ground that is a bump.
     """
     x = np.arange(0.0, size_m[0] + 2.0 * CELL_M, CELL_M)
     y = np.arange(0.0, size_m[1] + 2.0 * CELL_M, CELL_M)[:, None]
@@ -66,13 +53,4 @@ def draw_terrain(
         # The slope of a wave has the same size for every length, so long hills are higher than short ones.
         amplitude = 2.0 * slope / (number * np.sqrt(_WAVES))
         heights += amplitude * np.sin(number * (x * np.cos(heading) + y * np.sin(heading)) + phase)
-    return Terrain(frozen(heights), draw_bumps(size_m, rng, bumps))
-
-
-def draw_bumps(size_m: tuple[float, float], rng: np.random.Generator, share: float) -> FloatArray | None:
-    """Draw the bumps of an area, as in ``Terrain.bumps``: kerbs and holes that tilt a robot for one or two scans."""
-    if not share:
-        return None
-    cells = int(size_m[1] / BUMP_CELL_M) + 1, int(size_m[0] / BUMP_CELL_M) + 1
-    is_bump = rng.random(cells) < share
-    return frozen(is_bump[..., None] * rng.normal(0.0, _BUMP_RAD, (*cells, 2)))
+    return Terrain(frozen(heights))

@@ -71,10 +71,10 @@ class _Site:
         return self.stand(kind, disc(radius) + centre)
 
 
-def draw_yard(rng: np.random.Generator, slope: float = SLOPE, bumps: float = 0.0) -> FloorPlan:
+def draw_yard(rng: np.random.Generator, slope: float = SLOPE) -> FloorPlan:
     """Draw a yard of 70 to 120 m in each direction; the same generator state gives the same one.
 
-    ``slope`` and ``bumps`` describe its ground as in ``draw_terrain``; they change nothing else.
+    ``slope`` describes its ground as in ``draw_terrain``; it changes nothing else.
     """
     columns, rows = rng.permutation((2, 3)) if rng.random() < 0.6 else (3, 3)
     xs, x_lanes = _axis(int(columns), rng)
@@ -91,7 +91,7 @@ def draw_yard(rng: np.random.Generator, slope: float = SLOPE, bumps: float = 0.0
     for block in blocks:
         _beside_ways(block, site)
     _around(size_m, site)
-    terrain = draw_terrain(size_m, rng, slope, bumps)
+    terrain = draw_terrain(size_m, rng, slope)
     return FloorPlan(size_m, tuple(site.pieces), segments_of(site.pieces), site.lanes, (), terrain)
 
 

@@ -1,4 +1,4 @@
-"""The files of a finished federated run: the detector as ONNX files, its model card, and a picture of the rounds."""
+"""The files of a finished federated run: the detector as an ONNX file, its model card, and a picture of the rounds."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -7,14 +7,13 @@ from typing import Final
 
 from fcslam.config import dump
 from fcslam.errors import OutputError, TrainingError
-from fcslam.features.detector import GreyImage
-from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
+from fcslam.learning.export import detector_version, export_onnx
 from fcslam.learning.federated.checkpoint import CoordinatorState
 from fcslam.learning.federated.history import LOSS, ROUNDS_FILE, Row
 from fcslam.learning.federated.networks import weights_to_network
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 
-DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md", "rounds.png"
+CARD, PICTURE = "card.md", "rounds.png"
 SHOWN_METRICS: Final = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",
@@ -26,15 +25,14 @@ MEGABYTE: Final = 1e6
 
 
 def write_federated_artifacts(
-    state: CoordinatorState, folder: Path, settings: FederatedSettings, calibration: Sequence[GreyImage], judged_on: str
+    state: CoordinatorState, folder: Path, settings: FederatedSettings, judged_on: str
 ) -> list[Path]:
-    """Write the detector in float32 and int8, the picture and the card; returns their paths.
+    """Write the detector, the picture and the card; returns their paths.
 
     Args:
         state: its best weights are exported.
         folder: of the run; contains the table of rounds.
         settings: of the run.
-        calibration: images that give int8 its ranges.
         judged_on: the images on which versions were evaluated, in words.
 
     Raises:
@@ -43,7 +41,6 @@ def write_federated_artifacts(
     """
     network = weights_to_network(state.best, settings.training.encoder)
     export_onnx(network, folder / DETECTOR)
-    quantise_onnx(folder / DETECTOR, folder / INT8, calibration)
     rows = _rows(folder / ROUNDS_FILE)
     try:
         draw_rounds(rows, folder / PICTURE)
@@ -52,7 +49,7 @@ def write_federated_artifacts(
         raise OutputError(
             f"{folder}: cannot be written ({error}); free disk space and run the command again"
         ) from error
-    return [folder / name for name in (DETECTOR, INT8, PICTURE, CARD)]
+    return [folder / name for name in (DETECTOR, PICTURE, CARD)]
 
 
 def draw_rounds(rows: Sequence[Row], path: Path) -> None:
@@ -100,15 +97,13 @@ def _card(
     asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
     best = next((row for row in rows if int(row["round"]) == state.best_round), {})
     sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
-    private = f"epsilon {rows[-1]['epsilon']} at delta {settings.privacy.delta:g}" if rows else "nothing was sent"
     lines = [
         f"# Detector {version}",
         "",
         f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
         f"{state.best_round}. How often each was asked: {asked or 'never'}.",
         "",
-        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB. Privacy of all that a robot has seen: "
-        f"{private}.",
+        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB.",
         "",
         f"| {judged_on} | |",
         "|---|---|",

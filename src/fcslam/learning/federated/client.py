@@ -5,36 +5,26 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.federated.client_state import legacy_weights, load_optimiser_state, save_optimiser_state
 from fcslam.learning.federated.evaluation import SCORE_METRICS
 from fcslam.learning.federated.held_out import HeldOutPairs, Judgement, judge
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network
-from fcslam.learning.federated.privacy import privatise_update
 from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.learning.federated.weights import Weights, trained_names
+from fcslam.learning.federated.weights import Weights
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
-from fcslam.learning.point_training import train_points
 from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
 from fcslam.learning.trainer import TrainingProgress, validation_pairs
 from fcslam.learning.validation import validate
-
-NOISE_NEEDS_PUBLIC_IMAGES: Final = (
-    "with noise for privacy, no metrics of a robot's own images may leave it; give --public images"
-)
-
-NoiseSource = Callable[[int], np.random.Generator]
-"""Gives the generator of a round's noise: from the system's entropy on real robots, seeded in simulations."""
 
 
 class ClientUpdate(NamedTuple):
@@ -42,7 +32,7 @@ class ClientUpdate(NamedTuple):
 
     weights: dict[str, NDArray[np.float32]]
     losses: dict[str, float]
-    """Means over the steps; empty with privacy noise, because the losses carry none."""
+    """Means over the steps."""
 
 
 class FederatedClient(Protocol):
@@ -76,7 +66,6 @@ class RobotClient:
     """Contains the images."""
     cache: Path
     """Folder for what must survive a round: labels, the optimiser's state, and the weights of the legacy detector."""
-    noise: NoiseSource
     device: str = "cpu"
     on_step: Callable[[str, int], None] = lambda _robot, _steps: None
     """Called with the name and the number of steps done in a round."""
@@ -85,14 +74,14 @@ class RobotClient:
     images_settings: TrainingSettings | None = None
     """Settings with which the images were read; None if they were given."""
     revisits: RevisitExamples = field(default_factory=RevisitExamples)
-    """Points that were seen again, on which ``codes`` and ``heads`` are trained."""
+    """Points that were seen again, on which ``codes`` are trained."""
     inputs: CodeInputs = field(default_factory=CodeInputs)
     """Inputs from the images of ``revisits``."""
     held_out: HeldOutPairs = field(default_factory=HeldOutPairs)
     """Pairs of keyframes that are never trained on."""
 
     def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
-        """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
+        """Train from the weights. The result depends on the arguments, the cache and the images.
 
         Args:
             weights: global weights of the round.
@@ -109,7 +98,6 @@ class RobotClient:
         plan = LocalTrainingPlan(
             first_step=round_number * settings.local_steps,
             steps=settings.local_steps,
-            proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
             compatible=settings.compatible,
             frozen_statistics=frozen,
         )
@@ -123,26 +111,18 @@ class RobotClient:
             trained = train_codes(
                 start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
             )
-            if settings.trained == "heads" and self.revisits.voted:
-                codes, moments = trained.network.state_dict(), trained.optimiser_state
-                points = train_points(codes, self.revisits, training, plan, device, on_step, legacy, moments)
-                trained = points._replace(losses=trained.losses | points.losses)
         else:
             images = self._labelled_images(weights, settings).train
             trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)
         save_optimiser_state(self.cache, run_id, round_number, trained.optimiser_state)
-        new, names = network_to_weights(trained.network), trained_names(weights, frozen)
-        update = privatise_update(new, weights, names, settings.privacy, self.noise(round_number))
-        return ClientUpdate(update, {} if settings.privacy.noise_multiplier else trained.losses)
+        return ClientUpdate(network_to_weights(trained.network), trained.losses)
 
     def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
         """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out.
 
         Raises:
-            TrainingError: the settings ask for privacy noise, which metrics do not carry; or as in ``train``.
+            TrainingError: as in ``train``.
         """
-        if settings.privacy.noise_multiplier:
-            raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
         network = weights_to_network(weights, settings.training.encoder).to(self.device)
         held_out = self._labelled_images(weights, settings).held_out
         found = validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
@@ -153,11 +133,8 @@ class RobotClient:
         """A report on the pairs of keyframes that the robot holds out, with the weights, shape (P, 2).
 
         Raises:
-            TrainingError: the settings ask for privacy noise, which such reports do not carry; or the weights belong to
-                another network.
+            TrainingError: the weights belong to another network.
         """
-        if settings.privacy.noise_multiplier:
-            raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
         device = torch.device(self.device)
         network = weights_to_network(weights, settings.training.encoder).to(device)
         judgement: Judgement = judge(network, self.held_out, device)
@@ -178,16 +155,6 @@ class RobotClient:
 def robot_seed(robot: str, seed: int) -> int:
     """The seed of a robot, so that two robots draw different views."""
     return int(np.random.default_rng([seed, zlib.crc32(robot.encode())]).integers(2**31))
-
-
-def seeded_noise(robot: str, seed: int) -> NoiseSource:
-    """Noise that can be repeated, and so protects nobody: for robots that are simulated in one process."""
-    return lambda round_number: np.random.default_rng([robot_seed(robot, seed), round_number])
-
-
-def secret_noise(_round_number: int) -> np.random.Generator:
-    """Noise from the system's entropy, which cannot be repeated."""
-    return np.random.default_rng()
 
 
 def _ignore_progress(_stage: str, _progress: TrainingProgress) -> None:

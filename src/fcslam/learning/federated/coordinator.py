@@ -38,7 +38,6 @@ from fcslam.learning.federated.messages import (
     reply_sender,
     request_config,
 )
-from fcslam.learning.federated.privacy import epsilon
 from fcslam.learning.federated.replies import RoundReplies, printable_line, read_replies
 from fcslam.learning.federated.screening import screen, update_length
 from fcslam.learning.federated.settings import FederatedSettings
@@ -69,8 +68,6 @@ class CoordinatorHooks:
     """Called with the reason when a round cannot be completed; returns when to try again. If None, training fails."""
     gate: GateSettings | None = None
     """Decides on releases, by pairs that robots hold out; None: every version that is not worse is released."""
-    fallback: Callable[[str], Weights | None] = lambda _version: None
-    """Asked before each round with the version of the best weights; weights to go back to if it was taken back."""
     strategy: StrategyFactory | None = None
     """Makes the strategy; None: the one that the settings name."""
     clock: Callable[[], float] = time.monotonic
@@ -108,7 +105,7 @@ class Coordinator:
         if state.best_round > 0:
             self._hooks.on_release(state.best)
         while state.rounds_done < self._settings.rounds:
-            state, report = self._round(self._fallen_back(state))
+            state, report = self._round(state)
             rows.append(report.row())
             write_rows(self._folder / ROUNDS_FILE, rows)
             write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
@@ -129,18 +126,6 @@ class Coordinator:
         self._aggregator = Aggregator(self._settings, state.strategy_state, self._hooks.strategy)
         return state, read_rows(self._folder / ROUNDS_FILE, state.rounds_done)
 
-    def _fallen_back(self, state: CoordinatorState) -> CoordinatorState:
-        """The state, or the one from which training goes on after the released version was taken back."""
-        if state.best_round == 0:
-            return state
-        earlier = self._hooks.fallback(self._hooks.version(state.best))
-        if earlier is None:
-            return state
-        self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
-        return replace(
-            state, weights=earlier, average=earlier, best=earlier, best_scores={}, strategy_state={}, best_round=0
-        )
-
     def _round(self, state: CoordinatorState) -> tuple[CoordinatorState, RoundReport]:
         """One round."""
         started, sent = self._hooks.clock(), self._model(state.weights)
@@ -153,7 +138,6 @@ class Coordinator:
 
         length = update_length(replies.weights, sent.weights)
         following = self._next_state(trained, weights, candidate.weights, comparison, decision, length)
-        privacy = self._settings.privacy
         report = RoundReport(
             round_number=following.rounds_done,
             version=candidate.version,
@@ -168,7 +152,6 @@ class Coordinator:
             bytes_down=(Counter(trained.times_asked) - Counter(state.times_asked)).total() * sent.size_bytes,
             bytes_up=replies.bytes_up,
             seconds=self._hooks.clock() - started,
-            epsilon=epsilon(privacy.noise_multiplier, max(following.times_asked.values()), privacy.delta),
         )
         return following, report
 

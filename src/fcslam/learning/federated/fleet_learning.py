@@ -1,6 +1,5 @@
 """The process in which the fleet of a service learns: ``python -m fcslam.learning.federated.fleet_learning``.
 
-One thread runs the rounds. Another one follows the open mission and takes a released version back that turns out worse.
 On stdout the process writes events as the worker of a mission does. It ends with its stdin.
 """
 
@@ -13,111 +12,43 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 import torch
 
-from fcslam.errors import FcslamError
+from fcslam.errors import FcslamError, OutputError
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.features.detector_file import describe_detector_file
-from fcslam.learning.federated.artifacts import DETECTOR
-from fcslam.learning.federated.gate import is_worse
 from fcslam.learning.federated.history import RoundReport
-from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.learning.federated.launch import open_port, waiting
-from fcslam.learning.federated.live_settings import RELEASE, RELEASES, FleetLearningSettings
-from fcslam.learning.federated.mission_places import MissionPlaces
-from fcslam.learning.federated.networks import weights_version
-from fcslam.learning.federated.releases import Releases
-from fcslam.learning.federated.weights import Weights
+from fcslam.learning.federated.live_settings import RELEASE, FleetLearningSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.service.http.authentication import Authenticator
-from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import READY
+from fcslam.storage.files import write_file
 
 NICENESS: Final = 10
-MISSION_EVERY_S: Final = 30.0
-"""Time between two looks at the mission."""
+START: Final = "start.onnx"
+"""The detector from which training started, in the output folder."""
 _log = logging.getLogger("fcslam.learning")
 
 Tell = Callable[[str, int], None]
 
 
-@dataclass(slots=True)
-class MissionJudge:
-    """Follows the open mission and judges the version in use on it."""
-
-    data: Path
-    """The service's folder of missions."""
-    settings: FleetLearningSettings
-    releases: Releases
-    tell: Tell
-    _mission: MissionPlaces | None = None
-
-    def step(self) -> None:
-        """Look at the mission once.
-
-        Raises:
-            FcslamError: the mission cannot be read.
-        """
-        name = (self.data / "open").read_text(encoding="utf-8").strip()
-        if self._mission is None or self._mission.folder.name != name:
-            self._mission = MissionPlaces(MissionFolder(self.data / "missions" / name))
-        if self._mission.follow() and self.releases.is_judged:
-            self.judge(self._mission)
-
-    def judge(self, mission: MissionPlaces) -> None:
-        """Take the version in use back if it certainly finds fewer places than the one before."""
-        number, earlier = self.releases.pair
-        version, before = (self.releases.versions[each] for each in (number, earlier))
-        loss = is_worse(mission.found_again(version, before), self.settings.gate, self.settings.federated.training.seed)
-        if loss is not None:
-            in_use = self.releases.take_back(number)
-            _log.warning("%s finds fewer places than %s (%+.3f): taken back", version, before, loss.mean)
-            self.tell(RELEASE, in_use)
-
-    def run(self, stop: threading.Event) -> None:
-        """Follow the mission until ``stop`` is set."""
-        while not stop.wait(MISSION_EVERY_S):
-            try:
-                self.step()
-            except (FcslamError, OSError) as error:  # the service may open another mission at this moment
-                _log.error("the mission is not followed now: %s", error)
-
-
 def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket, tell: Tell) -> None:
-    """Learn until all rounds are done, and judge the version in use as long as the process lives.
+    """Learn until all rounds are done, and live on.
 
     Raises:
         TrainingError: the output folder belongs to other rounds.
         OutputError: the output folder cannot be written.
     """
-    start = _announced(data)
-    releases = Releases.opened(output / RELEASES, start.read_bytes(), describe_detector_file(start).version)
-    judge = MissionJudge(data, settings, releases, tell)
-    if releases.is_judged or releases.taken_back:
-        tell(RELEASE, releases.in_use)
-    encoder, options = settings.federated.training.encoder, ExecutionOptions(device="cpu", threads=1)
-    initial = prepare_initial_weights(releases.detector(0), output, settings.federated, options, lambda *_: None)
-
-    def release(weights: Weights) -> None:
-        version = weights_version(weights, encoder)
-        if version not in releases.versions:
-            tell(RELEASE, releases.add(version, (output / DETECTOR).read_bytes(), weights))
 
     def report(done: RoundReport) -> None:
         decision = f"{done.version} is released" if done.released else "not released"
         if done.reason:
             _log.info("round %d: %s: %s", done.round_number, decision, done.reason)
 
-    job = FederatedJob(
-        output, settings.federated, releases.detector(0), gate=settings.gate,
-        fallback=partial(releases.fallback, initial=initial),
-    )  # fmt: skip
     told: set[str] = set()
 
     def say_once(line: str) -> None:
@@ -125,15 +56,27 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
             told.add(line)
             _log.info("%s", line)
 
+    job = FederatedJob(output, settings.federated, _start(data, output), gate=settings.gate)
+    options = ExecutionOptions(device="cpu", threads=1)
     everybody = Authenticator(None)  # the service has asked for the token
     with open_port(listener, None, everybody, say_once) as grid:
-        stop = threading.Event()
-        thread = threading.Thread(target=judge.run, args=(stop,), name="judge", daemon=True)
-        thread.start()
         tell(READY, 0)
-        run_job(job, options, ProgressCallbacks(rounds=report, released=release), grid, waiting(say_once))
-        _log.info("all %d rounds are done; what is released stays judged", settings.federated.rounds)
-        thread.join()
+        progress = ProgressCallbacks(rounds=report, released=lambda _weights: tell(RELEASE, 0))
+        run_job(job, options, progress, grid, waiting(say_once))
+        _log.info("all %d rounds are done", settings.federated.rounds)
+        threading.Event().wait()
+
+
+def _start(data: Path, output: Path) -> Path:
+    """The detector from which training starts: a copy of the one that was announced at the first start."""
+    kept = output / START
+    try:
+        if not kept.exists():
+            output.mkdir(parents=True, exist_ok=True)
+            write_file(kept, _announced(data).read_bytes())
+    except OSError as error:
+        raise OutputError(f"{kept}: cannot be written ({error}); free disk space") from error
+    return kept
 
 
 def _announced(data: Path) -> Path:

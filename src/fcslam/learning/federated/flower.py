@@ -1,7 +1,7 @@
 """The adapter to Flower: the only module that imports it or knows what it does not document.
 
-It relies on internals: who sends a message, how a message is serialised, what a ``Grid`` has to offer, the moments of
-FedAdam. ``tests/learning/federated/test_flower.py`` checks each of them. To support another version of Flower, change
+It relies on internals: who sends a message, how a message is serialised, what a ``Grid`` has to offer.
+``tests/learning/federated/test_flower.py`` checks each of them. To support another version of Flower, change
 ``SUPPORTED_VERSIONS`` and the requirement in pyproject.toml, and make that test pass.
 
 Flower's SuperLink and SuperNode are not used. They run whatever app a caller submits, and their Control API asks for no
@@ -15,8 +15,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version as installed_version
 from typing import Any, Final
-
-from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
 
@@ -61,14 +59,7 @@ from flwr.clientapp import ClientApp  # noqa: E402
 from flwr.common.serde import message_from_proto, message_to_proto  # noqa: E402
 from flwr.proto.message_pb2 import Message as MessageProto  # noqa: E402
 from flwr.serverapp import Grid  # noqa: E402
-from flwr.serverapp.strategy import (  # noqa: E402
-    FedAdam,
-    FedAvg,
-    FedMedian,
-    FedProx,
-    FedTrimmedAvg,
-    Krum,
-)
+from flwr.serverapp.strategy import FedAvg, FedMedian  # noqa: E402
 from flwr.supercore.task_identity import TaskIdentity  # noqa: E402
 
 logging.getLogger("flwr").setLevel(logging.ERROR)
@@ -82,14 +73,10 @@ __all__ = [
     "ConfigRecord",
     "Context",
     "Error",
-    "FedAdam",
     "FedAvg",
     "FedMedian",
-    "FedProx",
-    "FedTrimmedAvg",
     "Grid",
     "InProcessGrid",
-    "Krum",
     "Message",
     "MessageType",
     "MetricRecord",
@@ -101,8 +88,6 @@ __all__ = [
     "message_to_bytes",
     "reply_from_bytes",
     "request_from_bytes",
-    "restore_moments",
-    "strategy_moments",
     "use_own_identity",
 ]
 
@@ -210,18 +195,6 @@ class NodeSelection:
     def get_node_ids(self) -> list[int]:
         """The nodes."""
         return self._nodes
-
-
-def strategy_moments(strategy: FedAvg) -> dict[str, dict[str, NDArray[Any]]]:
-    """FedAdam's first and second moments, each an array by name; both are empty in other strategies."""
-    return {moment: getattr(strategy, moment, None) or {} for moment in ("m_t", "v_t")}
-
-
-def restore_moments(strategy: FedAvg, moments: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-    """Let a new strategy continue with the moments of an earlier one."""
-    for moment, arrays in moments.items():
-        if arrays:
-            setattr(strategy, moment, dict(arrays))
 
 
 def message_to_bytes(message: Message) -> bytes:

@@ -1,6 +1,6 @@
 """The release gate of a fleet that learns while it maps: a version has to be better on pairs that no robot trained on.
 
-It must also find the places of the mission as well as the released version. Both comparisons are paired: every pair is
+It must also find places as well as the released version. Both comparisons are paired: every pair is
 judged with both versions, and the intervals are those of the differences.
 """
 
@@ -53,21 +53,6 @@ def decide(
         rows, [float(np.mean(each[:, 0])) for each in differences.values() if len(each)], gains, settings
     )
     return GateDecision(reason is None, reason or "better on held-out pairs", len(rows), gains, values)
-
-
-def is_worse(differences: FloatArray, settings: GateSettings, seed: int) -> Interval | None:
-    """The interval of a released version's loss of places, if it is certain: a reason to take the version back.
-
-    Args:
-        differences: of each pair of places of the mission, found (1) or not (0) with this version less with the one
-            before, shape (N,).
-        settings: thresholds.
-        seed: of the bootstrap.
-    """
-    if len(differences) < settings.fewest_places:
-        return None
-    interval = mean_interval(differences, np.random.default_rng(seed))
-    return interval if interval.high < 0.0 else None
 
 
 def _objection(

@@ -60,7 +60,7 @@ class HeldOutPairs:
     @classmethod
     def of(cls, frames: Sequence[Keyframe], T_own_base: FloatArray) -> "HeldOutPairs":
         """Pairs of keyframes that are held out, at their estimated poses in the robot's map, shape (N, 3)."""
-        revisits = [(i, j, len(rows)) for i, j, rows in revisits_in_map(frames, T_own_base).pairs]
+        revisits = [(i, j, len(rows)) for i, j, rows in revisits_in_map(frames, T_own_base)]
         chosen = np.linspace(0, len(revisits) - 1, min(len(revisits), MOST_PAIRS)).astype(int)
         first, second = np.triu_indices(len(frames), 1)
         distances = np.hypot(*(T_own_base[first, :2] - T_own_base[second, :2]).T)
@@ -127,7 +127,7 @@ def _recall(a: Keyframe, b: Keyframe, T_a_b: FloatArray, shared: int) -> float:
     """Keypoints that are the same points by the poses and match by their codes, as a share of the points that both
     frames are known to show; at most 1."""
     matched = {(i, j) for i, j in mutual_matches(a.features.descriptors, b.features.descriptors).pairs.tolist()}
-    right = sum((i, j) in matched for i, j in correspond(a, b, T_a_b).rows.tolist())
+    right = sum((i, j) in matched for i, j in correspond(a, b, T_a_b).tolist())
     return min(right / shared, 1.0)
 
 

@@ -48,8 +48,6 @@ class RoundReport:
     """Size of the weights that all robots sent."""
     seconds: float = 0.0
     """Duration of the round."""
-    epsilon: float = math.inf
-    """Privacy loss of the robot that was asked most often, over all rounds so far; see ``privacy``."""
 
     def row(self) -> Row:
         """The cells of the table by column."""
@@ -63,7 +61,6 @@ class RoundReport:
             "bytes_down": str(self.bytes_down),
             "bytes_up": str(self.bytes_up),
             "seconds": f"{self.seconds:.3f}",
-            "epsilon": f"{self.epsilon:.6g}",
             "robots": " | ".join(self.robots),
             "left_out": " | ".join(f"{robot}: {reason}" for robot, reason in sorted(self.left_out.items())),
             **{f"{LOSS}{name}": f"{value:.6g}" for name, value in self.losses.items()},

@@ -13,7 +13,7 @@ from fcslam.learning.arrays import write_arrays
 from fcslam.learning.checkpoint import read_checkpoint
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network, weights_version
 from fcslam.learning.federated.onnx_weights import SUFFIX, read_onnx_weights, with_batch_statistics
-from fcslam.learning.federated.public_images import calibration_images
+from fcslam.learning.federated.public_images import statistics_images
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.settings import Encoder
 from fcslam.learning.stages import StageCallback, train_on_shapes
@@ -59,7 +59,7 @@ def prepare_initial_weights(
     kept = folder / f"start-{weights_version(weights, encoder)}.npz"
     try:
         if not kept.exists():
-            write_arrays(kept, with_batch_statistics(weights, encoder, calibration_images(public)))
+            write_arrays(kept, with_batch_statistics(weights, encoder, statistics_images(public)))
         return network_to_weights(weights_to_network(read_arrays(kept), encoder))
     except OSError as error:
         raise OutputError(

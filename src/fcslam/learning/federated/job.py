@@ -7,18 +7,17 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.config import dump
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import OutputError
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.artifacts import DETECTOR, write_federated_artifacts
-from fcslam.learning.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
+from fcslam.learning.federated.artifacts import write_federated_artifacts
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.live_settings import GateSettings
 from fcslam.learning.federated.networks import weights_to_network, weights_version
-from fcslam.learning.federated.public_images import calibration_images, public_evaluation, read_public_images
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.public_images import public_evaluation, read_public_images
+from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 from fcslam.learning.federated.strategies import StrategyFactory
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.stages import StageCallback
@@ -40,11 +39,8 @@ class FederatedJob:
     """Folders of images that the server may read; without any, the robots evaluate."""
     strategy: StrategyFactory | None = None
     """Makes a strategy of your own; None: the one that the settings name."""
-
     gate: GateSettings | None = None
     """Decides on releases by pairs that robots hold out; None: every version that is not worse is released."""
-    fallback: Callable[[str], Weights | None] = lambda _version: None
-    """As in ``CoordinatorHooks``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +74,12 @@ def run_job(
         wait: as in ``CoordinatorHooks``.
 
     Returns:
-        The files for the user: the detector in float32 and int8, the picture of the rounds, and the model card.
+        The files for the user: the detector, the picture of the rounds, and the model card.
 
     Raises:
         TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
         OutputError: a file cannot be written.
     """
-    if job.settings.privacy.noise_multiplier and not job.public:
-        raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
     images = read_public_images(job.public)
     _write_config(job, job.output / CONFIG_FILE)
     initial = prepare_initial_weights(job.start, job.output, job.settings, options, callbacks.stage, images)
@@ -97,9 +91,7 @@ def run_job(
 
     version = partial(weights_version, encoder=encoder)
     evaluate = public_evaluation(images, encoder, options.device)
-    hooks = CoordinatorHooks(
-        version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.fallback, job.strategy
-    )
+    hooks = CoordinatorHooks(version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.strategy)
     state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
     _write_config(job, job.output / CONFIG_FILE, again=True)
     judged_on = (
@@ -109,7 +101,7 @@ def run_job(
     )
     if job.gate is not None:
         judged_on = "on revisits that no robot trained on, mean"
-    return write_federated_artifacts(state, job.output, job.settings, calibration_images(images), judged_on)
+    return write_federated_artifacts(state, job.output, job.settings, judged_on)
 
 
 def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:

@@ -11,9 +11,7 @@ from fcslam.learning.settings import TrainingSettings
 from fcslam.records import FloatArray
 
 RELEASE: Final = "release"
-"""The event by which the process of a learning fleet names the version that robots are to use, by its number."""
-RELEASES: Final = "releases"
-"""Folder of the versions, below the output folder of the rounds."""
+"""The event by which the process of a learning fleet says that it has released a detector."""
 
 
 class HeldOutSettings(Settings):
@@ -32,7 +30,7 @@ class HeldOutSettings(Settings):
 
 
 class GateSettings(Settings):
-    """When a version of the detector is released, and when it is taken back."""
+    """When a version of the detector is released."""
 
     fewest_pairs: int = Field(
         default=200,
@@ -45,11 +43,6 @@ class GateSettings(Settings):
         ge=0.0,
         le=1.0,
         description="largest loss of places found again that the interval may leave possible, as a share",
-    )
-    fewest_places: int = Field(
-        default=50,
-        ge=1,
-        description="fewest pairs of places, described by both versions, on which a released version is judged again",
     )
 
 
@@ -83,7 +76,7 @@ class LiveRounds(FederatedSettings):
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
     trained: TrainedLayers = Field(
         default="codes",
-        description="layers that robots train: codes, those of the descriptors; or heads, also those of the keypoints",
+        description="layers that robots train: codes, those of the descriptors",
     )
     compatible: float = Field(
         default=4.0,

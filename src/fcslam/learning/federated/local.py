@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.client import RobotClient, seeded_noise
+from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.learning.trainer import ExecutionOptions
@@ -37,14 +37,7 @@ def federate_locally(
         if not folder.is_dir():
             raise TrainingError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = [
-        RobotClient(
-            name,
-            folder,
-            job.output / "robots" / name,
-            seeded_noise(name, job.settings.training.seed),
-            options.device,
-            callbacks.steps,
-        )
+        RobotClient(name, folder, job.output / "robots" / name, options.device, callbacks.steps)
         for name, folder in zip(names, folders, strict=True)
     ]
     return run_job(job, options, callbacks, in_process_grid(clients))

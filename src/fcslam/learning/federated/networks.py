@@ -2,7 +2,7 @@
 
     KeypointNetwork  <->  Weights (float32 arrays by name)  <->  ArrayRecord
 
-Aggregation, screening and privacy work on ``Weights``. Networks exist where something is trained or evaluated, records
+Aggregation and screening work on ``Weights``. Networks exist where something is trained or evaluated, records
 (``codec``) where something is sent.
 """
 

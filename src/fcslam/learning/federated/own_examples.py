@@ -14,7 +14,7 @@ from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.geometry import se2
 from fcslam.learning.federated.held_out import HeldOutPairs
 from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, vote
+from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair
 from fcslam.learning.revisits import Keyframe, revisits_in_map
 from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
@@ -46,11 +46,8 @@ def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
     trained = [each for each, is_held_out in zip(shown, held_out, strict=True) if not is_held_out]
     judged = [each for each, is_held_out in zip(shown, held_out, strict=True) if is_held_out]
     frames, poses = _keyframes(trained)
-    found = revisits_in_map(frames, poses)
-    pairs = [_pair(frames, poses, i, j, rows) for i, j, rows in found.pairs]
-    voted = [vote(k, frames[k].features.keypoints_px, each) for k, each in enumerate(found.sightings)]
-    votes = [each for each in voted if each is not None]
-    examples = RevisitExamples([frame.image for frame in frames], pairs, votes)
+    pairs = [_pair(frames, poses, i, j, rows) for i, j, rows in revisits_in_map(frames, poses)]
+    examples = RevisitExamples([frame.image for frame in frames], pairs)
     return OwnExamples(examples, HeldOutPairs.of(*_keyframes(judged)))
 
 

@@ -1,14 +1,14 @@
-"""Public images: the only ones that the server may read. It evaluates detectors and calibrates int8 on them."""
+"""Public images: the only ones that the server may read. It evaluates detectors on them."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
 
 from fcslam.errors import TrainingError
 from fcslam.features.detector import GreyImage
-from fcslam.learning.export import CALIBRATION_IMAGES
 from fcslam.learning.federated.evaluation import EvaluateFn, Metrics
 from fcslam.learning.federated.networks import weights_to_network
 from fcslam.learning.federated.weights import Weights
@@ -19,6 +19,8 @@ from fcslam.learning.settings import Encoder
 from fcslam.learning.stages import SyntheticShapes
 from fcslam.learning.trainer import validation_pairs
 from fcslam.learning.validation import validate
+
+STATISTICS_IMAGES: Final = 64
 
 
 def read_public_images(roots: Sequence[Path]) -> list[GreyImage]:
@@ -49,8 +51,8 @@ def public_evaluation(images: Sequence[GreyImage], encoder: Encoder, device: str
     return evaluate
 
 
-def calibration_images(public: Sequence[GreyImage]) -> list[GreyImage]:
-    """Images that give int8 its ranges and batch normalisation its statistics: public ones, or synthetic shapes."""
+def statistics_images(public: Sequence[GreyImage]) -> list[GreyImage]:
+    """Images that give batch normalisation its statistics: public ones, or synthetic shapes."""
     if public:
-        return list(public[:: max(len(public) // CALIBRATION_IMAGES, 1)])[:CALIBRATION_IMAGES]
-    return [example.image for example in SyntheticShapes(2, CALIBRATION_IMAGES)[:]]
+        return list(public[:: max(len(public) // STATISTICS_IMAGES, 1)])[:STATISTICS_IMAGES]
+    return [example.image for example in SyntheticShapes(2, STATISTICS_IMAGES)[:]]

@@ -21,7 +21,7 @@ import torch
 
 from fcslam.errors import FcslamError, TrainingError
 from fcslam.learning.code_training import CodeInputs
-from fcslam.learning.federated.client import RobotClient, secret_noise
+from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
 from fcslam.learning.federated.live_settings import RobotLearningSettings
@@ -88,8 +88,8 @@ class LearningRobot:
         self._client.inputs = CodeInputs()
         revisits = examples.revisits
         tell(
-            f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own, "
-            f"{len(revisits.voted)} with voted keypoints; {len(examples.held_out.revisits)} pairs held out"
+            f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
+            f"{len(examples.held_out.revisits)} pairs held out"
         )
 
 
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str]) -> int:
     threading.Thread(target=_listen, args=(idle,), daemon=True).start()
     try:
         shown = Credentials() if given.credentials is None else read_credentials(given.credentials)
-        client = RobotClient(given.name, given.keyframes, given.cache, secret_noise)
+        client = RobotClient(given.name, given.keyframes, given.cache)
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
         link = partial(_IdleLink, robot, given.server, given.name, shown.token, shown.ca, shown.own)

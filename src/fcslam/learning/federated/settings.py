@@ -1,15 +1,18 @@
 """Settings of federated training."""
 
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from fcslam.config import Settings
 from fcslam.learning.settings import TrainingSettings
 
-StrategyName = Literal["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"]
+DETECTOR: Final = "detector.onnx"
+"""File of the released detector in the output folder."""
+
+StrategyName = Literal["fedavg", "fedmedian"]
 Normalisation = Literal["averaged", "frozen"]
-TrainedLayers = Literal["all", "codes", "heads"]
+TrainedLayers = Literal["all", "codes"]
 
 
 class ScreeningSettings(Settings):
@@ -42,22 +45,6 @@ class ScreeningSettings(Settings):
     )
 
 
-class PrivacySettings(Settings):
-    """Differential privacy: noise that a robot adds to its update before the update leaves it."""
-
-    clip_norm: float = Field(
-        default=1.0, gt=0.0, description="largest norm of an update; longer updates are scaled down to it"
-    )
-    noise_multiplier: float = Field(
-        default=0.0,
-        ge=0.0,
-        description="standard deviation of the noise, as a multiple of clip_norm; 0 for neither clipping nor noise",
-    )
-    delta: float = Field(
-        default=1e-5, gt=0.0, lt=1.0, description="probability with which the privacy loss may exceed epsilon"
-    )
-
-
 class FederatedSettings(Settings):
     """Settings of a federated training run."""
 
@@ -65,7 +52,7 @@ class FederatedSettings(Settings):
     local_steps: int = Field(
         default=10,
         ge=1,
-        description="optimiser steps of each robot in a round; of each head, with trained: heads",
+        description="optimiser steps of each robot in a round",
     )
     judge_every: int = Field(
         default=5,
@@ -80,11 +67,6 @@ class FederatedSettings(Settings):
     deadline_s: float = Field(
         default=3600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
     )
-    proximal: float = Field(
-        default=0.01,
-        ge=0.0,
-        description="strength of FedProx's proximal term, which holds robots to the global weights",
-    )
     compatible: float = Field(
         default=0.0,
         ge=0.0,
@@ -95,8 +77,7 @@ class FederatedSettings(Settings):
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="share of Nesterov's momentum kept between rounds, at most 1 - 1/N for N robots; 0 for off; "
-        "fedadam and krum do not use it",
+        description="share of Nesterov's momentum kept between rounds, at most 1 - 1/N for N robots; 0 for off",
     )
     smoothing: float = Field(
         default=0.8,
@@ -105,20 +86,14 @@ class FederatedSettings(Settings):
         description="share of earlier rounds in the moving average of which versions are made; "
         "decreases with the learning rate",
     )
-    server_rate: float = Field(default=0.003, gt=0.0, description="server learning rate of FedAdam")
-    trimmed: float = Field(
-        default=0.2, ge=0.0, lt=0.5, description="share of the updates that FedTrimmedAvg removes at each end"
-    )
-    malicious: int = Field(default=1, ge=0, description="number of poisoned robots that Krum must tolerate")
     normalisation: Normalisation = Field(
         default="averaged",
         description="batch statistics: averaged over the robots like weights, or frozen at their initial values",
     )
     trained: TrainedLayers = Field(
         default="all",
-        description="layers that robots train: all; codes, those of the descriptors alone, so that keypoints stay as "
-        "they are; or heads, those of the descriptors and of the keypoints, on what a robot saw again; codes and heads "
-        "need frozen batch statistics",
+        description="layers that robots train: all; or codes, those of the descriptors alone, so that keypoints stay "
+        "as they are, on what a robot saw again, which needs frozen batch statistics",
     )
     collapse: float = Field(
         default=0.15,
@@ -129,19 +104,10 @@ class FederatedSettings(Settings):
     screening: ScreeningSettings = Field(
         default_factory=ScreeningSettings, description="thresholds above which an update is refused"
     )
-    privacy: PrivacySettings = Field(
-        default_factory=PrivacySettings, description="differential privacy of the robots' images"
-    )
     training: TrainingSettings = Field(
         default_factory=TrainingSettings,
         description="training on each robot; its steps are replaced by rounds times local_steps",
     )
-
-    @model_validator(mode="after")
-    def _variances_stay_positive(self) -> Self:
-        if self.normalisation == "averaged" and (self.strategy == "fedadam" or self.privacy.noise_multiplier > 0.0):
-            raise ValueError("FedAdam and noise can make variances negative; set normalisation to frozen")
-        return self
 
     @model_validator(mode="after")
     def _revisits_leave_statistics(self) -> Self:

@@ -1,36 +1,21 @@
-"""Aggregation: Flower's strategies, momentum between rounds, and the state of both that must survive a restart."""
+"""Aggregation: Flower's strategies, and momentum between rounds, which must survive a restart."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.codec import record_to_weights, weights_to_record
-from fcslam.learning.federated.flower import (
-    FedAdam,
-    FedAvg,
-    FedMedian,
-    FedProx,
-    FedTrimmedAvg,
-    Krum,
-    Message,
-    MetricRecord,
-    RecordDict,
-    restore_moments,
-    strategy_moments,
-)
+from fcslam.learning.federated.flower import FedAvg, FedMedian, Message, MetricRecord, RecordDict
 from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, EXAMPLES_KEY, METRICS_KEY
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, trained_names, weights_error
 
-_MOMENTUM: Final = "momentum"
-
 StrategyFactory = Callable[..., FedAvg]
-"""A subclass of Flower's FedAvg, or a function that makes one from FedAvg's keyword arguments. A checkpoint keeps the
-state of a strategy only if it is that of FedAdam."""
+"""A subclass of Flower's FedAvg, or a function that makes one from FedAvg's keyword arguments. A checkpoint keeps no
+state of a strategy."""
 
 
 class Aggregator:
@@ -46,19 +31,13 @@ class Aggregator:
         self, settings: FederatedSettings, state: Mapping[str, NDArray[Any]], strategy: StrategyFactory | None = None
     ) -> None:
         self.strategy = create_strategy(settings, strategy)
-        restore_moments(self.strategy, {name: _group(state, name) for name in strategy_moments(self.strategy)})
         self._largest_momentum = settings.server_momentum
-        # FedAdam has its own momentum. Krum selects one robot's update, which is too noisy to be followed further.
-        without = settings.strategy in ("fedadam", "krum") or settings.server_momentum == 0.0
-        self._momentum = None if without else _group(state, _MOMENTUM)
+        self._momentum = dict(state)
 
     @property
     def state(self) -> dict[str, NDArray[Any]]:
         """Arrays with which another aggregator continues as this one would, by name."""
-        groups = {**strategy_moments(self.strategy), _MOMENTUM: self._momentum or {}}
-        return {
-            f"{group}/{name}": np.asarray(array) for group, arrays in groups.items() for name, array in arrays.items()
-        }
+        return self._momentum
 
     def aggregate(self, round_number: int, updates: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
         """The next global weights.
@@ -81,7 +60,7 @@ class Aggregator:
         record, _ = self.strategy.aggregate_train(round_number, messages)
         aggregated = {name: np.asarray(array, np.float32) for name, array in record_to_weights(record).items()}
         reason, following = weights_error(aggregated, old), aggregated
-        if reason is None and self._momentum is not None:
+        if reason is None and self._largest_momentum > 0.0:
             # Limited to the way that the robots would have gone if they had trained one after another.
             share = min(self._largest_momentum, 1.0 - 1.0 / len(updates))
             following, self._momentum = apply_server_momentum(aggregated, old, self._momentum, share)
@@ -131,25 +110,5 @@ def create_strategy(settings: FederatedSettings, factory: StrategyFactory | None
         "arrayrecord_key": ARRAYS_KEY,
         "configrecord_key": CONFIG_KEY,
     }
-    return (factory or _named(settings))(**everyone)
-
-
-def _named(settings: FederatedSettings) -> StrategyFactory:
-    """The strategy that the settings name."""
-    match settings.strategy:
-        case "fedavg":
-            return partial(FedAvg)
-        case "fedprox":
-            return partial(FedProx, proximal_mu=settings.proximal)
-        case "fedadam":
-            return partial(FedAdam, eta=settings.server_rate)
-        case "fedmedian":
-            return partial(FedMedian)
-        case "fedtrimmedavg":
-            return partial(FedTrimmedAvg, beta=settings.trimmed)
-        case "krum":
-            return partial(Krum, num_malicious_nodes=settings.malicious)
-
-
-def _group(state: Mapping[str, NDArray[Any]], group: str) -> dict[str, NDArray[Any]]:
-    return {name.removeprefix(f"{group}/"): array for name, array in state.items() if name.startswith(f"{group}/")}
+    named: StrategyFactory = FedMedian if settings.strategy == "fedmedian" else FedAvg
+    return (factory or named)(**everyone)

@@ -6,13 +6,13 @@ from contextlib import contextmanager
 from io import BytesIO, FileIO
 from math import nan
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 from zlib import crc32
 
 import numpy as np
 from pydantic import ValidationError
 
-from fcslam.errors import OutputError, SourceError
+from fcslam.errors import OutputError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import (
     CameraImage,
@@ -31,19 +31,15 @@ from fcslam.sources.recording.layout import (
     HEADER_BYTES,
     IMAGES,
     IMAGES_FILE,
-    META,
     ODOMETRY_FILE,
     RANGE,
     RANGES,
-    SCANS,
     SCANS_FILE,
     SWEEP_NUMBERS,
     FrameFile,
     Meta,
     check_sweep,
     image_path,
-    is_whole,
-    read_meta,
     write_meta,
 )
 
@@ -51,20 +47,11 @@ _NO_POSE = (nan, nan, nan)
 _NO_SWEEP = (nan,) * SWEEP_NUMBERS
 
 
-class RecordCounts(NamedTuple):
-    """How many records of each kind a recording holds."""
-
-    scans: int
-    odometry: int
-    images: int
-    ground_truth: int
-
-
 class RecordingWriter:
     """A recording that grows. Nothing is buffered: what ``write`` has returned from outlives this process."""
 
     def __init__(self, folder: Path, meta: Meta) -> None:
-        """Use ``create`` or ``resume`` instead."""
+        """Use ``create`` instead."""
         self._folder = folder
         self._meta = meta
         self._next_sequence = 0
@@ -86,20 +73,6 @@ class RecordingWriter:
             if any(folder.iterdir()):
                 raise OutputError(f"{folder}: is not empty; choose another place")
             write_meta(folder, meta)
-        return cls._opened(folder, meta)
-
-    @classmethod
-    def resume(cls, folder: Path) -> Self:
-        """Continue the recording at ``folder``; incomplete last records are removed.
-
-        Raises:
-            SourceError: the folder has no recording, or one of another version.
-            OutputError: the recording cannot be written.
-        """
-        return cls._opened(folder, read_meta(folder))
-
-    @classmethod
-    def _opened(cls, folder: Path, meta: Meta) -> Self:
         writer = cls(folder, meta)
         try:
             with _translate_errors(folder):
@@ -118,18 +91,6 @@ class RecordingWriter:
     def camera(self) -> CameraModel | None:
         """The camera of all images."""
         return self._meta.camera
-
-    @property
-    def counts(self) -> RecordCounts:
-        """Records in the folder."""
-        truth = self._appenders[GROUND_TRUTH]
-        scans, odometry, images = (self._count(frames) for frames in (SCANS_FILE, ODOMETRY_FILE, IMAGES_FILE))
-        return RecordCounts(scans, odometry, images, truth.content(0, truth.size).count(b"\n"))
-
-    @property
-    def is_gapless(self) -> bool:
-        """Whether no record is missing before another one, which can happen after a power cut."""
-        return self._next_sequence == sum(self.counts[:3])
 
     def write(self, item: RecordedItem) -> None:
         """Append one record.
@@ -170,13 +131,9 @@ class RecordingWriter:
             (self._folder / IMAGES).mkdir(exist_ok=True)
         for frames in files:
             appender = self._appenders[frames.name] = _Appender(self._folder / frames.name)
-            self._next_sequence = max(self._next_sequence, _cut_to_whole_frames(appender, frames))
-        ranges = self._appenders[RANGES] = _Appender(self._folder / RANGES)
-        ranges.cut(min(ranges.size, _end_of_ranges(self._appenders[SCANS])))
-        for unfinished in (self._folder / IMAGES).glob(f"{self._count(IMAGES_FILE):08d}.*"):
-            unfinished.unlink()
-        truth = self._appenders[GROUND_TRUTH] = _Appender(self._folder / GROUND_TRUTH)
-        truth.cut(truth.content(0, truth.size).rfind(b"\n") + 1)
+            appender.append(frames.header)
+        for name in (RANGES, GROUND_TRUTH):
+            self._appenders[name] = _Appender(self._folder / name)
 
     def _check(self, item: RecordedItem) -> None:
         if isinstance(item, GnssFix):
@@ -255,10 +212,6 @@ class _Appender:
         self.file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+")
         self.size = os.fstat(self.file.fileno()).st_size
 
-    def content(self, start: int, end: int) -> bytes:
-        """The bytes from ``start`` (included) to ``end`` (excluded)."""
-        return os.pread(self.file.fileno(), end - start, start)
-
     def append(self, piece: bytes) -> None:
         """Append the whole piece, or undo a partial write (disk full) and raise OSError."""
         written = 0
@@ -266,45 +219,9 @@ class _Appender:
             while written < len(piece):
                 written += os.pwrite(self.file.fileno(), piece[written:], self.size + written)
         except OSError:
-            self.cut(self.size)
+            self.file.truncate(self.size)
             raise
         self.size += len(piece)
-
-    def cut(self, size: int) -> None:
-        """Truncate the file to ``size`` bytes."""
-        self.file.truncate(size)
-        self.size = size
-
-
-def _cut_to_whole_frames(appender: _Appender, frames: FrameFile) -> int:
-    """Remove incomplete frames from the end, and write the header if it is missing; returns the next sequence number.
-
-    Raises:
-        SourceError: the file does not match the laser or version.
-    """
-    header = appender.content(0, HEADER_BYTES)
-    if header != frames.header[: len(header)]:
-        raise SourceError(f"{appender.path}: does not fit {META}, so it cannot be resumed; copy both again")
-    if len(header) < HEADER_BYTES:
-        appender.cut(0)
-        appender.append(frames.header)
-    count = (appender.size - HEADER_BYTES) // frames.frame_bytes
-    while count:
-        start = HEADER_BYTES + (count - 1) * frames.frame_bytes
-        frame = appender.content(start, start + frames.frame_bytes)
-        if is_whole(frame):
-            break
-        count -= 1
-    appender.cut(HEADER_BYTES + count * frames.frame_bytes)
-    return int(np.frombuffer(frame, frames.frame)["sequence"][0]) + 1 if count else 0
-
-
-def _end_of_ranges(scans: _Appender) -> int:
-    """The end of the ranges of the last scan, in bytes; 0 without scans."""
-    if scans.size == HEADER_BYTES:
-        return 0
-    frame = np.frombuffer(scans.content(scans.size - SCANS_FILE.frame_bytes, scans.size), SCANS_FILE.frame)[0]
-    return int(frame["offset"]) + RANGE.itemsize * int(frame["beam_count"])
 
 
 @contextmanager

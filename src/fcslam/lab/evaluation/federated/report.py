@@ -1,22 +1,13 @@
 """The report of a study of federated training: gaps to central training with intervals, and the worst robot."""
 
-import csv
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
 
 import numpy as np
 
-from fcslam.errors import OutputError
-from fcslam.lab.evaluation.federated.arms import ALONE, CENTRAL, LOCAL
 from fcslam.lab.evaluation.federated.pairs import MEASURES
-from fcslam.lab.evaluation.federated.study import StudyResults
+from fcslam.lab.evaluation.federated.study import ALONE, CENTRAL, LOCAL, StudyResults
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
-
-COLUMNS: Final = (
-    "measure", "arm", "mean", "gap", "low", "high", "closed", "closed_alone", "worst_robot", "worst_gap", "seeds",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,25 +44,6 @@ def report(results: StudyResults, seed: int = 1, against: str = CENTRAL) -> list
         for index in range(len(MEASURES))
         for arm in results.measured
     ]
-
-
-def write_report(reports: list[ArmReport], path: Path) -> None:
-    """Write the report as a CSV file.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(COLUMNS)
-            for each in reports:
-                numbers = (each.mean, *each.gap, each.closed, each.closed_alone)
-                seeds = " ".join(f"{mean:.4f}" for mean in each.seeds)
-                cells = [f"{number:.4f}" for number in numbers]
-                rows.writerow((each.measure, each.arm, *cells, each.worst_robot, f"{each.worst_gap:.4f}", seeds))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
 def _report(results: StudyResults, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:

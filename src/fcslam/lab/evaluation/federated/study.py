@@ -2,36 +2,22 @@
 
 All arms start from the same weights, and the networks that are compared saw the same number of samples. Each network is
 exported and measured on the same pairs of views, of images that no arm trains on; the robots' own networks divide the
-pairs among them. Finished results are kept, so a study can be interrupted, and several processes can work on one study.
+pairs among them. Finished results are kept, so a study can be interrupted.
 """
 
-import fcntl
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
-from pydantic import Field
 
-from fcslam.config import Settings, dump, load
-from fcslam.errors import EvaluationError, OutputError
+from fcslam.config import parse
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.lab.evaluation.federated.arms import (
-    ALONE,
-    CENTRAL,
-    LOCAL,
-    START,
-    Arm,
-    SeedContext,
-    train_arm,
-    train_central,
-    train_locally,
-)
 from fcslam.lab.evaluation.federated.pairs import (
     MEASURES,
     MOST_POINTS,
@@ -40,45 +26,59 @@ from fcslam.lab.evaluation.federated.pairs import (
     held_out_pairs,
     measure_pair,
 )
+from fcslam.lab.evaluation.federated.poison import Poison, PoisonedClient
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.client import FederatedClient, RobotClient
+from fcslam.learning.federated.client_app import in_process_grid
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
-from fcslam.learning.federated.networks import weights_to_network
+from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import ViewPair
+from fcslam.learning.pairs import TrainingExample, ViewPair
+from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
-from fcslam.learning.trainer import ExecutionOptions, TrainingProgress
+from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 from fcslam.records import FloatArray
 from fcslam.untrusted import read_arrays
 
+START: Final = "start"
+"""The initial weights without training."""
+CENTRAL: Final = "central"
+"""One network on the images of all robots."""
+LOCAL: Final = "local"
+"""Each robot on its own images, with as many steps as all robots of the fleet have together."""
+ALONE: Final = "alone"
+"""Each robot on its own images, with as many steps as it has in the fleet."""
 TEST_SHARE: Final = 0.25
 """Share of each robot's images that no arm trains on, chosen by their names."""
-STUDY_FILE: Final = "study.yaml"
 
 
-class StudySettings(Settings):
-    """Settings of a study."""
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One way to train the fleet."""
 
-    federated: FederatedSettings = Field(
-        default_factory=FederatedSettings, description="federated settings of every arm"
-    )
-    start: Path | None = Field(
-        default=None,
-        description="checkpoint or detector.onnx from which all arms start; null for training on synthetic shapes",
-    )
-    arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="federated arms by name")
-    seeds: int = Field(default=3, ge=1, description="number of repetitions of each arm, from the same start")
-    local_seeds: int | None = Field(
-        default=None,
-        ge=0,
-        description="repetitions of the arms local and alone, which cost most; 0 for none, null for all seeds",
-    )
-    pairs: int = Field(default=500, ge=1, description="pairs of views in the test, divided evenly among the robots")
-    images: int = Field(default=400, ge=4, description="most image files of a robot, for training and test")
-    trained: int = Field(default=400, ge=2, description="most image files of a robot that are trained on")
+    together: bool = True
+    """True: federated training; false: central training with as many steps as one robot of the fleet."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Federated settings of this arm that differ from those of the study."""
+    poison: Poison | None = None
+    """How the last robot falsifies updates; None: it does not."""
+    seeds: int | None = None
+    """Number of the study's seeds for which this arm is trained; None for all."""
+
+    def federated(self, common: FederatedSettings, seed: int) -> FederatedSettings:
+        """The settings of this arm.
+
+        Raises:
+            ConfigError: ``settings`` names something that is not a setting.
+        """
+        content = common.model_dump() | dict(self.settings)
+        content["training"] = dict(content["training"]) | {"seed": seed}
+        return parse(FederatedSettings, content, "an arm of the study")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +88,24 @@ class Study:
     robots: Mapping[str, Path]
     """Folders of images by name."""
     folder: Path
-    settings: StudySettings
-    options: ExecutionOptions
-    on_progress: Callable[[str, int, int], None]
+    federated: FederatedSettings
+    """Settings of every arm."""
+    arms: Mapping[str, Arm]
+    """By name; no name begins with that of a built-in arm."""
+    start: Path | None = None
+    """Checkpoint or exported detector from which all arms start; None for training on synthetic shapes."""
+    seeds: int = 3
+    """Repetitions of each arm, from the same start."""
+    local_seeds: int = 1
+    """Repetitions of the arms ``LOCAL`` and ``ALONE``, which cost most; 0 for none."""
+    pairs: int = 500
+    """Pairs of views in the test, divided evenly among the robots."""
+    images: int = 400
+    """Most image files of a robot, for training and test."""
+    trained: int = 400
+    """Most image files of a robot that are trained on."""
+    options: ExecutionOptions = field(default_factory=ExecutionOptions)
+    on_progress: Callable[[str, int, int], None] = lambda _name, _done, _total: None
     """Called with what is being done, the amount done, and its total."""
 
 
@@ -108,101 +123,9 @@ class StudyResults:
     """
 
 
-def run_study(study: Study) -> StudyResults:
-    """Train and measure everything that is not measured yet.
-
-    Raises:
-        EvaluationError: the folder belongs to another study, or an arm has a reserved or malformed name.
-        TrainingError: a robot has too few images.
-        OutputError: a file cannot be written.
-    """
-    for name in study.settings.arms:
-        if name.split("-")[0] in (START, CENTRAL, LOCAL, ALONE) or not name.replace("-", "").isalnum():
-            raise EvaluationError(
-                f"{name}: an arm's name has letters, digits and hyphens, and is none of the built-in arms"
-            )
-    with _locked(
-        study.folder / "study.lock", wait=True
-    ):  # a process that starts at the same time reads a complete file
-        _claim(study)
-    share = -(-study.settings.pairs // len(study.robots))
-    pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
-    files = _files_of_arms(study)
-    missing = [(name, seed, file) for name, places in files.items() for seed, file in enumerate(places, start=1)]
-    common: SharedInputs | None = None
-    # First what no other process works on. Then wait for the others, and take over what they leave unfinished.
-    for wait in (False, True):
-        for name, seed, file in missing:
-            with _locked(file.with_suffix(".lock"), wait) as mine:
-                if mine and not file.exists():
-                    common = common or _shared_inputs(study, pairs)
-                    networks = _trained(_seed_context(study, common, seed), name, study.settings.arms)
-                    write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
-    owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
-    measured = {name: np.stack([read_arrays(file)["measures"] for file in places]) for name, places in files.items()}
-    return StudyResults(tuple(study.robots), owners, measured)
-
-
-def _files_of_arms(study: Study) -> dict[str, list[Path]]:
-    """Files of the measurements of each arm, by seed."""
-    settings = study.settings
-    own = settings.seeds if settings.local_seeds is None else min(settings.local_seeds, settings.seeds)
-    seeds = {START: 1, CENTRAL: settings.seeds, LOCAL: own, ALONE: own}
-    seeds |= {name: min(arm.seeds or settings.seeds, settings.seeds) for name, arm in settings.arms.items()}
-    return {
-        name: [study.folder / f"seed{seed}" / "measured" / f"{name}.npz" for seed in range(1, count + 1)]
-        for name, count in seeds.items()
-        if count
-    }
-
-
-@contextmanager
-def _locked(path: Path, wait: bool) -> Iterator[bool]:
-    """Whether this process has the lock of the file; ``wait`` for it, or give up if another process has it."""
-    mine = True
-    with ExitStack() as stack:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = stack.enter_context(path.open("w", encoding="utf-8"))
-            fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            mine = False
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error})") from error
-        yield mine
-
-
-def _trained(context: SeedContext, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
-    if name == START:
-        return [weights_to_network(context.start, context.settings.training.encoder)]
-    if name == CENTRAL:
-        return train_central(context)
-    return train_arm(context, name, arms[name]) if name in arms else train_locally(context, name)
-
-
-def _claim(study: Study) -> None:
-    """Claim the folder for this study, or check that it belongs to it; arms and seeds may be added to a study."""
-    robots = "".join(f"# {robot}: {folder.resolve()}\n" for robot, folder in study.robots.items())
-    settings, path = study.settings, study.folder / STUDY_FILE
-    try:
-        study.folder.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            before = load(StudySettings, path)
-            counts = {"seeds": settings.seeds, "local_seeds": settings.local_seeds}
-            known = before.model_copy(update={"arms": before.arms | settings.arms, **counts})
-            settings = settings.model_copy(update={"arms": known.arms})
-            same = {name: known.arms[name].model_copy(update={"seeds": arm.seeds}) for name, arm in before.arms.items()}
-            changed = same != before.arms
-            if changed or known != settings or not path.read_text(encoding="utf-8").startswith(robots):
-                raise EvaluationError(f"{path}: belongs to another study; give another folder")
-        path.write_text(robots + dump(settings), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{study.folder}: cannot be used as the output folder ({error})") from error
-
-
 @dataclass(frozen=True, slots=True)
 class SharedInputs:
-    """Data that all seeds share."""
+    """Data that all arms and seeds share."""
 
     start: Weights
     images: Mapping[str, TrainingImages]
@@ -211,45 +134,138 @@ class SharedInputs:
     """Features that the initial network detects in the first view of each pair."""
 
 
-def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
-    training = study.settings.federated.client_training()
+def run_study(study: Study) -> StudyResults:
+    """Train and measure everything that is not measured yet.
 
-    def on_progress(stage: str, progress: TrainingProgress) -> None:
-        study.on_progress(stage, progress.step, progress.steps)
+    Raises:
+        EvaluationError: a robot has no usable test image.
+        TrainingError: a robot has too few images, or the folder belongs to another study.
+        OutputError: a file cannot be written.
+    """
+    share = -(-study.pairs // len(study.robots))
+    pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
+    common: SharedInputs | None = None
+    measured = {}
+    for name, count in _seeds(study).items():
+        values = []
+        for seed in range(1, count + 1):
+            file = study.folder / f"seed{seed}" / "measured" / f"{name}.npz"
+            if not file.exists():
+                common = common or _shared_inputs(study, pairs)
+                networks = _trained(study, common, name, seed)
+                write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
+            values.append(read_arrays(file)["measures"])
+        measured[name] = np.stack(values)
+    owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
+    return StudyResults(tuple(study.robots), owners, measured)
 
-    device = torch.device(study.options.device)
-    images: dict[str, TrainingImages] = {}
-    with _locked(study.folder / "common.lock", wait=True):
-        start = prepare_initial_weights(
-            study.settings.start, study.folder, study.settings.federated, study.options, on_progress
-        )
-        network = weights_to_network(start, training.encoder)
-        labeller = keypoint_response(network.to(device), device)
-        for robot in study.robots:
-            files = _files(study, robot)[0]
-            images[robot] = read_labelled_images(files, study.folder / "labels", training, labeller, None, on_progress)
-    detector = _detector(network)
-    return SharedInputs(start, images, [detect_features(detector, pair.views[0]) for pair in pairs])
 
-
-def _seed_context(study: Study, common: SharedInputs, seed: int) -> SeedContext:
-    def on_progress(name: str, done: int, total: int) -> None:
-        study.on_progress(f"{name}, seed {seed}", done, total)
-
-    folder = study.folder / f"seed{seed}"
-    return SeedContext(study.settings.federated, seed, common.start, common.images, folder, study.options, on_progress)
+def _seeds(study: Study) -> dict[str, int]:
+    """Repetitions by arm, in the order in which the arms are trained."""
+    own = min(study.local_seeds, study.seeds)
+    counts = {START: 1, CENTRAL: study.seeds, LOCAL: own, ALONE: own}
+    counts |= {name: min(arm.seeds or study.seeds, study.seeds) for name, arm in study.arms.items()}
+    return {name: count for name, count in counts.items() if count}
 
 
 def _files(study: Study, robot: str) -> tuple[list[ImageFile], list[ImageFile]]:
     """A robot's image files for training and for the test, spread evenly over all of its files."""
-    some = _spread(find_images([study.robots[robot]]), study.settings.images)
+    some = _spread(find_images([study.robots[robot]]), study.images)
     tests = [file for file in some if zlib.crc32(file.name.encode()) < TEST_SHARE * 2**32]
-    return _spread([file for file in some if file not in tests], study.settings.trained), tests
+    return _spread([file for file in some if file not in tests], study.trained), tests
 
 
 def _spread(files: Sequence[ImageFile], most: int) -> list[ImageFile]:
     step = max(len(files) / most, 1.0)
     return [files[int(index * step)] for index in range(min(len(files), most))]
+
+
+def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
+    training = study.federated.client_training()
+
+    def on_progress(stage: str, progress: TrainingProgress) -> None:
+        study.on_progress(stage, progress.step, progress.steps)
+
+    device = torch.device(study.options.device)
+    start = prepare_initial_weights(study.start, study.folder, study.federated, study.options, on_progress)
+    network = weights_to_network(start, training.encoder)
+    labeller = keypoint_response(network.to(device), device)
+    images = {
+        robot: read_labelled_images(
+            _files(study, robot)[0], study.folder / "labels", training, labeller, None, on_progress
+        )
+        for robot in study.robots
+    }
+    detector = _detector(network)
+    return SharedInputs(start, images, [detect_features(detector, pair.views[0]) for pair in pairs])
+
+
+def _trained(study: Study, common: SharedInputs, name: str, seed: int) -> list[KeypointNetwork]:
+    """The networks of an arm: one for each robot in the arms ``LOCAL`` and ``ALONE``, else one."""
+    if name == START:
+        return [weights_to_network(common.start, study.federated.training.encoder)]
+    everything = [example for images in common.images.values() for example in images.train]
+    if name == CENTRAL:
+        return [_centrally(study, common, name, seed, everything, _steps_of(study, seed, len(common.images)))]
+    if name in (LOCAL, ALONE):
+        training = _steps_of(study, seed, len(common.images) if name == LOCAL else 1)
+        return [
+            _centrally(study, common, f"{name}-{robot}", seed, images.train, training)
+            for robot, images in common.images.items()
+        ]
+    arm = study.arms[name]
+    settings = arm.federated(study.federated, seed)
+    if not arm.together:
+        return [_centrally(study, common, name, seed, everything, settings.client_training())]
+    return [_federated(study, common, name, seed, settings)]
+
+
+def _federated(
+    study: Study, common: SharedInputs, name: str, seed: int, settings: FederatedSettings
+) -> KeypointNetwork:
+    """Train the network of an arm: the one that could be released at its end."""
+    folder = study.folder / f"seed{seed}" / name
+    clients: list[FederatedClient] = [
+        RobotClient(robot, Path(robot), folder / robot, study.options.device, images=own)
+        for robot, own in common.images.items()
+    ]
+    poison = study.arms[name].poison
+    if poison is not None:
+        clients[-1] = PoisonedClient(clients[-1], poison)
+    hooks = CoordinatorHooks(
+        partial(weights_version, encoder=settings.training.encoder),
+        # Without metrics no version is better than another: the last one counts, as in the other arms.
+        evaluate_fn=lambda _weights: {},
+        on_round=lambda report: study.on_progress(f"{name}, seed {seed}", report.round_number, settings.rounds),
+    )
+    state = Coordinator(in_process_grid(clients), settings, common.start, folder, hooks).run()
+    return weights_to_network(state.average, settings.training.encoder)
+
+
+def _steps_of(study: Study, seed: int, shares: int) -> TrainingSettings:
+    """Training settings with ``shares`` times the steps of a robot in the fleet."""
+    training = study.federated.client_training()
+    return training.model_copy(update={"steps": training.steps * shares, "seed": seed})
+
+
+def _centrally(
+    study: Study,
+    common: SharedInputs,
+    name: str,
+    seed: int,
+    examples: list[TrainingExample],
+    training: TrainingSettings,
+) -> KeypointNetwork:
+    """Train with the trainer of central training."""
+    state = weights_to_network(common.start, training.encoder).state_dict()
+    folder = study.folder / f"seed{seed}" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    quiet = replace(study.options, validate_every=training.steps, log_every=max(training.steps // 20, 1))
+
+    def on_progress(progress: TrainingProgress) -> None:
+        study.on_progress(f"{name}, seed {seed}", progress.step, progress.steps)
+
+    return TrainingRun(training, "joint", folder, quiet, state).train(examples, examples[:1], on_progress=on_progress)
 
 
 def _measured(

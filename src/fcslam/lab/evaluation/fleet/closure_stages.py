@@ -1,7 +1,7 @@
 """Precision and recall of a run's closures against the ground truth, by channel, stage and scope."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -9,7 +9,6 @@ import numpy as np
 from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureScope, closure_rows, closure_sets
 from fcslam.lab.evaluation.fleet.ground_truth import KnownPoses
 from fcslam.metrics.closures import (
-    ClosureCriteria,
     ClosureErrors,
     Mask,
     PoseReference,
@@ -20,7 +19,7 @@ from fcslam.metrics.closures import (
     precision,
 )
 from fcslam.metrics.relations import PoseTable
-from fcslam.metrics.revisits import RevisitCriteria, Revisits, find_revisits
+from fcslam.metrics.revisits import Revisits, find_revisits
 from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus, FloatArray
 from fcslam.runs import Run
 
@@ -51,15 +50,14 @@ FleetClosures = Mapping[tuple[ClosureScope, ClosureStatus, str], FleetClosureSco
 """Scores by scope, stage and name in ``CHANNELS``."""
 
 
-def score_closures(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> FleetClosures:
+def score_closures(run: Run, known: KnownPoses) -> FleetClosures:
     """Score all sets of closures. A closure is not covered if the true pose of an end is unknown."""
-    judged, sets = _judge(run, known, criteria), closure_sets(run)
+    judged, sets = _judge(run, known), closure_sets(run)
     scores = {}
     for within in ClosureScope:
-        asked = RevisitCriteria(within_gap_s=criteria.within_gap_s)
         across = within is ClosureScope.FLEET
-        revisits = find_revisits(known.truth, asked, across)
-        alike = find_revisits(known.truth, replace(asked, turn_deg=LIKE_HEADING_DEG), across)
+        revisits = find_revisits(known.truth, across)
+        alike = find_revisits(known.truth, across, LIKE_HEADING_DEG)
         for status in STAGES:
             for name, channels in CHANNELS.items():
                 scores[within, status, name] = judged.score(sets[within, status], channels, revisits, alike)
@@ -71,7 +69,6 @@ class _Judged:
     """All closures with their errors; rows are those of the known poses."""
 
     truth: PoseTable
-    criteria: ClosureCriteria
     pairs: Rows
     """Shape (K, 2)."""
     errors: ClosureErrors
@@ -88,24 +85,24 @@ class _Judged:
         members: Mask = np.logical_or.reduce(sets)
         surest: Mask = np.logical_or.reduce([self._at_full_precision(channel_set) for channel_set in sets])
         return FleetClosureScore(
-            precision(self.errors, members, self.criteria),
+            precision(self.errors, members),
             self._recall(members, revisits),
             self._recall(members, alike),
             self._recall(surest, revisits),
         )
 
     def _recall(self, members: Mask, revisits: Revisits) -> Recall:
-        correct = self.pairs[members & self.errors.correct(self.criteria)]
-        return revisits.recall(correct, self.truth, self.criteria.reach_m)
+        correct = self.pairs[members & self.errors.correct]
+        return revisits.recall(correct, self.truth)
 
     def _at_full_precision(self, members: Mask) -> Mask:
         """Members (K,) that are more similar than every wrong member."""
-        wrong = members & self.errors.covered & ~self.errors.correct(self.criteria)
+        wrong = members & self.errors.covered & ~self.errors.correct
         surer: Mask = members & (self.similarity > np.max(self.similarity[wrong], initial=-np.inf))
         return surer
 
 
-def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
+def _judge(run: Run, known: KnownPoses) -> _Judged:
     truth = known.truth
     pairs = closure_rows(run, truth)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
@@ -113,7 +110,7 @@ def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
     # The truth is known at the stamps of the closures, so the run's trajectory does not bridge any gap.
     reference = PoseReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
     return _Judged(
-        truth, criteria, pairs, closure_errors(pairs, T_i_j, truth, reference),
+        truth, pairs, closure_errors(pairs, T_i_j, truth, reference),
         np.array([closure.similarity for closure in run.closures]),
         {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in PLACE_CHANNELS},
     )  # fmt: skip

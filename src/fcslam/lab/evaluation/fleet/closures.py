@@ -11,7 +11,8 @@ from fcslam.errors import EvaluationError
 from fcslam.lab.evaluation.fleet.relation_graph import RelationGraph, build_relation_graph
 from fcslam.lab.evaluation.fleet.relations import pose_table
 from fcslam.metrics.closures import (
-    ClosureCriteria,
+    BRIDGE_S,
+    WITHIN_GAP_S,
     ClosureErrors,
     Mask,
     PoseReference,
@@ -70,7 +71,7 @@ class ClosureReport:
     """Number of the relations' stamps at which the run has a pose."""
 
 
-def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> ClosureReport:
+def evaluate_closures(run: Path, relations: Path) -> ClosureReport:
     """Precision and recall of the closures in the run folder ``run`` against the file ``relations``.
 
     Raises:
@@ -82,7 +83,7 @@ def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> 
     node_rows = poses.find(graph.stamps)
     if not np.any(node_rows >= 0):
         raise EvaluationError(f"{relations}: no relation names a stamp of {run}; are they of the same recording?")
-    evidence = _gather(opened, poses, graph, node_rows, criteria)
+    evidence = _gather(opened, poses, graph, node_rows)
     scores = {
         (within, status): evidence.score(members, within, status in STAGES)
         for (within, status), members in closure_sets(opened).items()
@@ -142,7 +143,6 @@ class _Evidence:
     """Errors and chains of all closures."""
 
     poses: PoseTable
-    criteria: ClosureCriteria
     pairs: Rows
     """Rows of the ends of the closures, shape (K, 2)."""
     by_graph: ClosureErrors
@@ -156,8 +156,8 @@ class _Evidence:
         """Score the closures that ``members``, shape (K,), selects."""
         covered = self.chains[members & self.by_graph.covered]
         return ClosureScore(
-            precision(self.by_graph, members, self.criteria),
-            precision(self.by_one, members, self.criteria),
+            precision(self.by_graph, members),
+            precision(self.by_one, members),
             self._recall(members, within) if is_stage else None,
             (_quantile(covered, 0.5), _quantile(covered, 1.0)),
         )
@@ -165,35 +165,35 @@ class _Evidence:
     def _recall(self, members: Mask, within: ClosureScope) -> Recall:
         first, second = self.poses.robots[self.revisits].T
         revisits = self.revisits[(first == second) == (within is ClosureScope.ROBOT)]
-        correct = self.pairs[members & self.by_graph.correct(self.criteria)]
-        found = revisits_found(revisits, correct, self.poses, self.criteria.reach_m)
+        correct = self.pairs[members & self.by_graph.correct]
+        found = revisits_found(revisits, correct, self.poses)
         return Recall(len(revisits), int(found.sum()))
 
 
-def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, criteria: ClosureCriteria) -> _Evidence:
+def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows) -> _Evidence:
     pairs = closure_rows(run, poses)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
     ends = node_rows[graph.ends]
     usable = np.all(ends >= 0, axis=1) & graph.holds
-    placed = _placed_reference(graph, node_rows, poses, criteria.bridge_s)
-    single = RelationReference(poses, criteria.bridge_s, ends[usable], graph.relations.T_1_2[usable])
+    placed = _placed_reference(graph, node_rows, poses)
+    single = RelationReference(poses, BRIDGE_S, ends[usable], graph.relations.T_1_2[usable])
     by_graph = closure_errors(pairs, T_i_j, poses, placed)
     return _Evidence(
-        poses, criteria, pairs, by_graph, closure_errors(pairs, T_i_j, poses, single),
-        _chains(graph, node_rows, by_graph), ends[usable & _is_revisit(ends, graph.relations.stamps, poses, criteria)],
+        poses, pairs, by_graph, closure_errors(pairs, T_i_j, poses, single),
+        _chains(graph, node_rows, by_graph), ends[usable & _is_revisit(ends, graph.relations.stamps, poses)],
     )  # fmt: skip
 
 
-def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable, bridge_s: float) -> PoseReference:
+def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable) -> PoseReference:
     """The graph's poses at stamps of the run."""
     known = np.flatnonzero(node_rows >= 0)
-    return PoseReference(poses, bridge_s, node_rows[known], graph.T_component_base[known], graph.components[known])
+    return PoseReference(poses, BRIDGE_S, node_rows[known], graph.T_component_base[known], graph.components[known])
 
 
-def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: ClosureCriteria) -> Mask:
+def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable) -> Mask:
     """Whether a relation connects two visits, not two moments of one visit: shape (R,), for rows and stamps (R, 2)."""
     across = poses.robots[ends[:, 0]] != poses.robots[ends[:, 1]]
-    least_s = np.where(across, ACROSS_ROBOTS_GAP_S, criteria.within_gap_s)
+    least_s = np.where(across, ACROSS_ROBOTS_GAP_S, WITHIN_GAP_S)
     longer: Mask = np.abs(stamps[:, 1] - stamps[:, 0]) > least_s
     return longer
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fcslam.lab.evaluation.fleet.closure_stages import FleetClosures, score_closures
 from fcslam.lab.evaluation.fleet.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
-from fcslam.metrics.closures import ClosureCriteria, Mask
+from fcslam.metrics.closures import WRONG_DEG, WRONG_M, Mask
 from fcslam.metrics.grid import GridAgreement, grid_agreement
 from fcslam.metrics.relations import RelationErrors
 from fcslam.metrics.trajectory import (
@@ -57,9 +57,10 @@ class Join:
     rotation_deg: float
     """Relative error of both robots, rotation."""
 
-    def is_false(self, criteria: ClosureCriteria) -> bool:
+    @property
+    def is_false(self) -> bool:
         """Whether the relative error exceeds the thresholds of a wrong closure, or cannot be measured (NaN)."""
-        return not (self.translation_m <= criteria.wrong_m and self.rotation_deg <= criteria.wrong_deg)
+        return not (self.translation_m <= WRONG_M and self.rotation_deg <= WRONG_DEG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,6 @@ class FleetReport:
 
     truth: Path
     """Folder of the ground truth."""
-    criteria: ClosureCriteria
     robots: tuple[RobotScore, ...]
     maps: int
     joins: tuple[Join, ...]
@@ -93,7 +93,7 @@ class FleetReport:
     @property
     def false_joins(self) -> tuple[Join, ...]:
         """Joins with a relative error above the thresholds, or without one."""
-        return tuple(join for join in self.joins if join.is_false(self.criteria))
+        return tuple(join for join in self.joins if join.is_false)
 
 
 def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
@@ -102,20 +102,19 @@ def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
     Raises:
         EvaluationError: the run or a robot's truth is missing or cannot be read, or they are of different recordings.
     """
-    opened, folder, criteria = open_run(run), truth_folder(run, truth), ClosureCriteria()
+    opened, folder = open_run(run), truth_folder(run, truth)
     known = known_poses(opened, folder)
     alignments = {k: align(*_poses(known, known.estimate.maps == k)) for k in np.unique(known.estimate.maps).tolist()}
     rng = np.random.default_rng(0)
     figures = {name: metric.value for name, metric in opened.metrics.items()}
     return FleetReport(
         truth=folder,
-        criteria=criteria,
         robots=_robot_scores(opened, known, alignments, figures),
         maps=len(alignments),
         joins=_joins(opened, known),
         within=relative_errors(near_pairs(known.truth, rng, across_robots=False), known.truth, known.estimate),
         across=relative_errors(near_pairs(known.truth, rng, across_robots=True), known.truth, known.estimate),
-        closures=score_closures(opened, known, criteria),
+        closures=score_closures(opened, known),
         agreement=_agreement(run, folder, alignments),
         places={channel: _place_traffic(channel, figures) for channel in PLACE_CHANNELS},
     )

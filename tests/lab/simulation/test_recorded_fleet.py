@@ -1,0 +1,60 @@
+"""A fleet on disk: two simulations give the same bytes; a folder in use and a full disk are one line each."""
+
+import resource
+from pathlib import Path
+
+import pytest
+
+from fcslam.cli import main
+from fcslam.sources import open_source
+
+COMMAND = [
+    "tools",
+    "simulate",
+    "--building",
+    "flat",
+    "--path-length",
+    "4",
+    "--robots",
+    "2",
+    "--no-camera",
+    "--seed",
+    "2",
+]
+
+
+def files(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+def test_the_same_command_writes_the_same_bytes_and_no_folder_twice(tmp_path, capsys):
+    for name in ("one", "two"):
+        assert main([*COMMAND, "--output", str(tmp_path / name)]) == 0
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+    assert main([*COMMAND, "--output", str(tmp_path / "one")]) == 2
+    assert "is not empty; choose another place" in capsys.readouterr().err
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path, capsys):
+    (tmp_path / "notes").write_text("mine")
+    assert main([*COMMAND, "--output", str(tmp_path)]) == 2
+    assert "is not empty; choose another place" in capsys.readouterr().err
+    assert files(tmp_path) == {Path("notes"): b"mine"}
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_can_be_read(tmp_path, capsys):
+    """A limit on file sizes stands for the disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        code = main([*COMMAND, "--output", str(tmp_path / "full")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "cannot be written (File too large)" in line
+    source = open_source(tmp_path / "full" / "robot_1")
+    assert source.survey().scan_count > 10
+    assert not source.faults
