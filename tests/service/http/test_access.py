@@ -14,6 +14,7 @@ from tests.service.http.desk import A, Desk, put_detector
 
 OPEN = {"/healthz", "/readyz", "/openapi.json"}
 VALUES = {
+    "layer": "changes",
     "number": 1,
     "robot": "a", "k": "0", "suffix": "png", "z": "0", "x": "0", "y": "0", "session": "a", "name": "mission",
     "channel": "camera", "version": "v1", "epoch": 0, "robot_i": "a", "stamp_i": "1.5", "robot_j": "b", "stamp_j": "2",
