@@ -9,7 +9,7 @@ export const fleet = {
   trails: new Map(), until: Infinity, // the moment that the map shows: paths and evidence until then
   selected: null, scan: null, readOnly: false, mayEdit: false, readAt: 0,
 };
-let release = null;
+let release = null, placedNow = null; // the closures that were placed last
 
 export const robotNamed = (session) => fleet.robots.find((r) => r.session === session);
 export const colourOf = (session) => robotNamed(session)?.color ?? "#777777";
@@ -59,9 +59,11 @@ export async function update(forget) {
     [certificate, json("maps"), json("separations"), json("robots"), listedClosures("accepted"), json("edits")]);
   if (fleet.mission !== null && counts.mission !== fleet.mission) { received.clear(); forget(); }
   const seen = robots.filter((r) => r.map !== null), paths = await Promise.all(seen.map((r) => trail(r.session)));
+  const isPlaced = closed === placedNow && seen.length === fleet.trails.size && seen.every((r, i) => paths[i] === fleet.trails.get(r.session) && r.map === robotNamed(r.session)?.map);
   Object.assign(fleet, { counts, mission: counts.mission, maps, separations, quality, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
   fleet.trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
-  fleet.accepted = closed.map(placed);
+  if (!isPlaced) fleet.accepted = closed.map(placed);
+  placedNow = closed;
   fleet.regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
   const contested = ["rejected", "revoked"].filter((status) => counts.metrics[`inter_robot_closures_${status}`]);
   fleet.contradicted = (await Promise.all(contested.map(closures))).flat();
