@@ -45,10 +45,12 @@ def test_every_target_reads_some_inputs_and_refuses_others(target, tmp_path):
     if target == "federated":
         pytest.importorskip("torch", reason="needs fcslam[federated]")
         pytest.importorskip("flwr", reason="needs fcslam[federated]")
-    with TARGETS[target](tmp_path) as one:
-        outcomes = (one(random.Random(f"{target} {number}")) for number in range(150))
+    with TARGETS[target](tmp_path) as opened:
+        outcomes = (opened.attempt(random.Random(f"{target} {number}")) for number in range(150))
         first = next(outcomes)
         assert any(outcome is not first for outcome in outcomes)
+        for seed in opened.seeds:
+            opened.read(seed)
 
 
 def test_an_exception_is_a_finding_with_the_command_that_repeats_it(fuzz, tmp_path, monkeypatch):
