@@ -224,7 +224,7 @@ def fuzz_by_coverage(outcome: Outcome, seed: int, seconds: float, folder: Path, 
     compiled = [
         ".".join(path.relative_to(package.parent).with_suffix("").parts)
         for path in package.rglob("*.py")
-        if "@njit" in path.read_text(encoding="utf-8")
+        if "njit" in path.read_text(encoding="utf-8")
     ]
     (corpus := folder / "corpus").mkdir()
     kept: set[str] = set()
@@ -235,6 +235,7 @@ def fuzz_by_coverage(outcome: Outcome, seed: int, seconds: float, folder: Path, 
 
         for number, seed_input in enumerate(made.seeds):
             (corpus / str(number)).write_bytes(seed_input)
+            made.read(seed_input)  # compiles
         judge = Judge(outcome, folder, counter)
 
         def one(data: bytes) -> None:

@@ -126,7 +126,7 @@ def bags(folder: Path) -> Iterator[Target]:
 def _recordings(folder: Path, names: Sequence[str]) -> Target:
     laser = LaserModel(181, -np.pi / 2, np.pi / 180, 50.0, (0.1, 0.0, 0.0))
     scans = [
-        LaserScan(100 + 0.2 * k, frozen(np.full(181, 2.0 + k), np.float32), laser, frozen((0.1 * k, 0.0, 0.01 * k)))
+        LaserScan(100 + 0.2 * k, frozen(np.full(181, 2.25 + k), np.float32), laser, frozen((0.1 * k, 0.0, 0.01 * k)))
         for k in range(12)
     ]
     (valid := folder / "valid").mkdir()
