@@ -1,15 +1,19 @@
 """Twelve hours of a service and five robots in fast motion: memory, files and database, hour by hour.
 
-    python benchmarks/soak.py [--hours 12] [--robots 5] [--rate 5] [--minutes 60]
+    python benchmarks/soak.py [--hours 12] [--robots 5] [--rate 5] [--minutes 60] [--patrol 15]
 
 Simulated robots (LiDAR, 180 beams) map one building with `fcslam serve`, each in a process of its own, up to 60 times
-as fast as in reality. In the first hour, each drives 40 m. In every further hour, it drives 5 m back and forth and then
-stands, as between two tasks; its LiDAR always scans. After every simulated minute, all of its connections break.
+as fast as in reality. In the first hour, each drives 40 m and four patrols: 5 m back and forth. In every further hour
+it drives one patrol. Then it stands, as between two tasks; its LiDAR always scans. After every simulated minute, all of
+its connections break.
 
-An hour ends when each robot has drawn its map and every packet has had its effect. Then the script reads the resident
-memory of each process (PSS, which counts shared pages once), its open files, and the size of the mission's database.
-The service's worker and the robots' back ends are processes of their own. A mission keeps all packets; the table shows
-what the database holds beside their bytes, and its write-ahead log. The report is written anew after each hour.
+An hour ends when each robot has drawn its map and every packet has had its effect. Then the script reads the memory of
+each process: resident, without what it shares with a process that it forked, and whatever other programs run. It counts
+open files, and reads the size of the mission's database. The service's worker and the robots' back ends are processes
+of their own. A mission keeps all packets; the table shows what the database holds beside their bytes, and its
+write-ahead log. The report is written anew after each hour.
+
+With `--patrol 0`, the robots stand from the second hour on: then nothing at all may grow, as no map does.
 
 Passed: from the first hour to the last, no process grows by more than 5 %, none has more open files by more than
 three, and the database holds at most 500 bytes more for each further packet beside the packet itself.
@@ -36,7 +40,7 @@ from fcslam.service.missions import FIRST
 
 MINUTE_S, LEAST_WALL_S = 60.0, 1.0
 """A simulated minute takes at least a second."""
-PATH_M, PATROL_S = 40.0, 15.0
+PATH_M, FIRST_PATROLS = 40.0, 4
 NOISE_M = 0.01
 MOST_GROWTH, MORE_FILES, MOST_BESIDE = 0.05, 3, 500.0
 KINDS = ("service", "worker", "robots", "back ends")
@@ -94,6 +98,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=5)
     parser.add_argument("--rate", type=float, default=5.0, help="of the LiDARs, Hz")
     parser.add_argument("--minutes", type=int, default=60, help="of an hour, for a short try")
+    parser.add_argument("--patrol", type=float, default=15.0, help="seconds that a robot drives there, and back")
     chosen = parser.parse_args()
     spawning = multiprocessing.get_context("spawn")
     began, rows, processes = time.perf_counter(), [], []
@@ -146,13 +151,14 @@ def scans_an_hour(chosen: Any) -> int:
 def run_robot(number: int, drive: Drive, chosen: Any, port: int, folder: str, minutes: Any, hour: Any) -> None:
     """Drive for hours."""
     rng, end = np.random.default_rng(number), len(drive.ranges_m) - 1
-    away = range(end, max(0, end - round(PATROL_S * chosen.rate)), -1)
+    away = range(end, max(0, end - round(chosen.patrol * chosen.rate)), -1)
     name = f"robot_{number + 1}"
     with fcslam.Robot(name, drive.laser, server=f"http://127.0.0.1:{port}", state=Path(folder) / name) as robot:
         began = time.monotonic()
         for count in range(chosen.hours * scans_an_hour(chosen)):
             begun, step = divmod(count, scans_an_hour(chosen))
-            way = (*away, *reversed(away)) if begun else range(end + 1)
+            patrol = (*away, *reversed(away))
+            way = patrol if begun else (*range(end + 1), *FIRST_PATROLS * patrol)
             index = way[step] if step < len(way) else end
             noise = rng.normal(0.0, NOISE_M, drive.ranges_m.shape[1])
             robot.add_scan(drive.ranges_m[index] + noise, 1000.0 + count / chosen.rate, drive.T_odom_base[index])
@@ -216,9 +222,10 @@ def children(pid: int) -> list[int]:
 
 
 def usage(pid: int) -> tuple[float, int]:
-    lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
-    kb = next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-    return kb * 1024 / 1e6, len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]
+    kb = {key: int(value.split()[0]) for key, value in (line.split(":") for line in lines)}
+    resident = kb["Rss"] - kb["Anonymous"] + kb["Pss_Anon"]
+    return resident * 1024 / 1e6, len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def sums(found: Mapping[str, tuple[float, int]]) -> list[float]:
@@ -241,8 +248,11 @@ def stored(folder: Path) -> tuple[int, float, float, float]:
 
 def write(chosen: Any, rows: Sequence[tuple], processes: Sequence[Mapping[str, tuple[float, int]]]) -> bool:
     """The report of the hours so far, and whether they passed."""
-    report = common.Report(__file__, __doc__, chosen)
-    report.say(f"{len(rows)} of {chosen.hours} hours, {chosen.robots} robots, {chosen.rate:g} scans a second.")
+    report = common.Report(__file__ if chosen.patrol else "soak_standing", __doc__, chosen)
+    report.say(
+        f"{len(rows)} of {chosen.hours} hours of {chosen.minutes} min, {chosen.robots} robots, "
+        f"{chosen.rate:g} scans a second, patrols of {chosen.patrol:g} s."
+    )
     report.table("Hours", HOURS, rows)
     growth = []
     for name, (first, files) in processes[0].items():

@@ -84,7 +84,7 @@ def ros2_reader(path: Path, suffix: str) -> Any:
         check_metadata(path)
         return rosbag2.Reader(path)
     # rosbags puts the path of a database into a URI as it is
-    return rosbag2.Reader.STORAGE_PLUGINS[suffix](Path(quote(str(path))) if suffix == ".db3" else path)
+    return rosbag2.Reader.STORAGE_PLUGINS[suffix](Path(quote(os.fsencode(path))) if suffix == ".db3" else path)
 
 
 def check_metadata(folder: Path) -> None:
