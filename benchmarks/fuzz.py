@@ -236,7 +236,7 @@ def fuzz_by_coverage(outcome: Outcome, seed: int, seconds: float, folder: Path, 
         for number, seed_input in enumerate(made.seeds):
             (corpus / str(number)).write_bytes(seed_input)
             made.read(seed_input)  # compiles
-        judge = Judge(outcome, folder, counter)
+        judge = Judge(outcome, folder, counter, GRACE_S)  # a new branch may have to be compiled
 
         def one(data: bytes) -> None:
             nonlocal written_s
@@ -259,7 +259,8 @@ def fuzz_by_coverage(outcome: Outcome, seed: int, seconds: float, folder: Path, 
 class Judge:
     """Reads inputs and notes what must not happen."""
 
-    def __init__(self, outcome: Outcome, folder: Path, counter: mmap.mmap) -> None:
+    def __init__(self, outcome: Outcome, folder: Path, counter: mmap.mmap, patience_s: float = LONGEST_S) -> None:
+        self._patience_s = patience_s
         self._outcome, self._folder, self._counter = outcome, folder, counter
         self._outside: list[str] = []
         self._armed, self._early_bytes = 0.0, 0
@@ -268,7 +269,7 @@ class Judge:
         """Read one input; ``known`` holds the places of exceptions that count once."""
         outcome, now = self._outcome, time.monotonic()
         if now > self._armed + 1.0:  # arming starts a thread, which takes longer than reading a packet
-            faulthandler.dump_traceback_later(LONGEST_S, exit=True)
+            faulthandler.dump_traceback_later(self._patience_s, exit=True)
             self._armed = now
         if outcome.inputs == WARM_UP:
             self._early_bytes = resident_bytes()
