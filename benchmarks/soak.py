@@ -115,7 +115,7 @@ def main() -> None:
             stack.callback(robot.kill)
         for number in range(1, chosen.hours + 1):
             watch(robots, links, minutes, hour)
-            settle(port)
+            settle(port, server.process.pid)
             pids = {"service": server.process.pid, **{f"robot {k + 1}": each.pid for k, each in enumerate(robots)}}
             processes.append(measured(pids))
             rows.append((
@@ -191,16 +191,15 @@ def watch(robots: Sequence[Any], links: Sequence[Link], minutes: Any, hour: Any)
     hour.wait(PATIENCE_S)
 
 
-def settle(port: int) -> None:
-    """Wait until every packet has had its effect, and what waits for a second is done."""
+def settle(port: int, service: int) -> None:
+    """Wait until every packet has had its effect, and the worker runs no task in a copy of itself."""
     import httpx
 
     until = time.monotonic() + PATIENCE_S
-    while httpx.get(f"http://127.0.0.1:{port}/readyz").json().get("backlog") != 0:
+    while httpx.get(f"http://127.0.0.1:{port}/readyz").json().get("backlog") != 0 or len(children(service)) > 1:
         if time.monotonic() > until:
             sys.exit("the service does not catch up")
         time.sleep(0.2)
-    time.sleep(2.0)
 
 
 def measured(pids: Mapping[str, int]) -> dict[str, tuple[float, int]]:
