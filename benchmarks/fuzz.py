@@ -141,7 +141,7 @@ def outcome_of(target: str, seed: int, seconds: float, coverage: bool) -> Outcom
                 command, capture_output=True, text=True, errors="replace", check=False,
                 timeout=seconds + LONGEST_S + GRACE_S,
             )  # fmt: skip
-            fate, words = f"the process ended with {ended.returncode}", ended.stderr[-3000:]
+            fate, words = f"the process ended with {ended.returncode}", ended.stdout[-2000:] + ended.stderr[-2000:]
             sites = SITES.findall(ended.stderr)
             is_whole = not coverage or (ended.returncode == 0 and bool(sites))
         except subprocess.TimeoutExpired as late:
