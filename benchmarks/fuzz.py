@@ -252,7 +252,7 @@ def fuzz_by_coverage(outcome: Outcome, seed: int, seconds: float, folder: Path, 
                 written_s = time.monotonic()
 
         limits = (f"-max_total_time={seconds:.0f}", f"-seed={seed % 2**31 + 1}", "-max_len=200000", "-rss_limit_mb=0")
-        atheris.Setup([sys.argv[0], *limits, "-timeout=0", "-detect_leaks=0", str(corpus)], one)
+        atheris.Setup([sys.argv[0], *limits, f"-timeout={GRACE_S:.0f}", "-detect_leaks=0", str(corpus)], one)
         atheris.Fuzz()
 
 
