@@ -296,6 +296,7 @@ class Judge:
                 trouble = f"{outcome.grew_bytes / 1e6:.0f} MB more than at the start"
         if trouble is not None:
             outcome.findings.append(f"{trouble}\n{how()}")
+            self._outside.clear()  # where a finding is kept
         outcome.inputs += 1
 
 

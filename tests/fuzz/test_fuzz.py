@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from fcslam.config import one_line, parse_yaml
-from fcslam.errors import ConfigError
+from fcslam.errors import ConfigError, SourceError
+from fcslam.mission.localization import read_map
 from tests.fuzz.mutations import mutate
 from tests.fuzz.targets import TARGETS, attempt
 
@@ -85,3 +86,10 @@ def test_yaml_that_its_parser_fails_on_is_refused_in_a_line(text):
         parse_yaml(text)
     assert "\n" not in str(refused.value)
     assert one_line("a\nb") == "a b"
+
+
+def test_the_image_of_a_map_in_the_home_of_nobody_is_one_line(tmp_path):
+    """Found by coverage."""
+    (tmp_path / "map.yaml").write_text("image: ~nobody-of-this-name/map.pgm\n")
+    with pytest.raises(SourceError, match="no map can be read"):
+        read_map(tmp_path / "map.yaml")
