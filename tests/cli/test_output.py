@@ -75,7 +75,7 @@ def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, 
 @pytest.mark.parametrize(
     "command",
     [
-        "map {log} -o /sys/run", 
+        "map {log} -o /sys/run",
         "tools simulate --robots 1 -o /sys/fleet", "serve --data /sys/data --port 0",
         "play {log} --server http://127.0.0.1:1 --state /sys/state",
     ],
