@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.cli import main
+from fcslam.cli import BAD_INPUT, main
 from fcslam.cli.output import new_folder
 from tests.sources.carmen_text import drive, flaser, pose_at, save
 
@@ -69,3 +69,20 @@ def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, 
     assert after[1:] == [f"map: {path}" for path in pictures]
     assert main(["map", *logs, "-o", str(tmp_path / "alone"), "--quiet", "-c", "fleet.join_maps=false"]) == 0
     assert "2 maps: one for each robot" in capsys.readouterr().out
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize(
+    "command",
+    [
+        "map {log} -o /sys/run",
+        "tools simulate --robots 1 -o /sys/fleet", "serve --data /sys/data --port 0",
+        "play {log} --server http://127.0.0.1:1 --state /sys/state",
+    ],
+)  # fmt: skip
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, capsys, command):
+    """Nobody makes a file in /sys, the administrator neither."""
+    log = save(tmp_path / "robot.log", drive(40))
+    assert main(command.format(log=log).split()) == BAD_INPUT
+    *_, line = capsys.readouterr().err.splitlines()
+    assert line.startswith("fcslam: /sys/")

@@ -3,13 +3,14 @@
 import json
 import random
 import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import cv2
 import numpy as np
 
 from fcslam.cloud.settings import CloudConfig
@@ -37,6 +38,7 @@ from fcslam.records import (
 from fcslam.service.detectors import DetectorStore
 from fcslam.sources import open_source, write_bag, write_carmen, write_recording
 from fcslam.storage.database import seal
+from fcslam.untrusted import STEPS, step_counter
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch
 from fcslam.wire.packets import decode, encode, read_label
 from tests.fuzz.mutations import NUMBERS, TOKENS, mutate
@@ -63,6 +65,16 @@ Attempt = Callable[[random.Random], bool]
 """Breaks one input and reads it: whether it could be read. Raises AssertionError or anything else for a finding."""
 
 
+class Target(NamedTuple):
+    """What is fuzzed."""
+
+    attempt: Attempt
+    read: Callable[[bytes], Any] | None = None
+    """Reads one input, for a fuzzer that makes inputs by coverage; None if there is no one file or message."""
+    seeds: tuple[bytes, ...] = ()
+    """Valid inputs of ``read``."""
+
+
 def attempt(read: Callable[[], Any]) -> bool:
     """Whether something could be read; a refusal must be words on a line."""
     try:
@@ -76,7 +88,7 @@ def attempt(read: Callable[[], Any]) -> bool:
 
 
 @contextmanager
-def packets(_: Path) -> Iterator[Attempt]:
+def packets(_: Path) -> Iterator[Target]:
     """One packet or a batch of them: what is read can be sent on and says the same."""
     corpus, names = list(packets_of_every_kind(random.Random(0))), list(BREAKERS)
 
@@ -96,23 +108,35 @@ def packets(_: Path) -> Iterator[Attempt]:
             return attempt(lambda: read_batch(mutate(rng, batch, corpus)))
         return attempt(lambda: read(data))
 
-    yield one
+    yield Target(one, read, tuple(corpus))
 
 
 @contextmanager
-def recordings(folder: Path) -> Iterator[Attempt]:
-    """CARMEN logs, ROS bags and recording folders: surveyed and read to the end."""
+def logs(folder: Path) -> Iterator[Target]:
+    """CARMEN logs: surveyed and read to the end."""
+    yield _recordings(folder, ("log.clf", "log.clf.gz", "log.clf.xz", "log.clf.bz2"))
+
+
+@contextmanager
+def bags(folder: Path) -> Iterator[Target]:
+    """ROS bags and recording folders: surveyed and read to the end."""
+    yield _recordings(folder, ("bag.bag", "bag.mcap", "bag.db3", "bag", "recording.fcslam"))
+
+
+def _recordings(folder: Path, names: Sequence[str]) -> Target:
     laser = LaserModel(181, -np.pi / 2, np.pi / 180, 50.0, (0.1, 0.0, 0.0))
     scans = [
-        LaserScan(100 + 0.2 * k, frozen(np.full(181, 2.0 + k), np.float32), laser, frozen((0.1 * k, 0.0, 0.01 * k)))
+        LaserScan(100 + 0.2 * k, frozen(np.full(181, 2.25 + k), np.float32), laser, frozen((0.1 * k, 0.0, 0.01 * k)))
         for k in range(12)
     ]
     (valid := folder / "valid").mkdir()
-    for name in ("log.clf", "log.clf.gz", "log.clf.xz", "log.clf.bz2"):
-        write_carmen(valid / name, scans)
-    for name in ("bag.bag", "bag.mcap", "bag.db3", "bag"):
-        write_bag(valid / name, scans)
-    write_recording(valid / "recording.fcslam", [laser], None, scans)
+    for name in names:
+        if name.startswith("log"):
+            write_carmen(valid / name, scans)
+        elif name.startswith("bag"):
+            write_bag(valid / name, scans)
+        else:
+            write_recording(valid / name, [laser], None, scans)
     corpus = _contents(valid)
 
     def read(path: Path) -> None:
@@ -126,11 +150,15 @@ def recordings(folder: Path) -> Iterator[Attempt]:
         path = _broken_copy(rng, folder / f"broken-{chosen}", corpus[chosen])
         return attempt(lambda: read(path))
 
-    yield one
+    def read_bytes(data: bytes) -> None:
+        (path := folder / "file").write_bytes(data)
+        read(path)
+
+    return Target(one, read_bytes, tuple(files["."] for files in corpus.values() if "." in files))
 
 
 @contextmanager
-def imports(folder: Path) -> Iterator[Attempt]:
+def imports(folder: Path) -> Iterator[Target]:
     """Mission files, with valid seals too, and networks: checked, opened and read."""
     whole = folder / "valid.sqlite"
     with closing(MissionStore(folder / "first.sqlite")) as store:
@@ -167,11 +195,18 @@ def imports(folder: Path) -> Iterator[Attempt]:
             path.write_bytes(mutate(rng, mission, [network]))
         return attempt(read_mission)
 
-    yield one
+    def read(data: bytes) -> None:
+        for old in (*folder.glob(f"{path.name}*"), folder / "again.sqlite"):
+            old.unlink(missing_ok=True)
+        path.write_bytes(data)
+        _seal(path)
+        read_mission()
+
+    yield Target(one, read, (mission,))
 
 
 @contextmanager
-def configuration(folder: Path) -> Iterator[Attempt]:
+def configuration(folder: Path) -> Iterator[Target]:
     """Settings files."""
     corpus = [dump(MissionConfig()).encode(), b"seed: 3\nrobot:\n  channels: [lidar]\n", b"{}\n"]
     path = folder / "config.yaml"
@@ -180,11 +215,11 @@ def configuration(folder: Path) -> Iterator[Attempt]:
         path.write_bytes(mutate(rng, rng.choice(corpus), corpus))
         return attempt(lambda: load(MissionConfig, path))
 
-    yield one
+    yield Target(one)
 
 
 @contextmanager
-def maps(folder: Path) -> Iterator[Attempt]:
+def maps(folder: Path) -> Iterator[Target]:
     """Maps of map_server: the description and the image."""
     description = (
         b"image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.5, 2.0, 0.0]\nnegate: 0\n"
@@ -201,11 +236,18 @@ def maps(folder: Path) -> Iterator[Attempt]:
             (folder / name).write_bytes(content)
         return attempt(lambda: read_map(folder / "map.yaml"))
 
-    yield one
+    def read(data: bytes) -> None:
+        parts = data.partition(b"\0\0")
+        (folder / "map.yaml").write_bytes(parts[0])
+        (folder / "map.pgm").write_bytes(parts[2])
+        read_map(folder / "map.yaml")
+
+    _, png = cv2.imencode(".png", np.arange(240, dtype=np.uint8).reshape(12, 20))
+    yield Target(one, read, tuple(description + b"\0\0" + each for each in (image, png.tobytes())))
 
 
 @contextmanager
-def federated(_: Path) -> Iterator[Attempt]:
+def federated(_: Path) -> Iterator[Target]:
     """Replies of robots to the server, as bytes, and the server's requests to a robot."""
     from fcslam.learning.federated.codec import GlobalModel, weights_to_record
     from fcslam.learning.federated.flower import (
@@ -251,11 +293,11 @@ def federated(_: Path) -> Iterator[Attempt]:
         assert all(np.isfinite(array).all() for weights in kept for array in weights.values())
         return attempt(lambda: read_request(order.content)) if order.has_content() else bool(found.weights)
 
-    yield one
+    yield Target(one)
 
 
 @contextmanager
-def http(folder: Path) -> Iterator[Attempt]:
+def http(folder: Path) -> Iterator[Target]:
     """Requests to the service by its own description: no answer is an internal error."""
     from tests.service.http.desk import A, B, Desk
 
@@ -299,11 +341,11 @@ def http(folder: Path) -> Iterator[Attempt]:
             assert status < 500 or status in (503, 507), f"{method} {path} {query} as {as_}: {status} {text!r}"
             return status < 400
 
-        yield one
+        yield Target(one)
 
 
 TARGETS: dict[str, Callable[[Path], Any]] = {
-    each.__name__: each for each in (packets, imports, recordings, http, federated, configuration, maps)
+    each.__name__: each for each in (packets, imports, logs, bags, http, federated, configuration, maps)
 }
 
 
@@ -335,6 +377,17 @@ def _fill(store: MissionStore) -> None:
     for content in EDITS:
         store.edit(content, "boss", 2.0)
     store.ask_to_finalize()
+
+
+def _seal(path: Path) -> None:
+    """Seal every row of a mission, as who writes the file can do it."""
+    with suppress(sqlite3.Error, UnicodeError, OverflowError), closing(sqlite3.connect(path)) as opened:
+        opened.set_progress_handler(step_counter(path.stat().st_size), STEPS)
+        opened.create_function("seal", -1, seal, deterministic=True)
+        for name in ("packets", "edits", "finalizations", "facts"):
+            columns = [row[1] for row in opened.execute(f"PRAGMA table_info({name})")][:-1]
+            opened.execute(f"UPDATE {name} SET seal = seal('{name}', {', '.join(columns)})")
+        opened.commit()
 
 
 def _change_cell(rng: random.Random, path: Path) -> None:

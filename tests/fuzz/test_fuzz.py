@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from fcslam.config import one_line, parse_yaml
-from fcslam.errors import ConfigError
+from fcslam.errors import ConfigError, SourceError
+from fcslam.mission.localization import read_map
 from tests.fuzz.mutations import mutate
 from tests.fuzz.targets import TARGETS, attempt
 
@@ -45,10 +46,12 @@ def test_every_target_reads_some_inputs_and_refuses_others(target, tmp_path):
     if target == "federated":
         pytest.importorskip("torch", reason="needs fcslam[federated]")
         pytest.importorskip("flwr", reason="needs fcslam[federated]")
-    with TARGETS[target](tmp_path) as one:
-        outcomes = (one(random.Random(f"{target} {number}")) for number in range(150))
+    with TARGETS[target](tmp_path) as opened:
+        outcomes = (opened.attempt(random.Random(f"{target} {number}")) for number in range(150))
         first = next(outcomes)
         assert any(outcome is not first for outcome in outcomes)
+        for seed in opened.seeds:
+            opened.read(seed)
 
 
 def test_an_exception_is_a_finding_with_the_command_that_repeats_it(fuzz, tmp_path, monkeypatch):
@@ -83,3 +86,10 @@ def test_yaml_that_its_parser_fails_on_is_refused_in_a_line(text):
         parse_yaml(text)
     assert "\n" not in str(refused.value)
     assert one_line("a\nb") == "a b"
+
+
+def test_the_image_of_a_map_in_the_home_of_nobody_is_one_line(tmp_path):
+    """Found by coverage."""
+    (tmp_path / "map.yaml").write_text("image: ~nobody-of-this-name/map.pgm\n")
+    with pytest.raises(SourceError, match="no map can be read"):
+        read_map(tmp_path / "map.yaml")

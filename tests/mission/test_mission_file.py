@@ -1,5 +1,6 @@
 """A mission that goes on from its file is the mission of all recordings at once, byte for byte."""
 
+import multiprocessing
 import os
 import shutil
 import sqlite3
@@ -14,6 +15,7 @@ import fcslam
 from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import EditError, SourceError
+from fcslam.mission.localization import read_map
 from fcslam.mission.mission import MissionCloud
 from fcslam.mission.mission_file import edit_mission, mission_bytes, read_mission
 from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
@@ -109,6 +111,43 @@ def test_the_state_of_another_user_is_not_read(begun, resumed, tmp_path, monkeyp
     fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
     assert resumed == [False, False]
     assert not (tmp_path / "again" / "mission.state").exists()
+
+
+@pytest.mark.attack
+def test_killed_while_it_goes_on_a_mission_is_as_before_or_the_next(logs, whole, begun, tmp_path):
+    """SIGKILL, while the run folder replaces the one that it goes on from."""
+    run, before = copied(begun, tmp_path / "run"), contents(begun)
+    for after_s in (0.05, 0.3, 0.6):
+        arguments = {"recordings": logs[2:], "onto": run, "output": run, "force": True}
+        process = multiprocessing.get_context("fork").Process(target=fcslam.map_recordings, kwargs=arguments)
+        process.start()
+        process.join(after_s)
+        process.kill()
+        process.join()
+        assert contents(run) == (contents(whole) if process.exitcode == 0 else before)
+        if process.exitcode == 0:
+            run = copied(begun, tmp_path / f"{after_s}")
+    fcslam.map_recordings(logs[2:], onto=run, output=run, force=True)
+    assert contents(run) == contents(whole)
+
+
+@pytest.mark.attack
+def test_names_of_folders_that_are_no_utf8_are_names(begun, tmp_path):
+    run = copied(begun, tmp_path / os.fsdecode(b"run \xff"))
+    assert open_run(run).pose_graph_g2o == open_run(begun).pose_graph_g2o
+    assert read_mission(run / "mission.fcslam").edits == read_mission(begun).edits
+    assert read_map(run).cells.tobytes() == read_map(begun).cells.tobytes()
+    fcslam.map_recordings([], onto=run, output=tmp_path / os.fsdecode(b"\xfe"))
+    assert contents(tmp_path / os.fsdecode(b"\xfe")) == contents(begun)
+
+
+@pytest.mark.attack
+def test_a_state_beyond_the_limit_is_not_read(begun, resumed, tmp_path):
+    """A file with a hole, of 3 GB."""
+    run = copied(begun, tmp_path / "run")
+    os.truncate(run / "mission.state", 3 << 30)
+    fcslam.map_recordings([], onto=run)
+    assert resumed == [False]
 
 
 def test_a_state_counts_only_if_nothing_but_the_packets_changed(logs, begun, resumed, tmp_path):

@@ -1,16 +1,20 @@
 """Messages of a live robot become the records of a bag."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from fcslam.errors import NetworkError
 from fcslam.records import CameraImage, GnssFix
+from fcslam.robot.mapped_scans import MappedScans
 from fcslam.ros import sensors
-from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
+from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, STEPS_BACK_FOR_RESTART, LiveSensors
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
 from fcslam.sources.faults import Fault
+from fcslam.wire.limits import MAXIMUM_BEAMS
 from tests.ros.ros_messages import (
     CODEC,
     KINDS,
@@ -466,3 +470,84 @@ def test_a_fix_of_satellite_navigation_has_the_antenna_that_tf_says():
     assert found[0].antenna_xy == pytest.approx((-0.3, 0.2))
     assert robot.sensors.audit.faults()[Fault.FIX_AT_ZERO].count == 1
     assert robot.sensors.audit.faults()[Fault.BROKEN_MESSAGE].count == 1
+
+
+def turned(message, **numbers):
+    """A transform with other numbers in its rotation."""
+    for name, value in numbers.items():
+        setattr(message.transforms[0].transform.rotation, name, value)
+    return message
+
+
+NAN = float("nan")
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("rotation", [dict.fromkeys("xyzw", NAN), {"w": 0.0, "z": 0.0}, {"w": np.inf}, {"z": 1e308}])
+def test_a_mounting_that_is_no_rotation_is_told_and_the_right_one_counts(rotation):
+    robot = Robot().hears("/tf_static", turned(transform(0.0, "base_link", "laser", (0.2, 0.0, 0.0)), **rotation))
+    robot.drives(np.arange(1.0, 9.0))
+    assert robot.said == ["/tf_static: broken messages skipped"]
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser")).drives(np.arange(9.0, 15.0))
+    assert robot.stamps == list(np.arange(1.0, 15.0))
+
+
+@pytest.mark.attack
+def test_odometry_that_is_no_pose_is_told_and_left_out(robot):
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (NAN, 0.0, 0.0))).drives([stamp])
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    assert [record.T_odom_base[0] for record in robot.records] == robot.stamps
+    assert robot.said == ["/odom: broken messages skipped"]
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("frames", [("laser", "laser"), ("a", "laser", "a"), ("laser", "a", "b", "laser")])
+def test_frames_in_a_loop_are_no_mounting(frames):
+    robot = Robot()
+    for parent, child in itertools.pairwise(frames):
+        robot.hears("/tf_static", transform(0.0, parent, child))
+    robot.drives(np.arange(1.0, 9.0)).waits(PATIENCE_S + 1.0)
+    (line,) = robot.said
+    assert "no transform from 'base_link' to 'laser'" in line
+
+
+@pytest.mark.attack
+def test_of_a_million_ranges_no_more_are_mapped_than_a_packet_holds(robot):
+    million = np.full(1_000_000, 5.0)
+    robot.drives(np.arange(1.0, 7.0)).hears("/scan", scan(7.0, million, increment=1e-6)).drives([8.0])
+    assert robot.stamps == [*np.arange(1.0, 7.0), 8.0]  # another laser than the first scans'
+    dense = Robot().hears("/tf_static", transform(0.0, "base_link", "laser"))
+    for stamp in np.arange(1.0, 7.0):
+        dense.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0))).hears("/scan", scan(stamp, million, increment=3e-6))
+    (mapped, *_) = [MappedScans().of(record) for record in dense.records]
+    assert mapped.laser.beam_count == len(mapped.ranges_m) <= MAXIMUM_BEAMS
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("ahead_s", [3.0, 3600.0, 2e9])
+def test_a_scan_from_the_future_costs_no_scan_after_it(robot, ahead_s):
+    robot.drives(np.arange(100.0, 106.0)).drives([106.0], ahead_s).drives(np.arange(106.0, 120.0))
+    assert robot.stamps[-14:] == list(np.arange(106.0, 120.0))
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("offset_s", [3600.0, -3600.0])
+def test_a_clock_that_jumps_by_an_hour_and_back_costs_a_few_scans(robot, offset_s):
+    robot.drives(np.arange(5000.0, 5010.0)).drives(np.arange(5010.0, 5030.0), offset_s)
+    robot.drives(np.arange(5030.0, 5060.0)).waits(60.0)
+    assert len(robot.records) >= 60 - STEPS_BACK_FOR_RESTART
+    (line,) = robot.said
+    assert "stepped back" in line
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("other", [(3600.0, 90), (-3600.0, 180)])
+def test_a_second_publisher_of_another_time_or_laser_is_left_out(robot, other):
+    offset_s, beams = other
+    robot.drives(np.arange(5000.0, 5006.0))
+    for robot.now_s in np.arange(5006.0, 5030.0):
+        robot.drives([robot.now_s]).hears("/scan", scan(robot.now_s + offset_s, np.full(beams, 2.0)))
+        robot.waits(robot.now_s + 0.5)
+        assert robot.stamps[-1] == robot.now_s - 0.5
+    assert robot.stamps == list(np.arange(5000.0, 5030.0))

@@ -47,3 +47,11 @@ def test_refused_logins_left_over_are_written_at_the_end(log, tmp_path):
     log.flush()
     assert [entry.content["count"] for entry in log.newest(10)] == [1, 3]
     assert os.listdir(tmp_path) == ["audit.jsonl"]
+
+
+def test_refused_logins_are_written_after_the_clock_went_back(tmp_path):
+    clock = {}
+    log = AuditLog(AuditFile(tmp_path / "audit.jsonl"), lambda: clock["now_s"])
+    for clock["now_s"] in (7200.0, 3600.0, 3601.0, 7200.0):
+        log.refuse_login("::1")
+    assert [entry.content["count"] for entry in log.newest(10)] == [1, 1, 2]

@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fcslam.cloud.claims import ClaimLimits
+from fcslam.cloud.edits import read_edit
 from fcslam.cloud.replies import SessionCorrection
 from fcslam.errors import PacketConflictError, PacketError
+from fcslam.mission import mission_store
 from fcslam.mission.mission_store import MissionStore
-from fcslam.records import Correction, frozen
+from fcslam.records import Correction, Removal, Undo, Veto, frozen
 from fcslam.service import intake as module
 from fcslam.service.intake import LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
 from fcslam.wire.batches import read_batch, write_batch
@@ -222,3 +224,31 @@ def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_rob
 def test_a_robot_that_is_called_like_a_session_is_refused(desk, name):
     with pytest.raises(PacketError, match="session of 'a'"):
         desk.take(robot=name)
+
+
+def test_jumps_of_the_clock_change_no_answer(tmp_path):
+    """An hour forth and back, at the server."""
+    answers = []
+    for name, jumps_s in (("steady", (0.0, 0.0, 0.0)), ("jumps", (3600.0, -3600.0, 0.0))):
+        store, jumping = MissionStore(tmp_path / name), iter(jumps_s)
+        intake = Intake(store, lambda: 100.0, lambda jumping=jumping: 1e9 + next(jumping, 0.0))
+        batches = (DATA[:2], DATA[2:4], DATA[4:])
+        answers.append([intake.take("a", "x", write_batch(batch), -1).batch for batch in batches])
+        answers[-1] += [packet.data for _, packet in store.arrivals(0, 100)]
+        store.close()
+    assert answers[0] == answers[1]
+
+
+def test_thousands_of_edits_are_read_once(desk, monkeypatch):
+    """Each request of a robot asks whether it was removed."""
+    for number in range(1, 1001):
+        desk.store.edit(Veto("a", "b") if number % 2 else Undo(number - 1), "boss", 0.0)
+    desk.take(DATA[0])
+    read = []
+    monkeypatch.setattr(mission_store, "read_edit", lambda *content: read.append(content) or read_edit(*content))
+    for data in DATA[1:4]:
+        desk.take(data)
+    assert read == []
+    desk.store.edit(Removal("a"), "boss", 0.0)
+    assert desk.intake.take("a", "x", write_batch([DATA[4]]), -1).removed
+    assert len(read) == 1

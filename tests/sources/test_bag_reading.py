@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 import tracemalloc
 from copy import copy
 
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan, Odometry
-from fcslam.sources import BagOptions, Fault, open_source, split
+from fcslam.sources import BagOptions, Fault, open_source, split, write_recording
 from tests.sources.bag_messages import (
     ANGLE_MIN,
     BEAMS,
@@ -300,3 +301,23 @@ def test_options_of_bags_are_refused_for_logs(tmp_path):
 def test_a_name_may_be_given(tmp_path):
     assert open_source(save(tmp_path / "run.bag", drive(12)), name="anna").name == "anna"
     assert open_source(save_log(tmp_path / "run.log", drive_log(12)), name="ben").name == "ben"
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("name", [*KINDS, "run.clf", "run.fcslam"])
+def test_names_that_are_no_utf8_are_names(tmp_path, name):
+    path = tmp_path / name
+    if name in KINDS:
+        save(path, drive(10))
+    elif name == "run.clf":
+        save_log(path, drive_log(10))
+    else:
+        source = open_source(save(tmp_path / "run.mcap", drive(10)))
+        write_recording(path, source.survey().lasers, None, source.records())
+    other = path.rename(tmp_path / os.fsdecode(b"\xff" + name.encode()))
+    if name == "run.db3":  # the driver of SQLite takes none
+        with pytest.raises(SourceError, match="rename it: a path that is not UTF-8"):
+            open_source(other).survey()
+        return
+    source = open_source(other)
+    assert source.survey().scan_count == sum(isinstance(record, LaserScan) for record in source.records()) == 10

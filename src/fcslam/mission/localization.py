@@ -113,7 +113,7 @@ def _read_map_file(description: Path) -> OccupancyMap:
 
 def _image_of(description: Path, image: str) -> Path:
     """Where the image of a map lies; map_saver writes the whole path, which is wrong after the map was moved."""
-    named = description.parent / Path(image).expanduser()
+    named = description.parent / Path(image)
     beside = description.parent / named.name
     return beside if beside.is_file() and not named.is_file() else named
 

@@ -150,6 +150,8 @@ class MissionStore:
             StoreError: the file is not a mission of this version, or cannot be used.
         """
         self._database: RowStore = Database(place, SCHEMA, VERSION) if isinstance(place, Path) else place
+        self._edits: list[Edit] = []
+        """Those read so far, numbered from 1; each request of a robot asks for them."""
 
     def close(self) -> None:
         """Close the file."""
@@ -304,9 +306,10 @@ class MissionStore:
             first, last = spans[name]
             if not first - NEARBY_S <= stamp <= last + NEARBY_S:
                 raise EditError(f"{name} has no scan at {stamp:.3f} s; its scans are from {first:.3f} to {last:.3f} s")
-        given = floors(in_force(self.edits()))
-        if isinstance(content, ManualClosure) and len({given.get(name, self._floor(name)) for name in named}) > 1:
-            raise EditError(f"{' and '.join(named)} are on different floors, which no closure joins")
+        if isinstance(content, ManualClosure):
+            given = floors(in_force(self.edits()))
+            if len({given.get(name, self._floor(name)) for name in named}) > 1:
+                raise EditError(f"{' and '.join(named)} are on different floors, which no closure joins")
 
     def _floor(self, session: str) -> str:
         """Floor that a session names; empty if none."""
@@ -319,7 +322,13 @@ class MissionStore:
 
     def edits(self, after: int = 0) -> list[Edit]:
         """The edits after number ``after``, in their order."""
-        return _edits(self._database.rows, after)
+        known = self._edits
+        newer = _edits(self._database.rows, len(known))
+        if newer:
+            known = [*known, *newer]
+            if known[-1].number == len(known):  # none is missing, as where another instance is about to add one
+                self._edits = known
+        return [edit for edit in known if edit.number > after]
 
     def ask_to_finalize(self) -> int:
         """Request the result of all packets that arrived; returns the number of the request."""

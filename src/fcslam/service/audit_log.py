@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -88,7 +89,7 @@ class AuditLog:
         self._place, self._wall_clock = place, wall_clock
         self._refused, self._refused_from = 0, ""
         """Refused logins that have no line yet, and where the last one came from."""
-        self._line_at = 0.0
+        self._line_at = -math.inf
 
     def record(self, who: str, address: str, action: str, status: int, content: Mapping[str, Any]) -> None:
         """Append what somebody did. A disk that is full loses the line, which the service's own log then says."""
@@ -103,7 +104,7 @@ class AuditLog:
     def refuse_login(self, address: str) -> None:
         """Count a request that no known token or certificate came with."""
         self._refused, self._refused_from = self._refused + 1, address
-        if self._wall_clock() >= self._line_at:
+        if not self._line_at - REFUSED_EVERY_S <= self._wall_clock() < self._line_at:  # the clock may go back
             self.flush()
 
     def flush(self) -> None:

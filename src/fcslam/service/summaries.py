@@ -126,7 +126,8 @@ def closure_summary(closure: ClosureRow) -> ClosureSummary:
 def all_edits(mission: ViewedMission) -> list[EditSummary]:
     """All edits, and what undid them."""
     edits = mission.store.edits()
-    return [edit_summary(edit, undone(edits)) for edit in edits]
+    gone = undone(edits)
+    return [edit_summary(edit, gone) for edit in edits]
 
 
 def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:

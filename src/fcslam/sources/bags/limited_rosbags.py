@@ -84,7 +84,7 @@ def ros2_reader(path: Path, suffix: str) -> Any:
         check_metadata(path)
         return rosbag2.Reader(path)
     # rosbags puts the path of a database into a URI as it is
-    return rosbag2.Reader.STORAGE_PLUGINS[suffix](Path(quote(str(path))) if suffix == ".db3" else path)
+    return rosbag2.Reader.STORAGE_PLUGINS[suffix](Path(quote(os.fsencode(path))) if suffix == ".db3" else path)
 
 
 def check_metadata(folder: Path) -> None:
@@ -157,7 +157,10 @@ def _stated(compression: str) -> Any:
 def _limit_database(connection: Any) -> None:
     import apsw
 
-    size = os.stat(connection.filename).st_size
+    try:
+        size = os.stat(connection.filename).st_size
+    except UnicodeDecodeError as error:
+        raise ValueError("rename it: a path that is not UTF-8 cannot be a database") from error
     connection.config(apsw.SQLITE_DBCONFIG_TRUSTED_SCHEMA, 0)
     connection.limit(apsw.SQLITE_LIMIT_LENGTH, longest_value(size))
     connection.set_progress_handler(step_counter(size), STEPS)
