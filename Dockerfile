@@ -2,7 +2,7 @@
 #
 #     docker build -t fcslam .
 #     docker run --rm -v "$PWD":/data fcslam map robot1.bag robot2.bag -o runs/building
-#     docker run -p 8340:8340 -v cloud:/data fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
+#     docker run -p 8340:8340 -v "$PWD":/data fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
 FROM debian:bookworm-slim
 
 RUN apt-get update \

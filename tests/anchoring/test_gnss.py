@@ -118,10 +118,13 @@ def test_a_bag_gives_its_fixes_and_names_those_at_zero(tmp_path, suffix):
     ]
     sent = [GnssFix(1000.25 + k, 47.0, 8.5 + 1e-6 * k, 400.0, 1.5, ANTENNA) for k in range(10)]
     sent[4] = GnssFix(1004.25, 0.0, 0.0, 0.0, 1.5, ANTENNA)
-    write_bag(tmp_path / f"robot{suffix}", sorted([*scans, *sent], key=lambda record: record.stamp))
+    sent[6] = GnssFix(1e6, 47.0, 8.5, 400.0, 1.5, ANTENNA)  # keeps none of the later ones away
+    write_bag(tmp_path / f"robot{suffix}", sorted([*scans, *sent], key=lambda record: min(record.stamp, 1006.25)))
     bag = RosBag(tmp_path / f"robot{suffix}", "robot")
     found = [record for record in bag.records() if isinstance(record, GnssFix)]
-    assert [fix.longitude_deg for fix in found] == [fix.longitude_deg for fix in sent if fix.latitude_deg]
+    assert [fix.longitude_deg for fix in found] == [fix.longitude_deg for fix in sent if fix.latitude_deg][:5] + [
+        fix.longitude_deg for fix in sent[7:]
+    ]
     assert {fix.antenna_xy for fix in found} == {ANTENNA}
     assert {fix.sigma_m for fix in found} == {1.5}
     assert bag.faults[Fault.FIX_AT_ZERO].count == 1

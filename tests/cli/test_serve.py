@@ -79,10 +79,32 @@ def test_names_that_cannot_be_are_refused(tmp_path, wrong, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_without_tokens_opens_the_service_to_nobody(credentials, tmp_path, capsys):
+    for name in ("cloud.pem", "cloud.key"):
+        shutil.copy(credentials / name, tmp_path / name)
+    assert main(["serve", "--data", str(tmp_path / "data"), "--credentials", str(tmp_path), "--port", "0"]) == 2
+    assert "holds no tokens.yaml, so everybody could send" in capsys.readouterr().err
+
+
+def test_tokens_that_are_all_there_are_not_written_again(tmp_path):
+    arguments = ["tools", "certificates", "-o", str(tmp_path / "made"), "--host", "localhost", "--robot", "anna"]
+    assert main(arguments) == 0
+    tokens = tmp_path / "made" / "tokens.yaml"
+    tokens.write_text("# robots of the ground floor\n" + tokens.read_text())
+    tokens.chmod(0o640)
+    before = tokens.read_bytes()
+    assert main(arguments) == 0
+    assert tokens.read_bytes() == before
+    assert main([*arguments, "--robot", "ben"]) == 0
+    assert "ben" in tokens.read_text()
+    assert stat.S_IMODE(tokens.stat().st_mode) == 0o640
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
         (["--host", "0.0.0.0"], "--credentials"),
+        (["--credentials", 300 * "x"], "holds neither tokens.yaml nor cloud.pem"),
         (["--host", "::"], "--insecure"),
         (["--credentials", "nowhere"], "holds neither tokens.yaml nor cloud.pem"),
         (["--credentials", "half"], "belong together"),

@@ -28,6 +28,8 @@ LEAST_SHARE: Final = 0.3
 """Least share of the fixes that agree."""
 MOST_TURN_RAD: Final = float(np.radians(3.0))
 """Largest standard deviation of the map's heading by the fixes that agree."""
+LEAST_SIGMA_M: Final = 0.02
+"""Least standard deviation of a fix, whatever its robot says."""
 HYPOTHESES: Final = 400
 """Pairs of fixes from which the pose of the map is guessed."""
 ROUNDS: Final = 6
@@ -110,7 +112,7 @@ def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: b
     measured = _Measured(
         np.concatenate([robot.variables[rows] for robot, rows in zip(robots, at, strict=True)]),
         np.array([fix.antenna_xy for fix in kept]),
-        np.column_stack((east, north)), np.array([fix.sigma_m for fix in kept]),
+        np.column_stack((east, north)), np.maximum(LEAST_SIGMA_M, [fix.sigma_m for fix in kept]),
         max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
     )  # fmt: skip
     poses = graph.poses()

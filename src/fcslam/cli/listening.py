@@ -1,6 +1,7 @@
 """Ports on which commands listen, and their certificates."""
 
 import ipaddress
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -64,7 +65,8 @@ def find_files(folder: Path | None) -> ServiceFiles:
 
     if folder is None:
         return ServiceFiles()
-    found = [folder / name if (folder / name).exists() else None for name in ("tokens.yaml", "cloud.pem", "cloud.key")]
+    names = "tokens.yaml", "cloud.pem", "cloud.key"
+    found = [folder / name if os.path.exists(folder / name) else None for name in names]
     if not any(found):
         raise ServiceError(f"{folder}: holds neither tokens.yaml nor cloud.pem; `fcslam tools certificates` makes them")
     return ServiceFiles(*found)

@@ -63,6 +63,10 @@ def record(
     if is_live(source):
         _record(source, output, duration, options, force, console)
     else:
+        if duration is not None:
+            from fcslam.errors import InputError
+
+            raise InputError(f"--duration is the time to record a live robot; {source} is a recording")
         _convert(source, output, options, force, console)
 
 

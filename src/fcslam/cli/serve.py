@@ -93,6 +93,11 @@ def serve(
     if is_open and not is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
     check_tls(certificate, key, client_ca)
+    if is_open and credentials is not None:
+        raise ServiceError(
+            f"{credentials}: holds no tokens.yaml, so everybody could send and read; `fcslam tools certificates` adds "
+            "it; or give --client-ca or --insecure"
+        )
     chosen = Workers(workers)
     chosen.check()
     if chosen.is_cluster:

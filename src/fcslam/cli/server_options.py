@@ -36,8 +36,8 @@ Budget = Annotated[
         "--budget-kBps",
         min=0.1,
         rich_help_panel=NETWORK,
-        help="Limit of the uplink, in kB per second of the recording. Keyscans and constraints are always sent; "
-        "places are sent with fewer descriptors or left out.",
+        help="Limit of the uplink, in kB per second of the recording. Keyscans, constraints, tags and fixes are always "
+        "sent; places are sent with fewer descriptors or left out.",
     ),
 ]
 

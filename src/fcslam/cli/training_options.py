@@ -38,9 +38,16 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
     """How to train here: on a GPU if CUDA shows one, the threads, and how often to validate and log."""
     import torch
 
+    from fcslam.errors import TrainingError
     from fcslam.learning.trainer import ExecutionOptions
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=device)
+    except RuntimeError as error:
+        raise TrainingError(
+            f"the GPU that CUDA names cannot be used ({error}); set CUDA_VISIBLE_DEVICES to nothing to train without"
+        ) from error
     threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
     if quick:
         return ExecutionOptions(

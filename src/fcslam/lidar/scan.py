@@ -129,7 +129,7 @@ def _swept(origins, directions, first, last, velocity, acceleration):  # type: i
     moved, turned, times = np.empty_like(origins), np.empty_like(directions), np.empty(len(origins))
     step = (last - first) / max(1, len(times) - 1)
     for i in range(len(times)):
-        times[i] = first + i * step if i < len(times) - 1 else last
+        times[i] = last if 0 < i == len(times) - 1 else first + i * step
         moved[i, 0], moved[i, 1], turned[i, 0], turned[i, 1] = ray_at(
             origins[i], directions[i], times[i], velocity, acceleration
         )

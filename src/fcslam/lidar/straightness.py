@@ -18,6 +18,8 @@ from fcslam.records import FloatArray, LaserModel, LaserScan, Ranges
 
 MOST_SCANS: Final = 300
 """Scans that are examined at most."""
+SCANS_TOGETHER: Final = 20
+"""Scans whose stretches are fitted at a time; more would take memory."""
 LEAST_MOVE_M, LEAST_TURN_RAD = 0.3, 0.3
 """The robot has moved or turned by so much between two of them."""
 LARGEST_TURN_RAD: Final = 0.03
@@ -65,10 +67,10 @@ class Excess(NamedTuple):
 
 def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
     """By how much the ranges of a laser are too long, if most walls show it; None if they are straight, or few."""
-    examined = groupby(islice(scans_apart(_steady(scans)), MOST_SCANS), lambda scan: scan.laser)
-    ranges_m, excess_m = np.concatenate(
-        [np.empty((0, 2)), *(_stretches(laser, [scan.ranges_m for scan in same]) for laser, same in examined)]
-    ).T
+    examined = enumerate(islice(scans_apart(_steady(scans)), MOST_SCANS))
+    groups = groupby(examined, lambda each: (each[0] // SCANS_TOGETHER, each[1].laser))
+    stretches = (_stretches(laser, [scan.ranges_m for _, scan in same]) for (_, laser), same in groups)
+    ranges_m, excess_m = np.concatenate([np.empty((0, 2)), *stretches]).T
     if len(ranges_m) < FEWEST_STRETCHES:
         return None
     if np.percentile(np.copysign(1.0, np.median(excess_m)) * excess_m, OTHERS) < LEAST_EXCESS_M:

@@ -66,7 +66,7 @@ class MissionConfig(Settings):
         if self.robot.sends is Sends.WORDS and self.fleet.matcher.decision is not MatchDecision.SIMILARITY:
             raise ValueError(
                 "robot.sends words leaves no ranges to verify places with; set fleet.matcher.decision to similarity "
-                "and fleet.fusion to two_point, or give --preset paper"
+                "and fleet.fusion to two_point, or give --config paper"
             )
         return self
 

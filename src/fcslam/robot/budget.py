@@ -19,8 +19,8 @@ FEWEST_DESCRIPTORS = 50
 class Budget:
     """A limit of bytes per second of the recording's own clock, so the same recording always sends the same packets.
 
-    Hello, keyscans and constraints are always sent: without them there is no map. Places get the rest of the budget:
-    they are sent with all their descriptors, with the strongest ones, or not at all.
+    Hello, keyscans and constraints are always sent, as without them there is no map; so are tags and fixes. Places get
+    the rest of the budget: they are sent with all their descriptors, with the strongest ones, or not at all.
     """
 
     def __init__(self, bytes_per_s: float) -> None:

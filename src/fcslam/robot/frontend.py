@@ -359,8 +359,9 @@ class RobotFrontend:
     def _send_fixes(self, pose: ScanPose) -> None:
         """Send the fixes up to the newest scan, each with the keyscan of the scan next to it, one for each keyscan."""
         poses = (pose,) if self._newest is None else (self._newest[1], pose)
-        while self._fixes and self._fixes[0].stamp <= pose.stamp:
-            fix = self._fixes.popleft()
+        due = [fix for fix in self._fixes if fix.stamp <= pose.stamp]
+        self._fixes = deque((fix for fix in self._fixes if fix.stamp > pose.stamp), maxlen=MOST_FIXES)
+        for fix in due:
             nearest = min(poses, key=lambda pose: abs(pose.stamp - fix.stamp))
             if abs(nearest.stamp - fix.stamp) > LATE_S or nearest.keyscan <= self._fixed:
                 continue

@@ -11,8 +11,10 @@ cluster/                an authority of its own, and the certificate of a cluste
 import datetime
 import hashlib
 import ipaddress
+import os
 import secrets
 import shutil
+import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -154,8 +156,14 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
                 raise OutputError(f"{place}: tokens.yaml has no entry for this token; remove it, and a new one is made")
             write_file(place, f"{token}\n", private=True)
             entries.append(TokenEntry(name=name, role=role, sha256=hashlib.sha256(token.encode()).hexdigest()))
+    if len(entries) == len(known):
+        return
     content = TokensFile(tokens=tuple(entries)).model_dump(mode="json", exclude_none=True)
+    before = path.stat() if path.exists() else None
     write_file(path, yaml.safe_dump(content, sort_keys=False))
+    if before is not None:  # the service still reads it if another user runs this
+        path.chmod(stat.S_IMODE(before.st_mode))
+        os.chown(path, before.st_uid, before.st_gid)
 
 
 def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

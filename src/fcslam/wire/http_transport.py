@@ -166,7 +166,9 @@ class HttpClient:
             yield
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
-                raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
+                raise CloudError(
+                    f"{self._url}: its certificate is not trusted ({error}); give its ca.pem in --credentials"
+                ) from error
             raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{self._hint(error)}") from error
 
     def _hint(self, error: "httpx.RequestError") -> str:

@@ -1,5 +1,6 @@
 """Files with which a robot shows who it is: tokens, and keys of TLS."""
 
+import os
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ def read_credentials(folder: Path) -> Credentials:
     Raises:
         InputError: there is no such file, the token cannot be read, or a certificate has no key.
     """
-    there = {name for name in (TOKEN, AUTHORITY, CERTIFICATE, KEY) if (folder / name).exists()}
+    there = {name for name in (TOKEN, AUTHORITY, CERTIFICATE, KEY) if os.path.exists(folder / name)}
     if not there:
         raise InputError(
             f"{folder}: holds no credentials ({TOKEN}, {AUTHORITY}, {CERTIFICATE} and {KEY}); give a folder in "

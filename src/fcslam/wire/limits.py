@@ -40,8 +40,6 @@ KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
 
-MAXIMUM_WORDS = 65536
-"""Words of a vocabulary that robots and cloud share."""
 BYTES_PER_WORD = 2
 
 TILE_CELLS = 256

@@ -55,6 +55,8 @@ def homography(
     kinds = [EvaluatedDetectorKind(one) for one in detector or () if one in list(EvaluatedDetectorKind)]
     places = [Path(one) for one in detector or () if one not in list(EvaluatedDetectorKind)]
     weights = [place for place in places if place.suffix == ".onnx"]
+    if weights and not set(kinds) & {EvaluatedDetectorKind.ONNX, EvaluatedDetectorKind.LOGITS}:
+        kinds.append(EvaluatedDetectorKind.ONNX)
     detectors = choose_detectors(kinds, weights, [place for place in places if place.suffix != ".onnx"])
     with ProgressDisplay(notices()) as display:
         evaluated = display.start("evaluating", len(found) * len(detectors))

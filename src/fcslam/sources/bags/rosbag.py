@@ -5,7 +5,6 @@ scans are consistent; damaged messages are skipped and counted. A robot that sta
 shows that there is odometry.
 """
 
-import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -101,7 +100,10 @@ class RosBag:
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
-        fixes = deque(self._fixes(audit))
+        found, faults = self._fixes
+        fixes = deque(found)
+        for kind, fault in faults.counts.items():
+            audit.add(kind, fault.first_line, fault.count)
         for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
@@ -119,9 +121,10 @@ class RosBag:
                 except ValueError:
                     audit.add(Fault.BROKEN_IMAGE, number)
 
-    def _fixes(self, audit: Audit) -> Iterator[GnssFix]:
-        """The fixes of satellite navigation, at most one a second."""
-        stream, newest_s = self.stream, -math.inf
+    @cached_property
+    def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
+        """The fixes of satellite navigation in the order of their stamps, a second apart, and faults of the others."""
+        stream, audit, found = self.stream, _audit(), list[GnssFix]()
         topics = fix_topics(stream.robot)[:1]
         for message in stream.bag.messages(topics) if topics else ():
             try:
@@ -131,9 +134,13 @@ class RosBag:
             except ValueError:
                 audit.add(Fault.BROKEN_MESSAGE, message.number)
             else:
-                if fix is not None and fix.stamp >= newest_s + FIX_INTERVAL_S:
-                    newest_s = fix.stamp
-                    yield fix
+                if fix is not None:
+                    found.append(fix)
+        apart: list[GnssFix] = []
+        for fix in sorted(found, key=lambda fix: fix.stamp):
+            if not apart or fix.stamp >= apart[-1].stamp + FIX_INTERVAL_S:
+                apart.append(fix)
+        return tuple(apart), audit.faults()
 
     def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         entries = self.stream.entries(audit, with_images=with_images)
