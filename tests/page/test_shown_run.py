@@ -245,6 +245,26 @@ def test_a_report_of_what_cannot_be_shown_says_what(run, tmp_path):
         report_html(shown)
 
 
+def test_what_cannot_be_read_of_a_run_is_not_there(shown, tmp_path):
+    folder = tmp_path / "run"
+    (folder / "map.yaml").write_bytes(b"\xff")
+    (folder / "trajectories" / "c.tum").symlink_to("a.tum")
+    assert [a.status_code for a in ask(shown, "/api/v1/maps/0/walls", "/api/v1/trajectories.zip")] == [404, 404]
+
+
+def test_a_report_of_a_run_with_a_link_says_so(shown, tmp_path):
+    (tmp_path / "run" / "trajectories" / "c.tum").symlink_to("a.tum")
+    with pytest.raises(EvaluationError, match="trajectories"):
+        report_html(shown)
+
+
+def test_a_run_without_trajectories_has_no_archive_of_them(tmp_path):
+    Run({}, metrics={"maps": Metric("maps", 0, "1")}).save(tmp_path / "run")
+    with ShownRun(tmp_path / "run", "run") as shown:
+        (answer,) = ask(shown, "/api/v1/trajectories.zip")
+        assert (answer.status_code, answer.json()) == (404, {"error": "there are no trajectories"})
+
+
 CHROMIUM = shutil.which("chromium")
 
 

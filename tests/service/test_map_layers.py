@@ -6,13 +6,16 @@ import re
 import numpy as np
 import pytest
 
+from fcslam import untrusted
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import outlines
+from fcslam.mission.mission_file import stored_mission
 from fcslam.page.shown_run import ShownRun
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.service import map_layers
 from fcslam.service.http.responses import MapLayer
 from fcslam.service.map_layers import layers_of, map_shapes, walls_of
-from fcslam.service.summaries import map_summaries
+from fcslam.service.summaries import all_sessions, map_summaries
 from tests.mission.test_map_changes import write_run
 
 PLAN = {
@@ -85,11 +88,60 @@ def test_changes_lie_where_boxes_came_and_went(run):
         assert np.abs(shapes[kind] - box).max() < 0.5
 
 
-def test_a_broken_file_is_named(run, tmp_path):
+def test_packets_are_read_once_for_all_who_ask_for_changes(tmp_path, monkeypatch):
+    reads = []
+    monkeypatch.setattr(map_layers, "stored_mission", lambda store: reads.append(store) or stored_mission(store))
+    with ShownRun(write_run(tmp_path / "asked", (0, 1)), "asked") as shown:
+        first, second = (map_shapes(shown, 0, MapLayer.CHANGES) for _ in range(2))
+    assert first == second != []
+    assert len(reads) == 1
+
+
+def test_packets_that_expand_too_much_are_not_decoded(tmp_path, monkeypatch):
+    with ShownRun(write_run(tmp_path / "bomb", (0, 1)), "bomb") as shown:
+        monkeypatch.setattr(untrusted, "FREE_BYTES", -(10**12))
+        with pytest.raises(EvaluationError, match="limit"):
+            map_shapes(shown, 0, MapLayer.CHANGES)
+
+
+def test_a_trajectory_without_poses_is_no_session_of_a_map(tmp_path):
+    folder = write_run(tmp_path / "empty", (0, 1))
+    first, second = (folder / "trajectories" / f"{name}.tum" for name in ("anna", "anna+1"))
+    second.write_text("")
+    with ShownRun(folder, "empty") as shown:
+        assert layers_of(shown, 0) == map_shapes(shown, 0, MapLayer.CHANGES) == []
+        assert [session.map for session in all_sessions(shown)] == [0, None]
+    first.write_text("")
+    with ShownRun(folder, "empty") as shown:
+        assert map_shapes(shown, 0, MapLayer.CHANGES) == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"maps": [3]}',
+        "[" * 200_000,
+        json.dumps(PLAN).replace("missing", "tag"),
+        json.dumps(PLAN).replace("[1.0, 2.0]", f"[{10**400}, 2]"),
+        " " * 5000,
+    ],
+    ids=["wrong", "nested", "unknown kind", "huge number", "too large"],
+)
+def test_a_broken_file_is_named(tmp_path, monkeypatch, content):
     folder = write_run(tmp_path / "broken", (0,))
-    (folder / "plan.json").write_text('{"maps": [3]}')
+    (folder / "plan.json").write_text(content)
+    if content.isspace():
+        monkeypatch.setattr(map_layers, "_MOST_BYTES", 4000)
     with ShownRun(folder, "broken") as shown, pytest.raises(EvaluationError, match=r"plan\.json"):
         map_shapes(shown, 0, MapLayer.PLAN)
+
+
+def test_a_file_that_is_a_link_is_not_followed(tmp_path):
+    folder = write_run(tmp_path / "linked", (0,))
+    (tmp_path / "other.json").write_text(json.dumps(TAGS))
+    (folder / "tags.json").symlink_to(tmp_path / "other.json")
+    with ShownRun(folder, "linked") as shown, pytest.raises(EvaluationError, match=r"tags\.json"):
+        map_shapes(shown, 0, MapLayer.TAGS)
 
 
 def test_outlines_run_through_the_middles_of_cells_and_around_holes():

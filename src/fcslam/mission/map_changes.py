@@ -137,7 +137,9 @@ def _table(changes: Changes) -> str:
 
 def _seen(run: Run, mission: SavedMission, map_index: int, name: str) -> _Seen:
     """The keyscans of the run's map and their poses; sessions that are not in it are left out."""
-    members = {name: robot for name, robot in run.trajectories.items() if robot.map_index == map_index}
+    members = {
+        name: robot for name, robot in run.trajectories.items() if robot.map_index == map_index and len(robot.stamps)
+    }
     if not members:
         raise SourceError(f"{name}: has no map {map_index}; the first one is 0")
 

@@ -110,16 +110,26 @@ def read_mission(path: Path) -> SavedMission:
         with opened_copy(path) as store:
             mission = replace(stored_mission(store), state=_state_beside(path))
         if mission.state is None:
-            check_unpacked(
-                sum(len(packet.data) for packet in mission.stored),
-                sum(unpacked_size(packet.data) for packet in mission.stored),
-            )
+            check_packets(mission)
             _ = mission.packets  # beside a state that fits the file, this program has decoded them all before
         return mission
     except (PacketError, LimitError) as error:
         raise SourceError(f"{path}: {error}") from error
     except StoreError as error:
         raise SourceError(str(error)) from error
+
+
+def check_packets(mission: SavedMission) -> None:
+    """Check what the packets of a mission expand to, before they are decoded.
+
+    Raises:
+        LimitError: to more than ``most_unpacked``.
+        PacketError: one has no size.
+    """
+    check_unpacked(
+        sum(len(packet.data) for packet in mission.stored),
+        sum(unpacked_size(packet.data) for packet in mission.stored),
+    )
 
 
 @contextmanager

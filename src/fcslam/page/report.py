@@ -51,8 +51,11 @@ def report_html(mission: ViewedMission) -> str:
     """
     maps = {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
     zooms = {k: _zoom(occupancy, MOST_TILES // len(maps)) for k, occupancy in maps.items()}
-    pictures = _pictures(mission, maps, zooms)
-    return _page({"texts": _texts(mission, zooms), "pictures": pictures, "files": _files(mission, maps)})
+    try:
+        pictures = _pictures(mission, maps, zooms)
+        return _page({"texts": _texts(mission, zooms), "pictures": pictures, "files": _files(mission, maps)})
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"the run has files that cannot be shown ({error})") from error
 
 
 def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
@@ -108,7 +111,8 @@ def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
     named[POSE_GRAPH] = POSE_GRAPH
     files = {path: mission.run_folder / name for path, name in named.items()}
     contents = {path: file.read_bytes() for path, file in files.items() if file.is_file()}
-    contents[f"{TRAJECTORIES}.zip"] = trajectories_zip(mission.run_folder)
+    if (archive := trajectories_zip(mission.run_folder)) is not None:
+        contents[f"{TRAJECTORIES}.zip"] = archive
     for k, suffix in itertools.product(maps, ("zip", "svg", "tif")):
         if (exported := export_map(mission.run_folder, k, suffix)) is not None:
             contents[f"maps/{k}.{suffix}"] = exported

@@ -2,25 +2,29 @@
 
 import json
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
 from fcslam.anchoring.anchors import PLAN_JSON, TAGS_JSON
+from fcslam.anchoring.deviations import DeviationKind
 from fcslam.anchoring.walls import wall_direction
 from fcslam.errors import EvaluationError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED
 from fcslam.maps.exports import outlines
 from fcslam.mission.map_changes import changes_of
-from fcslam.mission.mission_file import stored_mission
-from fcslam.runs import QUALITY
+from fcslam.mission.mission_file import check_packets, stored_mission
+from fcslam.mission.mission_store import MissionStore
+from fcslam.runs import QUALITY, Run
 from fcslam.runs.map_files import map_stem, parse_map
 from fcslam.service.http.responses import MapLayer, MapShape, WallDirection
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
-from fcslam.untrusted import read_bytes, read_text
+from fcslam.untrusted import LimitError, read_bytes, read_text
 
 TAG_M: Final = 0.15
 """Half a side of the square that stands for a tag."""
-
+_MOST_BYTES: Final = 1 << 26
+"""Largest file that is shown as a layer; as objects, it takes many times as much memory."""
 
 _FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: f"{QUALITY}.json"}
 
@@ -35,7 +39,7 @@ def layers_of(mission: ViewedMission, k: int) -> list[MapLayer]:
     for first_s, last_s in sorted(
         (float(robot.stamps.min()), float(robot.stamps.max()))
         for robot in viewed_run(folder).trajectories.values()
-        if robot.map_index == k
+        if robot.map_index == k and len(robot.stamps)
     ):
         if first_s > ended_s:
             return [*found, MapLayer.CHANGES]
@@ -47,19 +51,19 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
     """A layer of map ``k``; empty if there is nothing to draw.
 
     Raises:
-        EvaluationError: a file of the run is broken.
+        EvaluationError: a file of the run is broken or too large.
     """
     folder = mission.run_folder
     if folder is None:
         return []
     if layer is MapLayer.CHANGES:
-        return _changes(mission, folder, k)
+        return [*_changes(viewed_run(folder), mission.store, k)]
     try:
-        content = json.loads(read_text(folder / _FILES[layer], folder))
+        content = json.loads(read_text(folder / _FILES[layer], folder, _MOST_BYTES))
         return _DRAWN[layer](content, k)
     except FileNotFoundError:
         return []
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise EvaluationError(f"{_FILES[layer]} cannot be shown ({error})") from error
 
 
@@ -70,17 +74,25 @@ def walls_of(folder: Path, k: int) -> WallDirection:
         EvaluationError: the files of the map are broken.
     """
     stem = map_stem(k)
-    pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
+    try:
+        pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{stem} cannot be read ({error})") from error
     return WallDirection(direction_rad=wall_direction(parse_map(stem, pgm, description)))
 
 
-def _changes(mission: ViewedMission, folder: Path, k: int) -> list[MapShape]:
+@lru_cache(maxsize=8)  # each takes all packets of the mission; a run that is replaced is another one
+def _changes(run: Run, store: MissionStore, k: int) -> tuple[MapShape, ...]:
+    mission = stored_mission(store)
     try:
-        found = changes_of(viewed_run(folder), stored_mission(mission.store), None, None, k, mission.name)
+        check_packets(mission)
+        found = changes_of(run, mission, None, None, k, "the run")
     except SourceError:  # there is no earlier day, or its robots sent no ranges
-        return []
+        return ()
+    except LimitError as error:
+        raise EvaluationError(f"the changes cannot be shown ({error})") from error
     masks = {APPEARED: found.appeared, DISAPPEARED: found.disappeared}
-    return [_shape(kind, outlines(mask, found.now)) for kind, mask in masks.items() if mask.any()]
+    return tuple(_shape(kind, outlines(mask, found.now)) for kind, mask in masks.items() if mask.any())
 
 
 def _plan(content: Mapping[str, Any], k: int) -> list[MapShape]:
@@ -89,9 +101,9 @@ def _plan(content: Mapping[str, Any], k: int) -> list[MapShape]:
         return []
     shapes = [_shape("plan", content["drawing"])] if "drawing" in content else []
     for one in report["deviations"]:
-        (a, b), (c, d) = one["start"], one["end"]
-        text = f"moved by {one['by_m']:.2f} m" if one["kind"] == "moved" else ""
-        shapes.append(_shape(one["kind"], f"M{a} {b}L{c} {d}", text, (a + c) / 2, (b + d) / 2))
+        (a, b), (c, d), kind = one["start"], one["end"], DeviationKind(one["kind"])
+        text = f"moved by {one['by_m']:.2f} m" if kind is DeviationKind.MOVED else ""
+        shapes.append(_shape(kind.value, f"M{a} {b}L{c} {d}", text, (a + c) / 2, (b + d) / 2))
     return shapes
 
 
@@ -115,11 +127,11 @@ def _quality(content: Mapping[str, Any], k: int) -> list[MapShape]:
     certificate = content.get(str(k))
     if certificate is None:
         return []
-    side, paths = certificate["cell"], {"good": "", "bad": ""}
+    side, squares = certificate["cell"], dict[str, list[str]](good=[], bad=[])
     for cell in certificate["cells"]:
         corner = f"M{cell['x'] - side / 2} {cell['y'] - side / 2}"
-        paths["good" if cell["good"] else "bad"] += f"{corner}h{side}v{side}h{-side}z"
-    return [_shape(kind, path) for kind, path in paths.items() if path]
+        squares["good" if cell["good"] else "bad"].append(f"{corner}h{side}v{side}h{-side}z")
+    return [_shape(kind, "".join(paths)) for kind, paths in squares.items() if paths]
 
 
 def _shape(kind: str, path: str, text: str = "", x: float = 0.0, y: float = 0.0) -> MapShape:

@@ -13,6 +13,7 @@ from typing import Any
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
+from fcslam.errors import EvaluationError
 from fcslam.maps.exports import earth_frame, zipped
 from fcslam.maps.palette import robot_colors
 from fcslam.maps.tiles import finest_zoom
@@ -65,7 +66,8 @@ def all_sessions(mission: ViewedMission) -> list[SessionSummary]:
 
 def sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
     """The sessions of one robot."""
-    store, mapped = mission.store, run_of(mission).trajectories
+    store = mission.store
+    mapped = {name: known for name, known in run_of(mission).trajectories.items() if len(known.stamps)}
     colors = robot_colors({session_name(*session[:2]) for session in mission.sessions()})
     sessions, changes, heard_s = [], in_force(store.edits()), mission.last_heard_s(robot)
     for session in mission.sessions(robot):
@@ -154,10 +156,17 @@ def map_summaries(mission: ViewedMission) -> list[MapSummary]:
     ]
 
 
-def trajectories_zip(folder: Path) -> bytes:
-    """The trajectories of a run folder as one archive."""
-    files = sorted((folder / TRAJECTORIES).glob("*.tum"))
-    return zipped({file.name: read_bytes(file, folder) for file in files})
+def trajectories_zip(folder: Path) -> bytes | None:
+    """The trajectories of a run folder as one archive; None if it has none.
+
+    Raises:
+        EvaluationError: one cannot be read.
+    """
+    try:
+        files = {file.name: read_bytes(file, folder) for file in sorted((folder / TRAJECTORIES).glob("*.tum"))}
+        return zipped(files) if files else None
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"the trajectories cannot be read ({error})") from error
 
 
 def map_separations(mission: ViewedMission) -> list[MapSeparation]:

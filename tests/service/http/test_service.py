@@ -154,6 +154,11 @@ def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):
     assert desk.told(desk.send("a", A[3:]))[0] == Acknowledgement("a", 0, len(A) - 1)
 
 
+def one_map(robots, layers):
+    summary = {"map": 0, "floor": "", "zoom": 5, "extent": ANY, "georeferenced": False}
+    return {**summary, "robots": robots, "layers": layers}
+
+
 def test_viewers_see_the_fleet(mapped):
     fleet = get(mapped, "fleet").json()
     assert (fleet["robots"], fleet["maps"], fleet["packets"]) == (["a", "b"], 1, len(A) + len(B))
@@ -168,9 +173,7 @@ def test_viewers_see_the_fleet(mapped):
     assert len(accepted) == 4
     assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
     assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
-    assert get(mapped, "maps").json() == [
-        {"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5, "extent": ANY, "georeferenced": False}
-    ]
+    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["changes"])]
 
 
 def test_the_extent_of_a_map_is_that_of_its_image(mapped):
@@ -414,15 +417,11 @@ def test_a_vetoed_closure_says_so_and_the_maps_come_apart_with_a_reason(mapped):
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     removed = edit(mapped, "removal", {"robot": "b"}).json()
     assert (removed["number"], removed["kind"], removed["author"]) == (1, "removal", "boss")
-    assert get(mapped, "maps").json() == [
-        {"map": 0, "floor": "", "robots": ["a"], "zoom": 5, "extent": ANY, "georeferenced": False}
-    ]
+    assert get(mapped, "maps").json() == [one_map(["a"], [])]
     assert get(mapped, "closures").json() == []
     undone = mapped.ask("POST", f"{API}/edits/1/undo", "boss").json()
     assert (undone["kind"], undone["content"]) == ("undo", {"number": 1})
-    assert get(mapped, "maps").json() == [
-        {"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5, "extent": ANY, "georeferenced": False}
-    ]
+    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["changes"])]
     edits = mapped.ask("GET", f"{API}/edits", "boss").json()
     assert [(edit["number"], edit["undone_by"]) for edit in edits] == [(1, 2), (2, None)]
     for kind, wrong, status in (

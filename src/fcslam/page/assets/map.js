@@ -2,7 +2,7 @@
 
 import { colourOf, fleet, isPast, keyOf, poseAt, robotNamed } from "./fleet.js";
 import { distance, middle, movedPoint } from "./geometry.js";
-import { Refused, ask, at, json, report } from "./service.js";
+import { Failed, Refused, ask, at, json, report } from "./service.js";
 
 const WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
 const BAR_PX = 120; // longest scale bar
@@ -287,13 +287,20 @@ const LOOKS = { // colour, width of the line, filling
 };
 const shapes = new Map();
 export function forgetShapes() { shapes.clear(); redraw(); }
+// The newest ones that have come, as for tiles; an answer that comes after another mission was opened is dropped with its key.
 function shapesOf(layer) {
-  const path = `maps/${chart.index}/layers/${layer}`;
-  if (!shapes.has(path)) {
-    shapes.set(path, []);
-    json(path).then((found) => { shapes.set(path, found.map((one) => ({ ...one, path: new Path2D(one.path) }))); redraw(); }, (error) => { at("message").textContent = error.message; });
+  const path = `maps/${chart.index}/layers/${layer}`, key = `${fleet.mission}/${path}`, kept = shapes.get(key) ?? { found: [], version: -1, isAsked: false };
+  shapes.set(key, kept);
+  if (kept.version < version && !kept.isAsked) {
+    const asked = version;
+    kept.isAsked = true;
+    json(path).then((found) => { Object.assign(kept, { found: found.map((one) => ({ ...one, path: new Path2D(one.path) })), version: asked, isAsked: false }); redraw(); })
+      .catch((error) => {
+        if (error instanceof Failed) { kept.found = []; at("message").textContent = error.message; }
+        setTimeout(() => { kept.isAsked = false; }, RETRY_MS); // the next drawing after that asks again
+      });
   }
-  return shapes.get(path);
+  return kept.found;
 }
 function drawShapes(layer) {
   const found = shapesOf(layer);

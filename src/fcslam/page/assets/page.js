@@ -76,7 +76,7 @@ const acts = {
   reload: () => location.reload(),
 };
 for (const [id, act] of Object.entries(acts)) at(id).addEventListener("click", act);
-for (const layer of document.querySelectorAll("#layers input")) layer.addEventListener("change", forgetShapes);
+for (const layer of document.querySelectorAll("#layers input")) layer.addEventListener("change", redraw);
 for (const id of ["decision", "of-robot", "two-robots"]) at(id).addEventListener("change", () => showEvidence().catch((error) => tell(error.message)));
 at("moment").addEventListener("input", slide);
 at("facts").addEventListener("toggle", () => { if (at("facts").open) showFacts().catch(() => {}); });

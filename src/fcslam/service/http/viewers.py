@@ -2,6 +2,8 @@
 
 import asyncio
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -117,10 +119,8 @@ def fleet_router(state: ViewerState) -> APIRouter:
         """Walls around both ends of a closure, laid on each other as it measured them."""
         run = run_of(state.mission)
         closure = _closure_of(run, channel, robot_i, stamp_i, robot_j, stamp_j)
-        try:
+        with _or_404():
             picture = overlay_png(state.mission.store, run, closure)
-        except EvaluationError as error:
-            raise HTTPException(404, str(error)) from error
         return Response(picture, media_type=MEDIA["png"], headers=KEPT)
 
     @router.get("/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}", responses=refusals(400, 404))
@@ -203,7 +203,7 @@ def map_router(state: ViewerState) -> APIRouter:
             raise HTTPException(404, f"there is no {map_stem(k)}") from error
         return _if_changed(request, tile, MEDIA["png"])
 
-    turn = asyncio.Lock()  # changes take as much memory as a map
+    turn = asyncio.Lock()  # one at a time: changes take all packets and several maps, an archive all its files
 
     @router.get("/maps/{k}/layers/{layer}", responses=refusals(400))
     async def get_layer(k: Index, layer: MapLayer) -> list[MapShape]:
@@ -216,8 +216,9 @@ def map_router(state: ViewerState) -> APIRouter:
         """The direction of most walls of a map."""
         folder = _folder_of(state)
         _existing(state, f"{map_stem(k)}.pgm")
-        async with turn:
-            return await run_in_threadpool(walls_of, folder, k)
+        with _or_404():
+            async with turn:
+                return await run_in_threadpool(walls_of, folder, k)
 
     @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
     def get_metrics() -> FileResponse:
@@ -246,9 +247,15 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get(
         f"/{TRAJECTORIES}.zip", response_class=Response, responses={**refusals(404), 200: content(MEDIA["zip"])}
     )
-    def get_trajectories() -> Response:
+    async def get_trajectories() -> Response:
         """The poses of all sessions, a file each."""
-        return Response(trajectories_zip(_folder_of(state)), media_type=MEDIA["zip"])
+        folder = _folder_of(state)
+        with _or_404():
+            async with turn:
+                archive = await run_in_threadpool(trajectories_zip, folder)
+        if archive is None:
+            raise HTTPException(404, "there are no trajectories")
+        return Response(archive, media_type=MEDIA["zip"])
 
     @router.get(
         "/trajectories/{session}.tum", response_class=Response, responses={**refusals(400, 404), 200: content(TEXT)}
@@ -279,6 +286,15 @@ def _if_changed(request: Request, body: bytes, media_type: str) -> Response:
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
     return Response(body, media_type=media_type, headers=headers)
+
+
+@contextmanager
+def _or_404() -> Iterator[None]:
+    """Refuse (HTTPException 404) what cannot be read of a run."""
+    try:
+        yield
+    except EvaluationError as error:
+        raise HTTPException(404, str(error)) from error
 
 
 def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
