@@ -31,7 +31,7 @@ def test_every_key_of_the_configuration_has_a_row_with_its_default():
     assert "| `fleet.fusion` | `joint` | - | `joint`, `n_point`, `two_point`, `first_two` |" in mission
     page = settings_reference.training_page()
     assert "| `loss.margin` |" in page
-    assert "| `privacy.delta` |" in page
+    assert "| `screening.quorum` |" in page
     assert "`training.steps`" not in page, "it refers to the section on training"
 
 

@@ -142,7 +142,7 @@ def test_a_mission_file_is_mapped_and_shown(logs, tmp_path):
     assert main(["map", str(logs[0]), "-o", str(tmp_path / "run"), "-q"]) == 0
     mission = mission_path(tmp_path / "run").rename(tmp_path / "alone.fcslam")
     report = tmp_path / "report.html"
-    assert main(["show", str(mission), "--html", str(report), "-q"]) == 0
+    assert main(["show", str(mission), "--html", str(report)]) == 0
     assert "maps/0/tiles/" in report.read_text()
 
 

@@ -129,7 +129,7 @@ def test_robots_own_networks_share_the_pairs_out(finished):
 def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
     folder, first = finished
     seen = set()
-    changes = {"seeds": 1, "arms": {"averaged": {}}, "start": folder / "shapes" / "checkpoint.npz"}
+    changes = {"seeds": 1, "arms": {"averaged": Arm()}, "start": folder / "shapes" / "checkpoint.npz"}
     again = run_study(study(robots, tmp_path, lambda name, *_: seen.add(name), **changes))
     assert "shapes" not in seen
     assert all(

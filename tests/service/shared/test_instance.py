@@ -149,7 +149,7 @@ def test_two_instances_of_one_name_are_refused(registry, postgres, monkeypatch):
     one, _ = instance(postgres, "same")
     one.start()
     again = Registry(postgres, "same", "another process")
-    with pytest.raises(ServiceError, match="another instance is called 'same'; stop it, or give this one another name"):
+    with pytest.raises(ServiceError, match="is called 'same'; stop it, or give this one another --port"):
         Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None)
     one.close()
     Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
