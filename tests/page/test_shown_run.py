@@ -252,9 +252,14 @@ def test_what_cannot_be_read_of_a_run_is_not_there(shown, tmp_path):
     assert [a.status_code for a in ask(shown, "/api/v1/maps/0/walls", "/api/v1/trajectories.zip")] == [404, 404]
 
 
-def test_a_report_of_a_run_with_a_link_says_so(shown, tmp_path):
-    (tmp_path / "run" / "trajectories" / "c.tum").symlink_to("a.tum")
-    with pytest.raises(EvaluationError, match="trajectories"):
+@pytest.mark.parametrize("name", ["trajectories/c.tum", "map.png", "pose_graph.g2o"])
+def test_a_report_of_a_run_with_a_link_says_so(shown, tmp_path, name):
+    """A link could take a file of the user into a report that is sent on."""
+    (tmp_path / "private").write_text("secret")
+    place = tmp_path / "run" / name
+    place.unlink(missing_ok=True)
+    place.symlink_to(tmp_path / "private")
+    with pytest.raises(EvaluationError, match=place.name):
         report_html(shown)
 
 

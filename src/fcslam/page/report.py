@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
@@ -31,7 +32,7 @@ from fcslam.service.summaries import (
     trajectories_zip,
 )
 from fcslam.service.viewed_mission import ViewedMission
-from fcslam.untrusted import read_text
+from fcslam.untrusted import read_bytes, read_text
 
 MOST_CLOSURES = 5000
 """Largest number of closures of each status that the page asks for."""
@@ -110,7 +111,7 @@ def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
     named = {f"maps/{k}.png": f"{map_stem(k)}.png" for k in maps}
     named[POSE_GRAPH] = POSE_GRAPH
     files = {path: mission.run_folder / name for path, name in named.items()}
-    contents = {path: file.read_bytes() for path, file in files.items() if file.is_file()}
+    contents = {path: read_bytes(file, mission.run_folder) for path, file in files.items() if os.path.lexists(file)}
     if (archive := trajectories_zip(mission.run_folder)) is not None:
         contents[f"{TRAJECTORIES}.zip"] = archive
     for k, suffix in itertools.product(maps, ("zip", "svg", "tif")):
