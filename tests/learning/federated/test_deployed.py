@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -76,6 +77,8 @@ class Deployment:
         self.keys, robots = folder / "keys", dict.fromkeys(("one", "two"), Role.ROBOT)
         for place in (self.keys, folder / "others"):
             make_credentials(place, ["127.0.0.1"], robots, datetime.now(UTC))
+        # a stranger's token, and the right authority
+        shutil.copy(self.keys / "ca.pem", folder / "others" / "robots" / "one" / "ca.pem")
 
     def server(self):
         words = ["serve", self.where, "-o", str(self.folder / "deployed"), "--credentials", str(self.keys)]

@@ -101,7 +101,7 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
     for robot in simulate_fleet(settings, 5).robots:
         record_robot(robot, tmp_path / "sim" / robot.name)
     weak = weak_detector(tmp_path)
-    (tmp_path / "data").mkdir()
+    (tmp_path / "data").mkdir(exist_ok=True)
     (tmp_path / "data" / "learning.yaml").write_text(yaml.safe_dump(SETTINGS))
     port = free_port()
     logs = [tmp_path / f"{name}.log" for name in ("service", *robots)]
