@@ -55,7 +55,8 @@ class PlanAlignment:
         if self.surface_m < LEAST_SURFACE_M:
             return f"plan and map share {self.surface_m:.0f} m of walls, {LEAST_SURFACE_M:.0f} m needed"
         if self.explained < LEAST_EXPLAINED:
-            return f"the scans saw {self.explained:.0%} of the plan's walls there, {LEAST_EXPLAINED:.0%} needed"
+            seen = f"the scans saw {self.explained:.0%} of the plan's walls there, {LEAST_EXPLAINED:.0%} needed"
+            return f"{seen}; is its scale right?"
         if self.violation > MOST_VIOLATION:
             return f"{self.violation:.0%} of the plan's walls stand in free space, {MOST_VIOLATION:.0%} allowed"
         if self.share < LEAST_SHARE:

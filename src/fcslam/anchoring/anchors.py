@@ -264,7 +264,7 @@ def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
         count = len(report["deviations"])
         yield (
             f"map {report['map']} is aligned with the plan: {report['confirmed_m']:.0f} m of walls confirmed, "
-            f"{', '.join([*scales, f'{count} walls differ ({PLAN_JSON})'])}"
+            f"{', '.join([*scales, f'{count} deviations of walls ({PLAN_JSON})'])}"
         )
     if TAGS_JSON in files:
         yield from tag_lines(json.loads(files[TAGS_JSON]))
