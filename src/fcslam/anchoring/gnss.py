@@ -107,7 +107,7 @@ def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: b
     middle = np.median([(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in kept], axis=0)
     projection: Any = Proj(proj="aeqd", lat_0=middle[0], lon_0=middle[1], ellps="WGS84")
     east, north = projection([fix.longitude_deg for fix in kept], [fix.latitude_deg for fix in kept])
-    gaps_s = np.concatenate([np.diff(robot.stamps[rows]) for robot, rows in zip(robots, at, strict=True)])
+    gaps_s = np.concatenate([np.diff(np.sort(robot.stamps[rows])) for robot, rows in zip(robots, at, strict=True)])
     interval_s = float(np.median(gaps_s)) if len(gaps_s) else CORRELATED_S
     measured = _Measured(
         np.concatenate([robot.variables[rows] for robot, rows in zip(robots, at, strict=True)]),

@@ -112,8 +112,7 @@ class Contradiction(NamedTuple):
             )
         remedy = (
             "correct the mounting in tf, or give --sensors laser-pose=X,Y,THETA[,upside-down], or correct the signs of "
-            "the "
-            "odometry"
+            "the odometry"
         )
         if upside_down:
             claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")

@@ -13,7 +13,6 @@ from fcslam.sources.bags.transforms import NoTransformError, TransformTree, moun
 SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
 """Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
 stations."""
-LEAST_SIGMA_M: Final = 0.02
 FIX_INTERVAL_S: Final = 0.9
 """Least time between two fixes that are used; the errors of nearer ones are the same."""
 FARTHEST_ANTENNA_M: Final = 50.0
@@ -51,7 +50,7 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
     sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
     if content.position_covariance_type and 0.0 < east2 < 1e8 and 0.0 < north2 < 1e8:
-        sigma_m = min(max(LEAST_SIGMA_M, (0.5 * (east2 + north2)) ** 0.5), LARGEST_SIGMA_M)
+        sigma_m = min((0.5 * (east2 + north2)) ** 0.5, LARGEST_SIGMA_M)
     return GnssFix(
         stamp,
         latitude,
