@@ -35,6 +35,7 @@ from fcslam.live.inputs import (
 )
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import WIRED, EventKind, Playback, RobotEvent, RobotPose, RobotStatus, Wiring
+from fcslam.live.teammates import beams_on_teammates
 from fcslam.live.tracker import LiveTracker
 from fcslam.maps.joint_tiles import padded
 from fcslam.mission.driving import track_of
@@ -45,6 +46,7 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     LaserModel,
+    LaserScan,
     Ranges,
     SensorRecord,
     Sweep,
@@ -511,7 +513,22 @@ class Robot(LiveTracker):
         self._is_placed = False
         if self._uplink is not None and not self._is_finished:
             self._uplink.before_record()
-        return super()._processed(record)
+        return super()._processed(self._beside_teammates(record) if isinstance(record, LaserScan) else record)
+
+    def _beside_teammates(self, scan: LaserScan) -> LaserScan:
+        """The scan with the beams marked that hit other robots of the fleet, as far as the newest joint map tells."""
+        fleet, pose, radius_m = self.fleet, self._pose, self._config.map.robot_radius_m
+        joint = None if fleet is None else fleet.joint_map
+        if fleet is None or joint is None or pose is None or radius_m <= 0.0:
+            return scan
+        known = fleet.robots()
+        own = next((mate.map_index for mate in known if mate.robot == self.name), None)
+        if own is None or own != pose.map_index:  # the joint map is that of ``own``
+            return scan
+        moved = np.zeros(3) if pose.T_odom_base is None else se2.between(pose.T_odom_base, scan.T_odom_base)
+        others = [mate for mate in known if mate.map_index == own and mate.robot != self.name]
+        on_teammates = beams_on_teammates(scan, se2.compose(pose.T_map_base, moved), others, joint, radius_m)
+        return scan if on_teammates is None else replace(scan, on_teammates=on_teammates)
 
     def _take(self, packets: list[Packet]) -> None:
         """Pass the next packets on."""

@@ -120,7 +120,7 @@ class RobotFrontend:
         self.odometry_fault: str | None = None
         """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
         self._config = config
-        self._mapped = MappedScans(config.lidar.ignore)
+        self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
