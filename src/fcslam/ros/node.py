@@ -244,8 +244,9 @@ class RobotNode:
         return True
 
     def _publish_fleet(self) -> None:
-        """Publish where the robots of the fleet are, at a fixed rate; frontiers and changes of the robot's map once."""
-        news, frontiers = 0, None
+        """Publish where the robots of the fleet are, at a fixed rate; frontiers, changes of the robot's map and how
+        good it is once."""
+        news, frontiers, quality = 0, None, None
         while not self._stop.wait(_FLEET_PERIOD_S):
             fleet = self._robot.fleet
             if fleet is None:
@@ -255,6 +256,9 @@ class RobotNode:
             if fleet.frontiers is not frontiers:
                 frontiers = fleet.frontiers
                 self._publish_frontiers(now_ns, fleet)
+            if fleet.quality and fleet.quality != quality:
+                quality = fleet.quality
+                self._outputs.quality(now_ns, self._robot.name, quality)
             for line in fleet.news[news:]:
                 news += 1
                 self._outputs.event(now_ns, self._robot.name, line)

@@ -21,6 +21,7 @@ from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
     from fcslam.live.fleet_view import Teammate
+    from fcslam.wire.fleet_client import QualityReply
 
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
@@ -33,6 +34,7 @@ OWN_MAP: Final = "own_map"
 """Topic of what a robot of a fleet saw itself."""
 FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
 FLEET_FRONTIERS, FLEET_GOAL = "fleet/frontiers", "fleet/goal"
+FLEET_QUALITY = "fleet/quality"
 MOST_TEAMMATES: Final = 64
 """Robots with a topic of their own; the others are in ``fleet/poses`` only."""
 LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
@@ -107,6 +109,7 @@ class Outputs:
         self._fleet: tuple[Publish, Publish] | None = None
         self._exploration: tuple[Publish, Publish] | None = None
         self._goal_xy: FloatArray = np.full(2, np.nan)
+        self._quality: Publish | None = None
         self._grid_topic(MAP)
         self._pose = publisher("pose", POSE, STREAMED)
         self._path = publisher("path", PATH, LATCHED)
@@ -173,6 +176,22 @@ class Outputs:
                 header = self._codec.header(now_ns, self._names.map_frame)
                 goal = self._codec.make(POSE_STAMPED, header=header, pose=self._codec.pose(in_space(T_map_goal)))
                 self._send(self._exploration[1], POSE_STAMPED, goal)
+
+    def quality(self, now_ns: int, robot: str, maps: "Sequence[QualityReply]") -> None:
+        """Publish how good the map of a robot is, by its certificate."""
+        with self._lock:
+            if self._quality is None:
+                self._quality = self._publisher(FLEET_QUALITY, DIAGNOSTICS, LATCHED)
+            statuses = [
+                self._status(f"map {one.map_index}", robot, _WARN if one.drives else _OK, one.verdict, {
+                    "map": one.map_index, "bar_m": one.bar_m, "within_m": one.within_m, "error_95_m": one.error_95_m,
+                    "good_share": one.good_share,
+                    **{f"drive_{number}": text for number, text in enumerate(one.drives, 1)},
+                })
+                for one in maps
+            ]  # fmt: skip
+            message = self._codec.make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
+            self._send(self._quality, DIAGNOSTICS, message)
 
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
         """Publish a map if it changed; returns whether it did.

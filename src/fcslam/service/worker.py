@@ -26,6 +26,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -48,7 +49,7 @@ from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.processes import Background, Start, start_copy
 from fcslam.records import Edit
-from fcslam.runs import Metric, Run
+from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
@@ -86,6 +87,8 @@ SHARED_LOOK_S = 0.25
 """Between two looks for packets that other instances stored."""
 LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
+QUALITY_EVERY_S = 30.0
+"""Its certificate is not computed more often than this, unless maps join or part."""
 
 _log = logging.getLogger(__name__)
 
@@ -125,6 +128,8 @@ class Worker:
         self._published = -1
         self._publish_at = clock()
         self._publishing: _Publishing | None = None
+        self._certified, self._certify_at = dict[str, int](), -math.inf
+        """The map of each session as the certificate of the live run folder was computed, and when it is due again."""
         self._joint_drawn, self._joint_at = -1, -math.inf
         self._joint_drawing: _Publishing | None = None
         self._heard: dict[tuple[str, int], float] = {}
@@ -442,17 +447,25 @@ class Worker:
             if self._fleet.read_ahead(AT_ONCE):  # after a restart, with a look at what else there is to do in between
                 return True
             result, traffic = self._fleet.estimate(), self._store.traffic()
+            maps = {robot.robot: robot.map_index for robot in result.robots}
+            certifies = now >= self._certify_at or maps != self._certified
             # Everything that it needs is in memory: the copy of this process must not use the store.
-            task = self._start(lambda: self._write_live(result, traffic))
+            task = self._start(lambda: self._write_live(result, traffic, certifies))
         except Exception as error:  # packets matter more, and there may be memory later
             return self._postpone(f"{type(error).__name__}: {error}")
+        if certifies:
+            self._certified, self._certify_at = maps, now + QUALITY_EVERY_S
         self._publishing = _Publishing(task, self._applied, now)
         self._published = self._applied
         return True
 
-    def _write_live(self, result: FleetResult, traffic: Ledger) -> None:
+    def _write_live(self, result: FleetResult, traffic: Ledger, certifies: bool) -> None:
         try:
-            self._folder.publish(self._run(result, traffic, with_local_maps=False))
+            run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
+            if not certifies:
+                files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))
+                run = replace(run, quality={file.name: file.read_bytes() for file in files})
+            self._folder.publish(run)
         except Exception as error:
             _log.error("the live map cannot be written: %s: %s", type(error).__name__, error)
             sys.exit(1)
@@ -476,14 +489,16 @@ class Worker:
         self._published, self._publish_at = -1, self._clock() + PAUSE_S
         return False
 
-    def _run(self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True) -> Run:
+    def _run(
+        self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True, with_certificates: bool = True
+    ) -> Run:
         counts: Counter[str] = Counter()  # over all floors
         for state in self._fleet.vocabularies():
             counts[f"words_{state.channel}_{state.detector_version}"] += state.words
         words = [Metric(name, count, "1") for name, count in counts.items()]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
-        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
+        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps, with_certificates)
 
 
 class _Publishing(NamedTuple):
