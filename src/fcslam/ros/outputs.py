@@ -196,18 +196,21 @@ class Outputs:
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
         """Publish a map if it changed; returns whether it did.
 
-        A small map goes out whole, unless ``only_changes``. Of a large map, only the cells go out that differ from the
-        last whole one or from the last update. So a late subscriber, who gets the whole one, is complete after any
-        update, and one who got all updates keeps no cell that changed back.
+        A small map goes out whole, unless ``only_changes``: the static layer of Nav2 takes no updates by default. Of a
+        large map, only the cells go out that differ from the last whole one or from the last update. So a late
+        subscriber, who gets the whole one, is complete after any update, and one who got all updates keeps no cell that
+        changed back.
         """
         grid = grid_of(occupancy)
         with self._lock:
             shown = self._grid_topic(topic)
-            if shown.newest is not None and _is_same(shown.newest, grid):
+            goes_whole = grid.values.size <= SMALL_MAP_CELLS and not only_changes
+            last = shown.whole if goes_whole else shown.newest
+            if last is not None and _is_same(last, grid):
                 return False
             before, shown.newest = (shown.whole, shown.newest), grid
             of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
-            if of_whole is None or of_newest is None or (grid.values.size <= SMALL_MAP_CELLS and not only_changes):
+            if goes_whole or of_whole is None or of_newest is None:
                 shown.whole = grid
                 self._send(shown.publish, GRID, self._grid_message(stamp_ns, grid))
             else:

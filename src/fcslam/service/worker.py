@@ -448,7 +448,8 @@ class Worker:
                 return True
             result, traffic = self._fleet.estimate(), self._store.traffic()
             maps = {robot.robot: robot.map_index for robot in result.robots}
-            certifies = now >= self._certify_at or maps != self._certified
+            is_known = (self._folder.live / f"{QUALITY}.json").exists()
+            certifies = not is_known or now >= self._certify_at or maps != self._certified
             # Everything that it needs is in memory: the copy of this process must not use the store.
             task = self._start(lambda: self._write_live(result, traffic, certifies))
         except Exception as error:  # packets matter more, and there may be memory later
