@@ -9,15 +9,16 @@ scanners in other kinds of buildings, with drives in the buildings 100 and 101, 
 errors, median and 95 %.
 
 The good scanner sees 12 m far, with noise of 0.015 m: its maps are better than 5 cm. The weak one sees 3 m far, with
-noise of 0.06 m, on one robot: its maps are worse. Maps of the medium one (5 m, 0.03 m, one robot) are good in places, and
-so are few of the short one (4 m, 0.04 m, two robots); these two were never used for calibration either. Logs: the error of a cell is the root mean square error of the pairs of scans up to
-10 m apart that end in it and whose relation is known.
+noise of 0.06 m, on one robot: its maps are worse. Maps of the medium one (5 m, 0.03 m, one robot) are good in places.
+Those of the short one (4 m, 0.04 m, two robots) are good almost nowhere. Logs: the error of a cell is the root mean
+square error of the pairs of scans up to 10 m apart that end in it and whose relation is known.
 
 The relations have errors of centimetres themselves, so they cannot judge 5 cm. Two tables show it. Where three
 relations close a triangle, no map and no scan is needed: they should lead back to where they begin. And the two raw
-scans of a relation lie on each other: iterative closest points, which share no code with the mapping, begin at the
-relation and are held by it (0.05 m, 1 degree), so that it stays where walls leave a direction open. The cells of the
-logs are judged by both: the relations as published, and the relations that were aligned so.
+scans of a relation are laid on each other by iterative closest points, which know neither map nor graph. They begin at
+the relation and are held by it (0.05 m, 1 degree), so it stays as it is where walls leave a direction open. The cells
+of the logs are judged by both: the relations as published, and the aligned ones. Errors that all scans of a laser
+share, as of its scale, show in neither.
 """
 
 import json
