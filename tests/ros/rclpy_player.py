@@ -55,12 +55,11 @@ class Driver:
         self.scans = self.node.create_publisher(LaserScan, f"{namespace}/scan", qos_profile_sensor_data)
         self.odometry = self.node.create_publisher(Odometry, f"{namespace}/odom", 10)
         self.finish = self.node.create_publisher(Empty, f"{namespace}/fcslam/finish", 10)
-        self.latencies, self.sent, self.maps, self.faults = [], {}, 0, set()
+        self.latencies, self.sent, self.faults = [], {}, set()
         self.node.create_subscription(PoseWithCovarianceStamped, f"{namespace}/pose", self.saw, 100)
         self.node.create_subscription(OccupancyGrid, f"{namespace}/map", self.mapped, LATCHED)
 
     def mapped(self, grid):
-        self.maps += 1
         self.faults |= set(faults_of(grid))
 
     def saw(self, pose):
@@ -137,12 +136,12 @@ def main(path, namespace, speed):
     driver.finish.publish(Empty())
     time.sleep(0.5)
     answer = {"played": len(recording["stamps"]), "posed": len(driver.latencies)}
-    answer |= {"maps": driver.maps, "faults": sorted(driver.faults)}
     if driver.latencies:
         answer["latency_ms"] = [1e3 * float(np.quantile(driver.latencies, share)) for share in (0.5, 0.9, 0.99)]
     if maps:
         grid = maps[-1]
         answer |= {"map_s": map_s, "frame": grid.header.frame_id, "values": sorted(set(grid.data))}
+        answer["faults"] = sorted(driver.faults.union(faults_of(grid)))
         answer |= {"width": grid.info.width, "height": grid.info.height}
     answer["path"] = len(paths[-1].poses) if paths else 0
     sys.stdout.write(json.dumps(answer) + "\n")
