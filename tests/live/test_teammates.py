@@ -135,6 +135,29 @@ def test_a_robot_that_follows_another_through_a_corridor_knows_that_it_drives():
     assert ends[0.0] > 3.0, "or the test shows nothing"
 
 
+def test_a_robot_that_stands_is_no_ghost_in_what_this_robot_saw_last(joint):
+    """Until the cloud draws the newest scans, the robot draws them itself."""
+    start, standing = np.array((-1.5, 0.0)), np.array((0.3, 0.8))
+    poses = worlds.drive([start, (1.5, 0.0)], step_m=0.1)
+    shifted = replace(joint, origin_xy=tuple((np.array(joint.origin_xy) - start).tolist()))
+    ghosts = {}
+    for radius_m in (0.35, 0.0):
+        config = {"map": {"robot_radius_m": radius_m}}
+        with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
+            robot.fleet = Fleet(shifted)
+            robot.fleet.mates = [mate(0.0, 0.0, name="a"), mate(*(standing - start))]
+            robot._correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
+            for k, pose in enumerate(poses):
+                scan, _ = scan_at(pose, worlds.room(), standing)
+                robot.add_scan(scan.ranges_m, 0.1 * k, pose)
+            drawn = robot.joint_map()
+        rows, columns = np.nonzero(drawn.cells == Occupancy.OCCUPIED)
+        places = drawn.origin_xy + 0.05 * (np.stack((columns, rows), axis=-1) + 0.5)
+        ghosts[radius_m] = np.count_nonzero(np.hypot(*(places - (standing - start)).T) < RADIUS_M + 0.05)
+    assert ghosts[0.35] == 0
+    assert ghosts[0.0] > 0, "or the test shows nothing"
+
+
 def test_the_points_stay_in_the_scan_that_is_sent():
     scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
     frontend = RobotFrontend("a", RobotConfig())

@@ -42,10 +42,8 @@ class MappedScans:
             rays = rays_of(laser)  # the body moves with the laser
             points = rays.origins + np.minimum(returns, laser.max_range_m)[:, None] * rays.directions
             returns = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), returns)
-        on_teammates = None if scan.on_teammates is None else scan.on_teammates[::step]
         sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
-        ranges_m = dequantise(quantise(returns))
-        return replace(scan, ranges_m=ranges_m, laser=laser, sweep=sweep, on_teammates=on_teammates)
+        return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser, sweep=sweep)
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
