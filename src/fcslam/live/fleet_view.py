@@ -24,7 +24,7 @@ POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
 FRONTIERS_S: Final = 5.0
 """Time between two looks at the frontiers."""
-QUALITY_S: Final = 30.0
+QUALITY_S: Final = 10.0
 """Time between two looks at how good the map is."""
 DOWNLINK_KBPS: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
