@@ -246,9 +246,9 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
     monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
     monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
     start = partial(Turned, wiring=Wiring(SameThread()))
-    arguments = ("anna", RosAddress("ros2", "/anna"), start, BagOptions(), NodeParameters(), tmp_path / "run")
+    anna = live.LiveRobot("anna", RosAddress("ros2", "/anna"), BagOptions(), NodeParameters())
     with pytest.raises(type(failure), match=re.escape(str(failure))):
-        live.drive_live(*arguments, Console(file=io.StringIO()))
+        live.drive_live(anna, start, tmp_path / "run", Console(file=io.StringIO()))
     assert read_tum(tmp_path / "run" / "trajectories" / "anna.tum")[0].size == len(scans)
     assert f"{len(scans)} scans, 1 sessions" in capsys.readouterr().out
 
