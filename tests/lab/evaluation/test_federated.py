@@ -80,7 +80,7 @@ def with_shapes(finished, folder):
     return folder
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_path):
     whole = finished[1]
 
@@ -108,7 +108,7 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
     assert again.robots == ("north", "south")
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     arms = {"frozen": Arm(settings={"normalisation": "frozen"}, seeds=1)}
