@@ -9,7 +9,7 @@ from fcslam.cluster.verifying import verifying
 from fcslam.cluster.workers import Workers
 from fcslam.errors import InputError
 from fcslam.mission.driving import side_by_side
-from fcslam.robot.beside import worker_process
+from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import Recording
 

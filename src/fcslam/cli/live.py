@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.errors import FcslamError
-    from fcslam.learning.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
@@ -52,7 +52,7 @@ def named_address(argument: str) -> "tuple[str, RosAddress]":
     return name if equals else place.robot, place
 
 
-class LiveRobot(NamedTuple):
+class LiveSource(NamedTuple):
     """Where a live robot is, and how it is read."""
 
     name: str
@@ -61,7 +61,7 @@ class LiveRobot(NamedTuple):
     parameters: "NodeParameters"
 
 
-def live_robot(argument: str, sensors: list[str] | None, ros_parameters: Path | None, use_sim_time: bool) -> LiveRobot:
+def live_source(argument: str, sensors: list[str] | None, ros_parameters: Path | None, use_sim_time: bool) -> LiveSource:
     """The live robot that the options of a command describe.
 
     Raises:
@@ -70,11 +70,11 @@ def live_robot(argument: str, sensors: list[str] | None, ros_parameters: Path | 
     from fcslam.sources import BagOptions
 
     name, address = named_address(argument)
-    return LiveRobot(name, address, bag_options(sensors) or BagOptions(), node_parameters(ros_parameters, use_sim_time))
+    return LiveSource(name, address, bag_options(sensors) or BagOptions(), node_parameters(ros_parameters, use_sim_time))
 
 
 def drive_live(
-    live: LiveRobot,
+    live: LiveSource,
     start: "Callable[..., Robot | LocalizedRobot]",
     output: Path | None,
     console: "Console",
@@ -162,14 +162,14 @@ def _learning(
         yield lambda _pose: None
         return
     from fcslam.errors import CloudError, StateError
-    from fcslam.learning.federated.learning_beside import LearningBeside
+    from fcslam.learning.federated.learning_process import LearningProcess
     from fcslam.live.standstill import Standstill
 
-    with closing(LearningBeside(plan, robot.name, notify)) as learning:
+    with closing(LearningProcess(plan, robot.name, notify)) as learning:
 
         def stop() -> None:
             try:
-                robot.stand_still()
+                robot.idle()
             except (CloudError, StateError):  # an event named it; the robot maps on, but does not learn
                 return
             learning.set_idle(True)

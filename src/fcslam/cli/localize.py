@@ -92,11 +92,11 @@ def localize(
         keep_private()
         _fetch(map_path, cloud, console)
     if live:
-        from fcslam.cli.live import drive_live, live_robot
+        from fcslam.cli.live import drive_live, live_source
         from fcslam.live.localized_robot import LocalizedRobot
 
         start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
-        drive_live(live_robot(source, sensors, ros_parameters, use_sim_time), start, output, console)
+        drive_live(live_source(source, sensors, ros_parameters, use_sim_time), start, output, console)
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)

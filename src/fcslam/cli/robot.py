@@ -74,7 +74,7 @@ def robot(
     ] = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
-    from fcslam.cli.live import drive_live, is_live, live_robot
+    from fcslam.cli.live import drive_live, is_live, live_source
     from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
@@ -86,7 +86,7 @@ def robot(
             f"{address}: is not the address of a live robot, as ros2:/robot1 is; `fcslam play` plays a recording to a "
             "service"
         )
-    live = live_robot(address, sensors, ros_parameters, use_sim_time)
+    live = live_source(address, sensors, ros_parameters, use_sim_time)
     settings, cloud = mission_config(config), access(server, credentials, budget_kbps)
     start = partial(
         Robot,

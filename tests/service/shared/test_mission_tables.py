@@ -62,7 +62,7 @@ def test_what_is_imported_is_exported_again(registry, postgres, tmp_path):
     store.export(tmp_path / "before.sqlite")
     store.close()
     tables = MissionTables(postgres, registry.create("imported"))
-    tables.take_in(tmp_path / "before.sqlite")
+    tables.import_mission(tmp_path / "before.sqlite")
     tables.export(tmp_path / "after.sqlite")
     assert rows(tmp_path / "after.sqlite") == rows(tmp_path / "before.sqlite")
     assert MissionStore(tables).put([packet(sequence=30)], 0.0) == 1
