@@ -142,7 +142,7 @@ def test_names_of_folders_that_are_no_utf8_are_names(begun, tmp_path):
 
 
 @pytest.mark.attack
-def test_a_state_beyond_the_limit_is_not_read(begun, resumed, tmp_path):
+def test_a_state_of_another_size_is_not_read(begun, resumed, tmp_path):
     """A file with a hole, of 3 GB."""
     run = copied(begun, tmp_path / "run")
     os.truncate(run / "mission.state", 3 << 30)
