@@ -1,5 +1,6 @@
 """Processes that end with the process that started them, however that ends: workers, and tasks beside it."""
 
+import ctypes
 import errno
 import multiprocessing
 import os
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from fcslam.errors import InputError
 
@@ -19,6 +20,10 @@ NICENESS = 10
 
 _NO_SEMAPHORES = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.ENOSYS})
 """Errors of a host that has none, and not of a process with too many open files, for example."""
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+_ALLOCATOR: Final = {_M_TRIM_THRESHOLD: 1 << 17, _M_MMAP_THRESHOLD: 1 << 17, _M_ARENA_MAX: 2}
+"""Options of glibc's ``mallopt``: the default sizes in bytes, which then do not adapt, and the number of heaps."""
 
 
 class Background(Protocol):
@@ -37,6 +42,18 @@ class Background(Protocol):
 
 Start = Callable[[Callable[[], None]], Background]
 """Starts a task beside this process."""
+
+
+def return_freed_memory() -> None:
+    """Let this process give freed memory back to the system, also between memory in use.
+
+    glibc by default keeps a heap for each of many threads, and puts ever longer arrays into them. So a process that
+    runs for days grows by the gaps, although what it uses does not. Other allocators stay as they are.
+    """
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        for option, value in _ALLOCATOR.items():
+            set_option(option, value)
 
 
 def start_method() -> Any:

@@ -140,9 +140,11 @@ def _server(
 
     import uvicorn
 
+    from fcslam.processes import return_freed_memory
     from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 
     allow_many_connections()
+    return_freed_memory()
     return GuardedServer(
         uvicorn.Config(
             app,
