@@ -57,13 +57,13 @@ def test_too_many_open_files_say_so(monkeypatch):
 
 FREEING = """
 import resource
-from fcslam.processes import return_freed_memory
+from fcslam.processes import keep_memory_trimmed, trim_memory
 
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
 
-if {is_set}:
-    return_freed_memory()
+if {kept}:
+    keep_memory_trimmed()
 bytearray(8_000_000)  # freed at once, it teaches the allocator to put such into a heap
 arrays, kept = [], []
 for _ in range(100):
@@ -71,15 +71,18 @@ for _ in range(100):
     kept.append(bytearray(b"x") * 5_000)
 full = resident()
 arrays.clear()
+if {trimmed}:
+    trim_memory()
 print(full - resident())
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
 def test_freed_memory_goes_back_although_some_between_it_is_in_use():
-    def freed(is_set):
-        command = [sys.executable, "-c", FREEING.format(is_set=is_set)]
+    def freed(kept, trimmed):
+        command = [sys.executable, "-c", FREEING.format(kept=kept, trimmed=trimmed)]
         return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
-    assert freed(False) < 20e6, "what the allocator does by itself"
-    assert freed(True) > 90e6
+    assert freed(kept=False, trimmed=False) < 20e6, "what the allocator does by itself"
+    assert freed(kept=True, trimmed=False) > 90e6
+    assert freed(kept=False, trimmed=True) > 90e6

@@ -44,16 +44,27 @@ Start = Callable[[Callable[[], None]], Background]
 """Starts a task beside this process."""
 
 
-def return_freed_memory() -> None:
-    """Let this process give freed memory back to the system, also between memory in use.
+def keep_memory_trimmed() -> None:
+    """Let this process give freed memory back to the system at once, also between memory in use.
 
     glibc by default keeps a heap for each of many threads, and puts ever longer arrays into them. So a process that
-    runs for days grows by the gaps, although what it uses does not. Other allocators stay as they are.
+    runs for days grows by the gaps, although what it uses does not. Other allocators stay as they are. Where long
+    arrays come and go all the time, this costs a third of the CPU: call ``trim_memory`` now and then there.
     """
-    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
-    if set_option is not None:
-        for option, value in _ALLOCATOR.items():
-            set_option(option, value)
+    for option, value in _ALLOCATOR.items():
+        _glibc("mallopt", option, value)
+
+
+def trim_memory() -> None:
+    """Give memory that is free now back to the system."""
+    _glibc("malloc_trim", 0)
+
+
+def _glibc(name: str, *values: int) -> None:
+    """Call a function that other C libraries lack."""
+    function = getattr(ctypes.CDLL(None), name, None)
+    if function is not None:
+        function(*values)
 
 
 def start_method() -> Any:

@@ -140,11 +140,11 @@ def _server(
 
     import uvicorn
 
-    from fcslam.processes import return_freed_memory
+    from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 
     allow_many_connections()
-    return_freed_memory()
+    keep_memory_trimmed()
     return GuardedServer(
         uvicorn.Config(
             app,
