@@ -61,7 +61,9 @@ class LiveSource(NamedTuple):
     parameters: "NodeParameters"
 
 
-def live_source(argument: str, sensors: list[str] | None, ros_parameters: Path | None, use_sim_time: bool) -> LiveSource:
+def live_source(
+    argument: str, sensors: list[str] | None, ros_parameters: Path | None, use_sim_time: bool
+) -> LiveSource:
     """The live robot that the options of a command describe.
 
     Raises:
@@ -70,7 +72,9 @@ def live_source(argument: str, sensors: list[str] | None, ros_parameters: Path |
     from fcslam.sources import BagOptions
 
     name, address = named_address(argument)
-    return LiveSource(name, address, bag_options(sensors) or BagOptions(), node_parameters(ros_parameters, use_sim_time))
+    return LiveSource(
+        name, address, bag_options(sensors) or BagOptions(), node_parameters(ros_parameters, use_sim_time)
+    )
 
 
 def drive_live(

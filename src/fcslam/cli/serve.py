@@ -140,9 +140,11 @@ def _server(
 
     import uvicorn
 
+    from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 
     allow_many_connections()
+    keep_memory_trimmed()
     return GuardedServer(
         uvicorn.Config(
             app,

@@ -47,7 +47,7 @@ from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.processes import RecurringTask, Start, start_copy
+from fcslam.processes import RecurringTask, Start, start_copy, trim_memory
 from fcslam.records import Edit
 from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
@@ -266,6 +266,7 @@ class Worker:
             self._share(SNAPSHOT, self._folder.snapshot)
         except (OSError, StoreError) as error:  # a restart takes longer then, and no more
             _log.error("no snapshot of the worker was written: %s", error)
+        trim_memory()  # gaps would grow for days
         self._written = self._applied
         self._write_at = self._clock() + max((self._clock() - began) / SNAPSHOT_SHARE, SNAPSHOT_EVERY_S)
         return True

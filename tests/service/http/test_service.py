@@ -243,8 +243,9 @@ def test_tiles_show_what_the_map_shows(mapped):
     assert mapped.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
 
 
-def test_a_tile_that_did_not_change_is_not_sent_again(mapped):
-    path = f"{API}/maps/0/tiles/5/0/0.png"
+@pytest.mark.parametrize("part", ["tiles/5/0/0.png", "layers/changes"])
+def test_a_part_of_a_map_that_did_not_change_is_not_sent_again(mapped, part):
+    path = f"{API}/maps/0/{part}"
     first = mapped.ask("GET", path, "eye")
     again = mapped.ask("GET", path, "eye", headers={"If-None-Match": first.headers["ETag"]})
     assert (again.status_code, again.content) == (304, b"")
