@@ -32,7 +32,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-learning test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
+.PHONY: help install gl learning demo test test-fast test-system test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
 # Where this is set, each process of a test compiles the package and the tests anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -42,7 +42,7 @@ help:
 	@echo "make test         all tests that need no recordings"
 	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
-	@echo "make test-learning a service and three robots that learn while they map; run make learning first"
+	@echo "make test-training federated training, with attackers and with deployed daemons; run make learning first"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
 	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
@@ -92,17 +92,17 @@ demo: gl learning
 	@$(BIN)/fcslam demo --output $(DEMO) $$($(HAS_GL) || echo --no-camera)
 
 test: $(INSTALLED)
-	@$(PYTEST) -m "not system"
+	@$(PYTEST) -m "not system and not training"
 
 test-fast: $(INSTALLED)
-	@$(PYTEST) -m "not system and not slow"
+	@$(PYTEST) -m "not system and not training and not slow"
 
 test-system: $(INSTALLED)
 	@$(PYTEST) -m system -rs
 
-# A service and three robots that learn while they map; needs what `make learning` installs.
-test-learning: $(INSTALLED)
-	@$(PYTEST) -m system -rs tests/learning/federated/test_learning_fleet.py
+# Needs what `make learning` installs.
+test-training: $(INSTALLED)
+	@$(PYTEST) -m training -rs
 
 test-attack: $(INSTALLED)
 	@$(PYTEST) -m attack -rs

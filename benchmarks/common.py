@@ -133,7 +133,7 @@ class Report:
         self._folder: Path = chosen.results
         self._setting = {
             "date": chosen.date,
-            "command": " ".join([f"python benchmarks/{self._name}.py", *sys.argv[1:]]),
+            "command": " ".join([f"python benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         }
         self._setting |= machine()
         self._parts: list[str] = []

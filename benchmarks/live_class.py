@@ -25,7 +25,7 @@ from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_f
 from fcslam.live.playback import PlaybackPace
 from fcslam.live.robot import LARGEST_BACKLOG
 from fcslam.records import LaserScan
-from fcslam.robot.beside import backend_process
+from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
 

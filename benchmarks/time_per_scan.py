@@ -29,7 +29,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.live.robot import LARGEST_BACKLOG
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserScan
-from fcslam.robot.beside import backend_process
+from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.sources import open_source

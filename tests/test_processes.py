@@ -1,6 +1,8 @@
-"""A host without semaphores for processes, such as a container without /dev/shm, gets one clear line."""
+"""Processes: a host without semaphores, such as a container without /dev/shm, gets one clear line; memory goes back."""
 
 import errno
+import subprocess
+import sys
 from multiprocessing import synchronize
 
 import pytest
@@ -9,7 +11,7 @@ from fcslam.cluster.verifying import verifying
 from fcslam.cluster.workers import Workers
 from fcslam.errors import InputError
 from fcslam.mission.driving import side_by_side
-from fcslam.robot.beside import worker_process
+from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import Recording
 
@@ -51,3 +53,36 @@ def test_too_many_open_files_say_so(monkeypatch):
     let_semaphores_fail(monkeypatch, errno.EMFILE)
     with pytest.raises(OSError, match="refused"):
         worker_process()
+
+
+FREEING = """
+import resource
+from fcslam.processes import keep_memory_trimmed, trim_memory
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
+
+if {kept}:
+    keep_memory_trimmed()
+bytearray(8_000_000)  # freed at once, it teaches the allocator to put such into a heap
+arrays, kept = [], []
+for _ in range(100):
+    arrays.append(bytearray(b"x") * 1_000_000)
+    kept.append(bytearray(b"x") * 5_000)
+full = resident()
+arrays.clear()
+if {trimmed}:
+    trim_memory()
+print(full - resident())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_freed_memory_goes_back_although_some_between_it_is_in_use():
+    def freed(kept, trimmed):
+        command = [sys.executable, "-c", FREEING.format(kept=kept, trimmed=trimmed)]
+        return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+    assert freed(kept=False, trimmed=False) < 20e6, "what the allocator does by itself"
+    assert freed(kept=True, trimmed=False) > 90e6
+    assert freed(kept=False, trimmed=True) > 90e6

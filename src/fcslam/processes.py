@@ -1,5 +1,6 @@
 """Processes that end with the process that started them, however that ends: workers, and tasks beside it."""
 
+import ctypes
 import errno
 import multiprocessing
 import os
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from fcslam.errors import InputError
 
@@ -19,6 +20,10 @@ NICENESS = 10
 
 _NO_SEMAPHORES = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.ENOSYS})
 """Errors of a host that has none, and not of a process with too many open files, for example."""
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+_ALLOCATOR: Final = {_M_TRIM_THRESHOLD: 1 << 17, _M_MMAP_THRESHOLD: 1 << 17, _M_ARENA_MAX: 2}
+"""Options of glibc's ``mallopt``: the default sizes in bytes, which then do not adapt, and the number of heaps."""
 
 
 class Background(Protocol):
@@ -37,6 +42,71 @@ class Background(Protocol):
 
 Start = Callable[[Callable[[], None]], Background]
 """Starts a task beside this process."""
+
+
+class RecurringTask:
+    """A task that runs beside this process again and again, for at most a share of the time."""
+
+    def __init__(self, start: Start, clock: Callable[[], float], share: float, every_s: float) -> None:
+        """``every_s``: the shortest time between the end of one run and the beginning of the next."""
+        self._start, self._clock, self._share, self._every_s = start, clock, share, every_s
+        self._running: Background | None = None
+        self._began_s = clock()
+        self.due_s = self._began_s
+        """When the next run may begin, by the clock."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a run has begun and ``end`` has not said that it ended."""
+        return self._running is not None
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a run may begin now."""
+        return self._running is None and self._clock() >= self.due_s
+
+    def begin(self, task: Callable[[], None]) -> None:
+        """Begin a run."""
+        self._running, self._began_s = self._start(task), self._clock()
+
+    def end(self) -> int | None:
+        """The exit code of a run that has ended since the last call; None: none has."""
+        if self._running is None or self._running.exitcode is None:
+            return None
+        exitcode, self._running = self._running.exitcode, None
+        now = self._clock()
+        self.due_s = now + max((now - self._began_s) * (1.0 / self._share - 1.0), self._every_s)
+        return exitcode
+
+    def stop(self) -> None:
+        """End a run that goes on."""
+        if self._running is not None:
+            self._running.terminate()
+            self._running.join()
+            self._running = None
+
+
+def keep_memory_trimmed() -> None:
+    """Let this process give freed memory back to the system at once, also between memory in use.
+
+    glibc by default keeps a heap for each of many threads, and puts ever longer arrays into them. So a process that
+    runs for days grows by the gaps, although what it uses does not. Other allocators stay as they are. Where long
+    arrays come and go all the time, this costs a third of the CPU: call ``trim_memory`` now and then there.
+    """
+    for option, value in _ALLOCATOR.items():
+        _glibc("mallopt", option, value)
+
+
+def trim_memory() -> None:
+    """Give memory that is free now back to the system."""
+    _glibc("malloc_trim", 0)
+
+
+def _glibc(name: str, *values: int) -> None:
+    """Call a function that other C libraries lack."""
+    function = getattr(ctypes.CDLL(None), name, None)
+    if function is not None:
+        function(*values)
 
 
 def start_method() -> Any:

@@ -62,23 +62,27 @@ class LimitError(OSError):
     """A file exceeds a limit; the message names the limit."""
 
 
-def open_file(path: Path, within: Path | None = None) -> BinaryIO:
+def open_file(path: Path, within: Path | None = None, most: int | None = None) -> BinaryIO:
     """Open a regular file for reading.
 
     Args:
         path: the file; a link that the user names is followed.
         within: a folder from outside that holds the file, directly or in folders: nothing below it may be a link.
+        most: the largest size, bytes; None: any.
 
     Raises:
         OSError: the file is missing, unreadable, a link within the folder, or a folder, pipe or device.
+        LimitError: it is larger than ``most``.
     """
     descriptor = os.open(path, _FLAGS) if within is None else _open_within(path, within)
     try:
-        mode = os.fstat(descriptor).st_mode
-        if stat.S_ISDIR(mode):
+        found = os.fstat(descriptor)
+        if stat.S_ISDIR(found.st_mode):
             raise IsADirectoryError(f"{path} is a folder, not a file")
-        if not stat.S_ISREG(mode):
+        if not stat.S_ISREG(found.st_mode):
             raise OSError(f"{path} is a pipe or device, not a file")
+        if most is not None and found.st_size > most:
+            raise LimitError(f"{path.name} has {_size(found.st_size)}; the limit is {_size(most)}")
         return os.fdopen(descriptor, "rb", _BUFFER_BYTES)
     except BaseException:
         os.close(descriptor)
@@ -100,11 +104,8 @@ def read_bytes(path: Path, within: Path | None = None, most: int = MOST_BYTES) -
     Raises:
         OSError: as ``open_file``, or the file is larger than ``most``.
     """
-    with open_file(path, within) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > most:
-            raise LimitError(f"{path.name} has {_size(size)}; the limit is {_size(most)}")
-        return file.read(size)
+    with open_file(path, within, most) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path, within: Path | None = None, most: int = MOST_BYTES) -> str:

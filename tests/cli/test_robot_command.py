@@ -215,8 +215,8 @@ def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypat
         def close(self):
             told.append("closed")
 
-    monkeypatch.setattr("fcslam.learning.federated.learning_beside.LearningBeside", Process)
-    robot = SimpleNamespace(name="anna", stand_still=lambda: told.append("keyframes are placed"))
+    monkeypatch.setattr("fcslam.learning.federated.learning_process.LearningProcess", Process)
+    robot = SimpleNamespace(name="anna", idle=lambda: told.append("keyframes are placed"))
     with live._learning("plan", robot, told.append) as follow:
         watch = live._watch(told.append, follow)
         for scan in range(1, 30):
@@ -246,9 +246,9 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
     monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
     monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
     start = partial(Turned, wiring=Wiring(SameThread()))
-    arguments = ("anna", RosAddress("ros2", "/anna"), start, BagOptions(), NodeParameters(), tmp_path / "run")
+    anna = live.LiveSource("anna", RosAddress("ros2", "/anna"), BagOptions(), NodeParameters())
     with pytest.raises(type(failure), match=re.escape(str(failure))):
-        live.drive_live(*arguments, Console(file=io.StringIO()))
+        live.drive_live(anna, start, tmp_path / "run", Console(file=io.StringIO()))
     assert read_tum(tmp_path / "run" / "trajectories" / "anna.tum")[0].size == len(scans)
     assert f"{len(scans)} scans, 1 sessions" in capsys.readouterr().out
 
@@ -266,11 +266,11 @@ def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
         def close(self):
             """Nothing to close."""
 
-    def stand_still():
+    def idle():
         raise CloudError("the token is not known (401)")
 
-    monkeypatch.setattr("fcslam.learning.federated.learning_beside.LearningBeside", Process)
-    robot = SimpleNamespace(name="anna", stand_still=stand_still)
+    monkeypatch.setattr("fcslam.learning.federated.learning_process.LearningProcess", Process)
+    robot = SimpleNamespace(name="anna", idle=idle)
     with live._learning("plan", robot, told.append) as follow:
         for scan in range(1, 30):
             follow(SimpleNamespace(stamp=float(scan), T_odom_base=np.zeros(3), T_map_base=np.zeros(3)))

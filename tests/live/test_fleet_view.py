@@ -146,7 +146,7 @@ def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):
         follow(fleet)
         answer = desk.ask("POST", "/api/v1/edits", "boss", json={"kind": "removal", "content": {"robot": "b"}})
         assert answer.status_code == 201, answer.text
-        desk.state.mission.worker.ring()
+        desk.state.mission.worker.notify()
         follow(fleet)
         assert fleet.news[1:] == ["map 0 holds a; taken out: b"]
 

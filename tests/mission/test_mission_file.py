@@ -142,12 +142,22 @@ def test_names_of_folders_that_are_no_utf8_are_names(begun, tmp_path):
 
 
 @pytest.mark.attack
-def test_a_state_beyond_the_limit_is_not_read(begun, resumed, tmp_path):
+def test_a_state_of_another_size_is_not_read(begun, resumed, tmp_path):
     """A file with a hole, of 3 GB."""
     run = copied(begun, tmp_path / "run")
     os.truncate(run / "mission.state", 3 << 30)
     fcslam.map_recordings([], onto=run)
     assert resumed == [False]
+
+
+@pytest.mark.attack
+def test_a_mission_beyond_the_limit_is_refused_by_its_size(begun, tmp_path):
+    """Files with a hole, of 3 GB: nothing of them is read."""
+    run = copied(begun, tmp_path / "run")
+    os.truncate(run / "mission.fcslam", 3 << 30)
+    for read in (read_mission, lambda path: edit_mission(path, [], "me", 0.0)):
+        with pytest.raises(SourceError, match=r"mission\.fcslam has 3221\.2 MB; the limit is 2147\.5 MB$"):
+            read(run)
 
 
 def test_a_state_counts_only_if_nothing_but_the_packets_changed(logs, begun, resumed, tmp_path):

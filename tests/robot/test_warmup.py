@@ -11,11 +11,11 @@ SCRIPT = """
 import gc, json, sys
 from numba.core.dispatcher import Dispatcher
 from fcslam.records import Channel
-from fcslam.robot.beside import Beside
+from fcslam.robot.backend_runner import WorkerBackend
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.warmup import warm_up_tracking
 from tests.robot.kidnapping import kidnapping
-from tests.robot.test_beside import Held
+from tests.robot.test_backend_runner import Held
 
 def compiled():
     return {
@@ -25,7 +25,7 @@ def compiled():
     }
 
 config, executor = RobotConfig(channels=(Channel.LIDAR,)), Held()
-robot = RobotFrontend("r", config, Beside("r", config, executor))
+robot = RobotFrontend("r", config, WorkerBackend("r", config, executor))
 executor.holds = True  # only the front end works
 scans, _ = kidnapping()
 cold = compiled()

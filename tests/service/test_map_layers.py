@@ -88,20 +88,35 @@ def test_changes_lie_where_boxes_came_and_went(run):
         assert np.abs(shapes[kind] - box).max() < 0.5
 
 
-def test_packets_are_read_once_for_all_who_ask_for_changes(tmp_path, monkeypatch):
-    reads = []
-    monkeypatch.setattr(map_layers, "stored_mission", lambda store: reads.append(store) or stored_mission(store))
+@pytest.fixture
+def reads(monkeypatch):
+    """The stores whose packets were read."""
+    found = []
+    monkeypatch.setattr(map_layers, "stored_mission", lambda store: found.append(store) or stored_mission(store))
+    return found
+
+
+def test_packets_are_read_once_for_all_who_ask_for_changes(tmp_path, reads):
     with ShownRun(write_run(tmp_path / "asked", (0, 1)), "asked") as shown:
         first, second = (map_shapes(shown, 0, MapLayer.CHANGES) for _ in range(2))
     assert first == second != []
     assert len(reads) == 1
 
 
-def test_packets_that_expand_too_much_are_not_decoded(tmp_path, monkeypatch):
+@pytest.mark.attack
+def test_packets_that_expand_too_much_are_not_decoded_and_read_once(tmp_path, reads, monkeypatch):
     with ShownRun(write_run(tmp_path / "bomb", (0, 1)), "bomb") as shown:
         monkeypatch.setattr(untrusted, "FREE_BYTES", -(10**12))
-        with pytest.raises(EvaluationError, match="limit"):
-            map_shapes(shown, 0, MapLayer.CHANGES)
+        for _ in range(2):
+            with pytest.raises(EvaluationError, match="limit"):
+                map_shapes(shown, 0, MapLayer.CHANGES)
+    assert len(reads) == 1
+
+
+@pytest.mark.attack
+def test_changes_of_maps_that_are_not_there_read_no_packets(run, reads):
+    assert [map_shapes(run, k, MapLayer.CHANGES) for k in (1, 2, 2**31 - 1)] == [[], [], []]
+    assert reads == []
 
 
 def test_a_trajectory_without_poses_is_no_session_of_a_map(tmp_path):

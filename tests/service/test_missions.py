@@ -17,7 +17,7 @@ class Launched:
     def __init__(self, folder):
         self.folder, self.stopped = folder, False
 
-    def ring(self):
+    def notify(self):
         pass
 
     def stop(self):

@@ -49,7 +49,7 @@ def test_rings_to_workers_that_die_do_not_keep_the_next_one_from_starting(superv
     supervisor, told = supervised(SAYS + "import os; os.close(0); print(flush=True); os._exit(3)")
 
     def rung():
-        supervisor.ring()
+        supervisor.notify()
         return supervisor.starts >= 4
 
     wait(rung)
@@ -60,7 +60,7 @@ def test_rings_that_are_not_read_keep_nobody_waiting(supervised, tmp_path):
     supervisor, told = supervised(SAYS + WAITS + "sys.stdin.buffer.read(1);" + SAYS + "sys.stdin.buffer.read()")
     wait(lambda: told)
     for _ in range(100_000):
-        supervisor.ring()
+        supervisor.notify()
     assert len(told) == 1, "it reads nothing yet"
     (tmp_path / "go").touch()
     wait(lambda: len(told) == 2)
@@ -96,10 +96,10 @@ def test_a_ring_while_a_worker_ends_or_after_it_is_not_heard(supervised, tmp_pat
     stopping = threading.Thread(target=supervisor.stop)
     stopping.start()
     wait(lambda: len(told) == 2)
-    supervisor.ring()
+    supervisor.notify()
     (tmp_path / "go").touch()
     stopping.join()
-    supervisor.ring()
+    supervisor.notify()
     assert supervisor.pid is None
 
 

@@ -85,12 +85,12 @@ def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotC
     from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
     from fcslam.learning.federated.own_examples import own_examples
     from fcslam.robot.backend import RobotBackend
-    from fcslam.robot.beside import Inline
+    from fcslam.robot.backend_runner import InlineBackend
     from fcslam.robot.frontend import RobotFrontend
 
     keyframes = folder / "keyframes"
     backend = RobotBackend(source.name, config.robot, keyframes)
-    robot = RobotFrontend(source.name, config.robot, Inline(backend))
+    robot = RobotFrontend(source.name, config.robot, InlineBackend(backend))
     for record in source.records():
         robot.process(record)
     robot.finish()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from fcslam.learning.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.robot.frontend import RobotConfig
     from fcslam.wire.http_transport import Server
 
@@ -41,7 +41,7 @@ def learning_plan(
     from fcslam.config import load
     from fcslam.errors import InputError
     from fcslam.features.detector_kinds import DetectorKind
-    from fcslam.learning.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.learning.federated.live_settings import RobotLearningSettings
     from fcslam.records import Channel
     from fcslam.wire.http_transport import addresses

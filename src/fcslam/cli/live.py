@@ -5,18 +5,18 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fcslam.cli.output import RUNS, answers, new_folder, print_line
-from fcslam.cli.recordings import print_faults
-from fcslam.cli.ros_options import stopping
+from fcslam.cli.recordings import bag_options, print_faults
+from fcslam.cli.ros_options import node_parameters, stopping
 from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.errors import FcslamError
-    from fcslam.learning.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 _SCANS_PER_LINE = 600
 """A line of progress is printed each time that many scans have come."""
-
-
 SERVER_PATIENCE_S = 60.0
 """Longest wait for the server at the end of a drive."""
 SWITCH_INTERVAL_S = 0.001
@@ -54,17 +52,39 @@ def named_address(argument: str) -> "tuple[str, RosAddress]":
     return name if equals else place.robot, place
 
 
+class LiveSource(NamedTuple):
+    """Where a live robot is, and how it is read."""
+
+    name: str
+    address: "RosAddress"
+    options: "BagOptions"
+    parameters: "NodeParameters"
+
+
+def live_source(
+    argument: str, sensors: list[str] | None, ros_parameters: Path | None, use_sim_time: bool
+) -> LiveSource:
+    """The live robot that the options of a command describe.
+
+    Raises:
+        InputError: an option cannot be used.
+    """
+    from fcslam.sources import BagOptions
+
+    name, address = named_address(argument)
+    return LiveSource(
+        name, address, bag_options(sensors) or BagOptions(), node_parameters(ros_parameters, use_sim_time)
+    )
+
+
 def drive_live(
-    name: str,
-    place: "RosAddress",
+    live: LiveSource,
     start: "Callable[..., Robot | LocalizedRobot]",
-    options: "BagOptions",
-    parameters: "NodeParameters",
     output: Path | None,
     console: "Console",
     learning: "RobotLearningPlan | None" = None,
 ) -> None:
-    """Run the robot at ``place`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
+    """Run a live robot until it is stopped, and write the run to ``output``; ``start`` makes the robot.
     With a plan for ``learning``, it learns while it stands still.
 
     Raises:
@@ -89,17 +109,18 @@ def drive_live(
             notify(event.text)
 
     with (
-        closing(open_network(place)) as network,
+        closing(open_network(live.address)) as network,
         compiled(console),
-        start(name, on_event=tell) as robot,
+        start(live.name, on_event=tell) as robot,
     ):
-        topics = await_sensors(network, place.namespace, options, parameters.topic_timeout)
+        namespace = live.address.namespace
+        topics = await_sensors(network, namespace, live.options, live.parameters.topic_timeout)
         for note in topics.notes:
             notify(note)
         suggest_pose = robot.suggest_pose if isinstance(robot, LocalizedRobot) else None
         change_floor = None if isinstance(robot, LocalizedRobot) else robot.change_floor
         node = RobotNode(
-            network, place.namespace, topics, options, robot, parameters, notify, suggest_pose, change_floor
+            network, namespace, topics, live.options, robot, live.parameters, notify, suggest_pose, change_floor
         )
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
@@ -145,14 +166,14 @@ def _learning(
         yield lambda _pose: None
         return
     from fcslam.errors import CloudError, StateError
-    from fcslam.learning.federated.learning_beside import LearningBeside
+    from fcslam.learning.federated.learning_process import LearningProcess
     from fcslam.live.standstill import Standstill
 
-    with closing(LearningBeside(plan, robot.name, notify)) as learning:
+    with closing(LearningProcess(plan, robot.name, notify)) as learning:
 
         def stop() -> None:
             try:
-                robot.stand_still()
+                robot.idle()
             except (CloudError, StateError):  # an event named it; the robot maps on, but does not learn
                 return
             learning.set_idle(True)

@@ -12,7 +12,7 @@ from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
-from fcslam.cli.ros_options import RosParameters, UseSimTime, node_parameters
+from fcslam.cli.ros_options import RosParameters, UseSimTime
 from fcslam.cli.server_options import Credentials, ServerUrl, access
 from fcslam.cli.warm_up import compiled
 
@@ -92,21 +92,11 @@ def localize(
         keep_private()
         _fetch(map_path, cloud, console)
     if live:
-        from fcslam.cli.live import drive_live, named_address
+        from fcslam.cli.live import drive_live, live_source
         from fcslam.live.localized_robot import LocalizedRobot
-        from fcslam.sources import BagOptions
 
-        name, place = named_address(source)
         start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
-        drive_live(
-            name,
-            place,
-            start,
-            bag_options(sensors) or BagOptions(),
-            node_parameters(ros_parameters, use_sim_time),
-            output,
-            console,
-        )
+        drive_live(live_source(source, sensors, ros_parameters, use_sim_time), start, output, console)
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)

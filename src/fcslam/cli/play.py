@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.learning.federated.learning_beside import RobotLearningPlan
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.live.records import RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.robot.frontend import RobotConfig
@@ -118,18 +118,18 @@ def _learn(
     watch: "Callable[[RobotStatus], None]", robot: "Robot",
 ) -> None:  # fmt: skip
     """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
-    from fcslam.learning.federated.learning_beside import LearningBeside
+    from fcslam.learning.federated.learning_process import LearningProcess
 
     def tell(line: str) -> None:
         print_line(console, line)
 
     tell("the drive is over; the robot learns with its fleet until Ctrl-C")
-    learning = LearningBeside(plan, robot.name, tell)
+    learning = LearningProcess(plan, robot.name, tell)
     began_s = time.monotonic()
     try:
         learning.set_idle(True)
         while (passed_s := time.monotonic() - began_s) < plan.settings.time_s and not learning.has_ended:
-            robot.stand_still()
+            robot.idle()
             watch(robot.status())
             display.show("learning", round(passed_s), round(plan.settings.time_s))
             time.sleep(0.5)

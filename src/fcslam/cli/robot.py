@@ -10,8 +10,8 @@ from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices
-from fcslam.cli.recordings import Sensors, bag_options
-from fcslam.cli.ros_options import RosParameters, UseSimTime, node_parameters
+from fcslam.cli.recordings import Sensors
+from fcslam.cli.ros_options import RosParameters, UseSimTime
 from fcslam.cli.server_options import NETWORK, Budget, Credentials, Floor, ServerUrl, access
 
 
@@ -74,11 +74,10 @@ def robot(
     ] = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
-    from fcslam.cli.live import drive_live, is_live, named_address
+    from fcslam.cli.live import drive_live, is_live, live_source
     from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
-    from fcslam.sources import BagOptions
     from fcslam.storage.files import keep_private
 
     keep_private()
@@ -87,7 +86,7 @@ def robot(
             f"{address}: is not the address of a live robot, as ros2:/robot1 is; `fcslam play` plays a recording to a "
             "service"
         )
-    name, place = named_address(address)
+    live = live_source(address, sensors, ros_parameters, use_sim_time)
     settings, cloud = mission_config(config), access(server, credentials, budget_kbps)
     start = partial(
         Robot,
@@ -98,13 +97,4 @@ def robot(
         wiring=Wiring(keeps_keyframes=learn),
     )
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
-    drive_live(
-        name,
-        place,
-        start,
-        bag_options(sensors) or BagOptions(),
-        node_parameters(ros_parameters, use_sim_time),
-        output,
-        notices(quiet),
-        plan,
-    )
+    drive_live(live, start, output, notices(quiet), plan)

@@ -77,7 +77,7 @@ def serve(
     import gc
     import logging
 
-    from fcslam.cli.serve_learning import learning_beside, learning_plan
+    from fcslam.cli.serve_learning import learning_plan, learning_process
     from fcslam.cli.shared_service import shared_state
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
@@ -120,7 +120,7 @@ def serve(
         if plan is not None:
             from fcslam.learning.federated.relay import learning_router
 
-            routers.append(learning_router(state, stack.enter_context(learning_beside(plan, state))))
+            routers.append(learning_router(state, stack.enter_context(learning_process(plan, state))))
         app = create_app(
             state, routers, local_names=tokens is None and client_ca is None, named=None if store is None else NAMED
         )
@@ -140,9 +140,11 @@ def _server(
 
     import uvicorn
 
+    from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 
     allow_many_connections()
+    keep_memory_trimmed()
     return GuardedServer(
         uvicorn.Config(
             app,

@@ -55,7 +55,7 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
 
 
 @contextmanager
-def learning_beside(plan: FleetLearningPlan, state: "ServiceState") -> Iterator[Path]:
+def learning_process(plan: FleetLearningPlan, state: "ServiceState") -> Iterator[Path]:
     """Run the process in which the fleet learns beside the block; robots get what it releases.
 
     Gives the Unix socket of the process, in a folder that only this user can open.

@@ -127,11 +127,13 @@ def _match(scan, guess, prior, velocity_prior, field, wide):  # type: ignore[no-
     t J^T J and t^2 J^T J. The Schur complement eliminates v.
     """
     pose, velocity = guess.copy(), np.zeros(3)
+    equations = _Equations(np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((4, 3)))
+    H, g, reduced = equations.H, equations.g, equations.reduced
     scale = wide
     for _ in range(MOST_ITERATIONS):
-        H, g, reduced = _normal_equations(scan, pose, velocity, field, scale, velocity_prior)
-        difference = pose - guess
-        difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
+        _normal_equations(equations, scan, pose, velocity, field, scale, velocity_prior)
+        turned = (pose[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi
+        difference = pose[0] - guess[0], pose[1] - guess[1], turned
         for r in range(3):
             for c in range(3):
                 g[r] += prior[r, c] * difference[c]
@@ -142,13 +144,15 @@ def _match(scan, guess, prior, velocity_prior, field, wide):  # type: ignore[no-
         for r in range(3):
             pose[r] -= step[r]
         if len(scan.times) > 0:
-            change = reduced[3] - reduced[0] * step[0] - reduced[1] * step[1] - reduced[2] * step[2]
-            velocity -= change
+            for r in range(3):
+                velocity[r] -= (
+                    reduced[3, r] - reduced[0, r] * step[0] - reduced[1, r] * step[1] - reduced[2, r] * step[2]
+                )
         if small and scale <= NARROW_SCALE_M:
             break
         scale = max(NARROW_SCALE_M, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    H, g, _ = _normal_equations(scan, pose, velocity, field, NARROW_SCALE_M, velocity_prior)
+    _normal_equations(equations, scan, pose, velocity, field, NARROW_SCALE_M, velocity_prior)
     explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
@@ -169,37 +173,55 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
     return b[0] / A[0, 0] - l10 * y - l20 * z, y, z
 
 
-@njit
-def _normal_equations(scan, pose, velocity, field, scale, velocity_prior):  # type: ignore[no-untyped-def]
-    """Normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``.
+class _Equations(NamedTuple):
+    """Normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``."""
 
-    Returns:
-        H (3, 3) and g (3,) of the pose; and (4, 3): the velocity that minimises the cost is moved by row 3 less the
-        step of the pose times rows 0 to 2.
-    """
-    own_pose, mixed_sums, own_velocity, g, f = _sums(scan, pose, velocity, field, scale)
+    H: FloatArray
+    """Shape (3, 3)."""
+    g: FloatArray
+    """Shape (3,)."""
+    mixed: FloatArray
+    """Block of pose and velocity, shape (3, 3)."""
+    own: FloatArray
+    """Block of the velocity, with its prior, shape (3, 3)."""
+    reduced: FloatArray
+    """Shape (4, 3): the velocity that minimises the cost is moved by row 3 less the step of the pose times rows 0 to
+    2."""
+
+
+@njit(allocates=False)
+def _normal_equations(equations, scan, pose, velocity, field, scale, velocity_prior):  # type: ignore[no-untyped-def]
+    """Write the normal equations at ``pose`` and ``velocity`` into ``equations``."""
+    H, g, mixed, own, reduced = equations
+    own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, scale)
     s2 = 1.0 / (POINT_SIGMA_M * POINT_SIGMA_M)
-    H, gradient = s2 * _symmetric(own_pose), s2 * np.array(g)
-    reduced = np.zeros((4, 3))
-    if len(scan.times) > 0:
-        mixed, own = s2 * _symmetric(mixed_sums), s2 * _symmetric(own_velocity)
-        for r in range(3):
-            own[r, r] += velocity_prior[r] + DAMPING
-        moment = s2 * np.array(f) + velocity_prior * velocity
-        reduced[3] = np.array(_solve(own, moment))
-        for r in range(3):
-            reduced[r] = np.array(_solve(own, mixed[r]))
-        for r in range(3):
-            gradient[r] -= mixed[r, 0] * reduced[3, 0] + mixed[r, 1] * reduced[3, 1] + mixed[r, 2] * reduced[3, 2]
-            for c in range(3):
-                H[r, c] -= mixed[r, 0] * reduced[c, 0] + mixed[r, 1] * reduced[c, 1] + mixed[r, 2] * reduced[c, 2]
-    return H, gradient, reduced
+    _scale_symmetric(H, s2, own_pose)
+    for r in range(3):
+        g[r] = s2 * moment[r]
+    if len(scan.times) == 0:
+        return
+    _scale_symmetric(mixed, s2, mixed_sums)
+    _scale_symmetric(own, s2, own_velocity)
+    for r in range(3):
+        own[r, r] += velocity_prior[r] + DAMPING
+        reduced[3, r] = s2 * velocity_moment[r] + velocity_prior[r] * velocity[r]
+    reduced[3, 0], reduced[3, 1], reduced[3, 2] = _solve(own, reduced[3])
+    for r in range(3):
+        reduced[r, 0], reduced[r, 1], reduced[r, 2] = _solve(own, mixed[r])
+    for r in range(3):
+        g[r] -= mixed[r, 0] * reduced[3, 0] + mixed[r, 1] * reduced[3, 1] + mixed[r, 2] * reduced[3, 2]
+        for c in range(3):
+            H[r, c] -= mixed[r, 0] * reduced[c, 0] + mixed[r, 1] * reduced[c, 1] + mixed[r, 2] * reduced[c, 2]
 
 
-@njit
-def _symmetric(upper):  # type: ignore[no-untyped-def]
+@njit(allocates=False)
+def _scale_symmetric(matrix, factor, upper):  # type: ignore[no-untyped-def]
+    """Write ``factor`` times a symmetric matrix, given by its upper triangle, into ``matrix``."""
     xx, xy, xt, yy, yt, tt = upper
-    return np.array(((xx, xy, xt), (xy, yy, yt), (xt, yt, tt)))
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = factor * xx, factor * yy, factor * tt
+    matrix[0, 1] = matrix[1, 0] = factor * xy
+    matrix[0, 2] = matrix[2, 0] = factor * xt
+    matrix[1, 2] = matrix[2, 1] = factor * yt
 
 
 @njit(allocates=False)

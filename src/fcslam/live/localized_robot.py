@@ -23,10 +23,10 @@ from fcslam.mission.localization import LocalizedDrive, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
-from fcslam.robot.localizer_beside import LocalizerBeside
 from fcslam.robot.map_localizer import MapEstimate
 from fcslam.robot.outbox import WaitingPackets
 from fcslam.robot.warmup import warm_up_tracking
+from fcslam.robot.worker_localizer import WorkerLocalizer
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Packet
@@ -90,7 +90,7 @@ class LocalizedRobot(LiveTracker):
         with ExitStack() as stack:
             executor = wiring.started(stack)
             try:
-                self._localizer = LocalizerBeside(self.name, self._map, initial, executor)
+                self._localizer = WorkerLocalizer(self.name, self._map, initial, executor)
             except BrokenExecutor as error:
                 raise InputError(
                     f"{self.name}: the process that searches the map does not start; a script that makes a "

@@ -15,7 +15,7 @@ from fcslam.lidar.frontend import motion_information
 from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
-from fcslam.robot.beside import worker_process
+from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.outbox import WaitingPackets
 
 

@@ -52,7 +52,7 @@ from fcslam.records import (
     Sweep,
     frozen,
 )
-from fcslam.robot.beside import Beside
+from fcslam.robot.backend_runner import WorkerBackend
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
@@ -400,7 +400,7 @@ class Robot(LiveTracker):
         self._raise_failure()
         return not uplink.unstored and not uplink.waiting.packets
 
-    def stand_still(self) -> None:
+    def idle(self) -> None:
         """Write where the keyframes are, for a process that learns from them, and take a detector that the server
         announced meanwhile. Call it while no scan is due.
 
@@ -468,7 +468,7 @@ class Robot(LiveTracker):
         self._part_base = 0 if outbox is None else outbox.first_epoch
         try:
             self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
-            backend = Beside(self.name, robot, executor, keyframes)
+            backend = WorkerBackend(self.name, robot, executor, keyframes)
             self._frontend = RobotFrontend(self.name, robot, backend, self._beside_teammates)
         except BrokenExecutor as error:
             raise InputError(

@@ -31,13 +31,15 @@ from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing
 from fcslam.storage.own_files import read_own
 from fcslam.storage.state_file import State, code_version, parse_state, state_bytes
-from fcslam.untrusted import LimitError, check_unpacked, open_file, read_bytes
+from fcslam.untrusted import MOST_BYTES, LimitError, check_unpacked, open_file, read_bytes
 from fcslam.wire.packets import SizedPacket, decode, unpacked_size
 
 _log = logging.getLogger(__name__)
 
 _AT_ONCE: Final = 1000
 """Packets that are read at once."""
+_COPIED_BYTES: Final = 1 << 20
+"""Bytes of a file that are copied at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,15 +139,16 @@ def opened_copy(path: Path | None) -> Iterator[MissionStore]:
     """Open a copy of a mission file, which itself is not changed; None: a mission before its first packet.
 
     Raises:
-        StoreError: the file is damaged or of another version, or cannot be read.
+        StoreError: the file is damaged, too large or of another version, or cannot be read.
     """
     with TemporaryDirectory() as place:  # opening the file for reading would leave files beside it
         copy = Path(place) / MISSION
         if path is not None:
-            check_mission(path)
-            with translate_errors(path), open_file(path) as file, copy.open("wb") as copied:
-                shutil.copyfileobj(file, copied)
-        with closing(MissionStore(copy)) as store:
+            with translate_errors(path), open_file(path, most=MOST_BYTES) as file:
+                check_mission(path)
+                with copy.open("wb") as copied:
+                    shutil.copyfileobj(file, copied, _COPIED_BYTES)
+        with closing(MissionStore(copy, is_checked=path is not None)) as store:
             yield store
 
 

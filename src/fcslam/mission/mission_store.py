@@ -143,13 +143,17 @@ class MissionStore:
         StoreError: from every method: the disk is full or broken, and nothing has changed.
     """
 
-    def __init__(self, place: Path | RowStore) -> None:
+    def __init__(self, place: Path | RowStore, *, is_checked: bool = False) -> None:
         """Open a mission: that of a file, which is created if there is none, or that of a server.
+
+        ``is_checked``: the file is a copy of one that ``check_mission`` passed just now.
 
         Raises:
             StoreError: the file is not a mission of this version, or cannot be used.
         """
-        self._database: RowStore = Database(place, SCHEMA, VERSION) if isinstance(place, Path) else place
+        self._database: RowStore = (
+            Database(place, SCHEMA, VERSION, is_checked=is_checked) if isinstance(place, Path) else place
+        )
         self._edits: list[Edit] = []
         """Those read so far, numbered from 1; each request of a robot asks for them."""
 

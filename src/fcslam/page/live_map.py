@@ -17,7 +17,7 @@ from fcslam.errors import FcslamError
 from fcslam.mission.mission import MissionCloud
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
-from fcslam.processes import Background, Start, obey_parent, start_copy, start_method
+from fcslam.processes import RecurringTask, Start, obey_parent, start_copy, start_method
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.worker import LIVE_EVERY_S, LIVE_LOOK_S
 
@@ -32,10 +32,9 @@ class LiveMap:
 
     def __init__(self, folder: MissionFolder, clock: Callable[[], float], start: Start) -> None:
         """``start`` runs a task in a copy of this process."""
-        self._folder, self._clock, self._start = folder, clock, start
-        self._task: Background | None = None
-        self._began_s = clock()
-        self._look_at = self._began_s + LIVE_EVERY_S
+        self._folder, self._clock = folder, clock
+        self._task = RecurringTask(start, clock, SHARE, LIVE_EVERY_S)
+        self._look_at = clock() + LIVE_EVERY_S
 
     def look(self, cloud: MissionCloud) -> None:
         """Start to write the map so far if the one before is written and some time ago; returns at once."""
@@ -43,11 +42,9 @@ class LiveMap:
         if now < self._look_at:
             return
         self._look_at = now + LIVE_LOOK_S
-        if self._task is None:
-            self._task, self._began_s = self._start(lambda: self._write(cloud)), now
-        elif self._task.exitcode is not None:
-            self._task = None
-            self._look_at = now + max((now - self._began_s) * (1.0 / SHARE - 1.0), LIVE_EVERY_S)
+        self._task.end()
+        if self._task.is_due:
+            self._task.begin(lambda: self._write(cloud))
 
     def finish(self, run_folder: Path) -> None:
         """Show the finished run from now on."""
@@ -56,9 +53,7 @@ class LiveMap:
 
     def stop(self) -> None:
         """Write no further map."""
-        if self._task is not None:
-            self._task.terminate()
-            self._task.join()
+        self._task.stop()
 
     def _write(self, cloud: MissionCloud) -> None:
         try:

@@ -1,7 +1,7 @@
 """The back end of one robot: keyscans and images in, records for the cloud out.
 
 It builds submaps, closes loops, solves the pose graph and describes places. Its output is a function of its inputs in
-their order, so it gives the same records wherever and whenever it runs (``fcslam.robot.beside``).
+their order, so it gives the same records wherever and whenever it runs (``fcslam.robot.backend_runner``).
 """
 
 from collections.abc import Iterator

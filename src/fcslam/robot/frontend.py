@@ -46,7 +46,7 @@ from fcslam.robot.backend import (
     SessionEnd,
     essential,
 )
-from fcslam.robot.beside import BackendRunner, Inline
+from fcslam.robot.backend_runner import BackendRunner, InlineBackend
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import LONGEST_S, PREDICTED, MotionPrediction
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
@@ -131,7 +131,7 @@ class RobotFrontend:
         """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
         self._config, self._mark = config, mark
         self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
-        self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
+        self._backend = InlineBackend(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
         self._sequence = 0

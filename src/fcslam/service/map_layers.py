@@ -54,10 +54,13 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
         EvaluationError: a file of the run is broken or too large.
     """
     folder = mission.run_folder
-    if folder is None:
+    if folder is None or layer not in layers_of(mission, k):
         return []
     if layer is MapLayer.CHANGES:
-        return [*_changes(viewed_run(folder), mission.store, k)]
+        found = _changes(viewed_run(folder), mission.store, k)
+        if isinstance(found, str):
+            raise EvaluationError(found)
+        return [*found]
     try:
         content = json.loads(read_text(folder / _FILES[layer], folder, MOST_LAYER_BYTES))
         return _DRAWN[layer](content, k)
@@ -82,7 +85,8 @@ def walls_of(folder: Path, k: int) -> WallDirection:
 
 
 @lru_cache(maxsize=8)  # each takes all packets of the mission; a run that is replaced is another one
-def _changes(run: Run, store: MissionStore, k: int) -> tuple[MapShape, ...]:
+def _changes(run: Run, store: MissionStore, k: int) -> tuple[MapShape, ...] | str:
+    """The changes, or why they are refused: an exception would not be kept."""
     mission = stored_mission(store)
     try:
         check_packets(mission)
@@ -90,7 +94,7 @@ def _changes(run: Run, store: MissionStore, k: int) -> tuple[MapShape, ...]:
     except SourceError:  # there is no earlier day, or its robots sent no ranges
         return ()
     except LimitError as error:
-        raise EvaluationError(f"the changes cannot be shown ({error})") from error
+        return f"the changes cannot be shown ({error})"
     masks = {APPEARED: found.appeared, DISAPPEARED: found.disappeared}
     return tuple(_shape(kind, outlines(mask, found.now)) for kind, mask in masks.items() if mask.any())
 

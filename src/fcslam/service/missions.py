@@ -88,7 +88,7 @@ class OpenMission:
             StoreError: it cannot be written.
         """
         edit = self.store.edit(content, author, self._wall_clock())
-        self.worker.ring()
+        self.worker.notify()
         return edit
 
     def close(self) -> None:
@@ -159,7 +159,7 @@ class ServedMissions(Protocol):
     def export(self, name: str, path: Path) -> None:
         """Write a mission as one new file."""
 
-    def take_in(self, name: str, path: Path) -> None:
+    def import_mission(self, name: str, path: Path) -> None:
         """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""
 
     def close(self) -> None:
@@ -256,7 +256,7 @@ class Missions:
         finally:
             store.close()
 
-    def take_in(self, name: str, path: Path) -> None:
+    def import_mission(self, name: str, path: Path) -> None:
         """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open.
 
         Raises:

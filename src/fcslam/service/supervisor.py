@@ -50,7 +50,7 @@ class RunningWorker(Protocol):
     def applied(self) -> int:
         """How many packets the present worker has applied, those of its snapshot included."""
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         """Notify the worker of new packets or requests."""
 
     def stop(self) -> None:
@@ -130,7 +130,7 @@ class Supervisor:
         """Totals of the present worker's stages, by name."""
         return dict(self._stages)
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         """Notify the worker of new packets or requests."""
         with self._lock:
             if self._process is not None and self._process.stdin is not None:

@@ -26,7 +26,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -47,7 +47,7 @@ from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.processes import Background, Start, start_copy
+from fcslam.processes import RecurringTask, Start, start_copy, trim_memory
 from fcslam.records import Edit
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
@@ -108,7 +108,7 @@ class Worker:
     ) -> None:  # fmt: skip
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
-        self._folder, self._store, self._clock, self._tell, self._start = folder, store, clock, tell, start
+        self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
         self._verify_pairs, self._share = verify_pairs, share
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
@@ -125,13 +125,13 @@ class Worker:
         """How many packets took effect before a restart: their results are stored already."""
         self._times: dict[tuple[str, int], float] = {}
         """Newest time of each session."""
-        self._published = -1
-        self._publish_at = clock()
-        self._publishing: _Publishing | None = None
+        joint_task = RecurringTask(start, clock, JOINT_SHARE, JOINT_EVERY_S)
+        live_task = RecurringTask(start, clock, LIVE_SHARE, LIVE_EVERY_S)
+        self._joint_maps = _Output("the joint maps", JOINT, folder.joint_maps, joint_task, self._joint_maps_writer)
+        self._live = _Output("the live map", LIVE, folder.live, live_task, self._live_writer)
+        self._outputs = self._joint_maps, self._live
         self._certified, self._certify_at = dict[str, int](), -math.inf
         """The map of each session as the certificate of the live run folder was computed, and when it is due again."""
-        self._joint_drawn, self._joint_at = -1, -math.inf
-        self._joint_drawing: _Publishing | None = None
         self._heard: dict[tuple[str, int], float] = {}
         """When the newest packet of each session took effect, seconds since 1970."""
         self._concluded: tuple[tuple[int, int], FleetResult] | None = None
@@ -150,21 +150,20 @@ class Worker:
             or self._take_packets()
             or self._report()
             or self._finalize()
-            or self._draw_joint_maps()
-            or self._publish()
+            or any(self._write(output) for output in self._outputs)
         )
 
     def wait_s(self) -> float:
         """How long there is nothing to do unless something comes in."""
-        if self._publishing is not None or self._joint_drawing is not None:
-            due_s = LIVE_LOOK_S
-        else:
-            due_s = self._publish_at - self._clock() if self._published < self._applied else LIVE_EVERY_S
-        if self._joint_drawn < self._applied:
-            due_s = min(due_s, self._joint_at - self._clock())
+        now, waits_s = self._clock(), [LIVE_EVERY_S]
+        for output in self._outputs:
+            if output.task.is_running:
+                waits_s.append(LIVE_LOOK_S)
+            elif output.shown < self._applied:
+                waits_s.append(output.task.due_s - now)
         if self._reported < self._applied:
-            due_s = min(due_s, self._report_at - self._clock())
-        return max(due_s, 0.0)
+            waits_s.append(self._report_at - now)
+        return max(min(waits_s), 0.0)
 
     def _take_edits(self) -> bool:
         edits = self._store.edits(self._newest_edit)
@@ -175,9 +174,9 @@ class Worker:
         if needs_new_fleet(before, now):
             self._start_over()
         self._fleet.edit(now)
-        self._joint_drawn = -1
-        self._published, self._reported = -1, min(self._reported, max(self._applied, self._resumed_at) - 1)
-        self._publish_at = self._clock()  # who edits the map waits for it
+        self._joint_maps.shown = self._live.shown = -1
+        self._live.task.due_s = self._clock()  # who edits the map waits for it
+        self._reported = min(self._reported, max(self._applied, self._resumed_at) - 1)
         return True
 
     @property
@@ -271,6 +270,7 @@ class Worker:
             self._share(SNAPSHOT, self._folder.snapshot)
         except (OSError, StoreError) as error:  # a restart takes longer then, and no more
             _log.error("no snapshot of the worker was written: %s", error)
+        trim_memory()  # gaps would grow for days
         self._written = self._applied
         self._write_at = self._clock() + max((self._clock() - began) / SNAPSHOT_SHARE, SNAPSHOT_EVERY_S)
         return True
@@ -375,7 +375,7 @@ class Worker:
             self._share(RESULT + name, self._folder.run(name))
             self._store.answer(asked.number, name)
         self._crashes.end()
-        self._published = self._joint_drawn = -1
+        self._joint_maps.shown = self._live.shown = -1
         self._tell("finalized", asked.number)
 
     def _result(self) -> FleetResult:
@@ -391,104 +391,65 @@ class Worker:
     def _read(self, number: PacketNumber) -> Packet:
         return decode(self._store.packet(*robot_and_epoch(number.session), number.sequence).data)
 
-    def _draw_joint_maps(self) -> bool:
-        """Draw the joint maps beside the worker, if something is new and the last time is long enough ago."""
-        now = self._clock()
-        if self._joint_drawing is not None:
-            self._end_drawing(self._joint_drawing, now)
-            return False
-        if self._joint_drawn == self._applied or self._applied < self._resumed_at or now < self._joint_at:
-            return False
-        try:
-            if self._fleet.read_ahead(AT_ONCE):
-                return True
-            known = self._concluded
-            is_final = known is not None and known[0] == (self._applied, self._newest_edit)
-            result = known[1] if known is not None and is_final else self._fleet.estimate()
-            task = self._start(lambda: self._write_joint_maps(result, dict(self._heard)))
-        except Exception as error:  # packets matter more, and there may be memory later
-            return self._draw_later(f"{type(error).__name__}: {error}")
-        self._joint_drawing, self._joint_drawn = _Publishing(task, self._applied, now), self._applied
-        return True
-
-    def _end_drawing(self, drawing: "_Publishing", now: float) -> None:
-        if drawing.task.exitcode is None:
-            return
-        self._joint_drawing = None
-        if drawing.task.exitcode:
-            self._draw_later(f"their writer ended with code {drawing.task.exitcode}")
-            return
-        self._joint_at = now + max((now - drawing.began_s) * (1.0 / JOINT_SHARE - 1.0), JOINT_EVERY_S)
-        try:
-            self._share(JOINT, self._folder.joint_maps)
-        except StoreError as error:
-            self._draw_later(str(error))
-
-    def _draw_later(self, reason: str) -> bool:
-        _log.error("the joint maps stay as they were: %s", reason)
-        self._joint_drawn, self._joint_at = -1, self._clock() + PAUSE_S
-        return False
-
-    def _write_joint_maps(self, result: FleetResult, heard_s: dict[tuple[str, int], float]) -> None:
-        try:
-            write_joint_maps(self._folder.joint_maps, joint_maps_of(result, heard_s, self._config.map))
-        except Exception as error:
-            _log.error("the joint maps cannot be written: %s: %s", type(error).__name__, error)
-            sys.exit(1)
-
-    def _publish(self) -> bool:
-        """Write the live run folder beside the worker, if something is new and the last time is long enough ago."""
-        now = self._clock()
-        if self._publishing is not None:
-            return self._end_publishing(self._publishing, now)
-        if self._published == self._applied or self._applied < self._resumed_at or now < self._publish_at:
+    def _write(self, output: "_Output") -> bool:
+        """Write an output in a copy of this process, if something is new and the last time is long enough ago."""
+        exitcode = output.task.end()
+        if exitcode is not None:
+            return self._end_writing(output, exitcode)
+        is_new = output.shown != self._applied and self._applied >= self._resumed_at
+        if not is_new or not output.task.is_due:
             return False
         try:
             if self._fleet.read_ahead(AT_ONCE):  # after a restart, with a look at what else there is to do in between
                 return True
-            result, traffic = self._fleet.estimate(), self._store.traffic()
-            maps = {robot.robot: robot.map_index for robot in result.robots}
-            is_known = (self._folder.live / f"{QUALITY}.json").exists()
-            certifies = not is_known or now >= self._certify_at or maps != self._certified
-            # Everything that it needs is in memory: the copy of this process must not use the store.
-            task = self._start(lambda: self._write_live(result, traffic, certifies))
+            write = output.writer()
+            output.task.begin(lambda: _written(output.name, write))
         except Exception as error:  # packets matter more, and there may be memory later
-            return self._postpone(f"{type(error).__name__}: {error}")
-        if certifies:
-            self._certified, self._certify_at = maps, now + QUALITY_EVERY_S
-        self._publishing = _Publishing(task, self._applied, now)
-        self._published = self._applied
+            return self._postpone(output, f"{type(error).__name__}: {error}")
+        output.shown = output.begun = self._applied
         return True
+
+    def _end_writing(self, output: "_Output", exitcode: int) -> bool:
+        if exitcode:  # packets matter more, and the disk may be freed
+            return self._postpone(output, f"the writer ended with code {exitcode}")
+        try:
+            self._share(output.shared_as, output.place)
+        except StoreError as error:
+            return self._postpone(output, str(error))
+        if output is self._live:
+            self._tell("live", output.begun)
+        return True
+
+    def _postpone(self, output: "_Output", reason: str) -> bool:
+        _log.error("%s will be written later: %s", output.name, reason)
+        output.shown, output.task.due_s = -1, self._clock() + PAUSE_S
+        return False
+
+    def _joint_maps_writer(self) -> Callable[[], None]:
+        """What writes the joint maps as they are now. A copy of this process must not use the store."""
+        known = self._concluded
+        is_final = known is not None and known[0] == (self._applied, self._newest_edit)
+        result = known[1] if known is not None and is_final else self._fleet.estimate()
+        heard_s, place = dict(self._heard), self._folder.joint_maps
+        return lambda: write_joint_maps(place, joint_maps_of(result, heard_s, self._config.map))
+
+    def _live_writer(self) -> Callable[[], None]:
+        """As ``_joint_maps_writer``, for the live run folder."""
+        result, traffic = self._fleet.estimate(), self._store.traffic()
+        maps = {robot.robot: robot.map_index for robot in result.robots}
+        is_known = (self._folder.live / f"{QUALITY}.json").exists()
+        certifies = not is_known or self._clock() >= self._certify_at or maps != self._certified
+        if certifies:
+            self._certified, self._certify_at = maps, self._clock() + QUALITY_EVERY_S
+        return lambda: self._write_live(result, traffic, certifies)
 
     def _write_live(self, result: FleetResult, traffic: Ledger, certifies: bool) -> None:
-        try:
-            run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
-            if not certifies:
-                files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))
-                run = replace(run, quality={file.name: file.read_bytes() for file in files})
-            self._folder.publish(run)
-        except Exception as error:
-            _log.error("the live map cannot be written: %s: %s", type(error).__name__, error)
-            sys.exit(1)
-
-    def _end_publishing(self, publishing: "_Publishing", now: float) -> bool:
-        if publishing.task.exitcode is None:
-            return False
-        self._publishing = None
-        if publishing.task.exitcode:  # packets matter more, and the disk may be freed
-            return self._postpone(f"its writer ended with code {publishing.task.exitcode}")
-        try:
-            self._share(LIVE, self._folder.live)
-        except StoreError as error:
-            return self._postpone(str(error))
-        self._publish_at = now + max((now - publishing.began_s) / LIVE_SHARE, LIVE_EVERY_S)
-        self._tell("live", publishing.applied)
-        return True
-
-    def _postpone(self, reason: str) -> bool:
-        _log.error("the live map stays as it was: %s", reason)
-        self._published, self._publish_at = -1, self._clock() + PAUSE_S
-        return False
+        """Write the live run folder; it keeps its certificate unless another one is due."""
+        run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
+        if not certifies:
+            files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))
+            run = replace(run, quality={file.name: file.read_bytes() for file in files})
+        self._folder.publish(run)
 
     def _run(
         self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True, with_certificates: bool = True
@@ -502,13 +463,29 @@ class Worker:
         return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps, with_certificates)
 
 
-class _Publishing(NamedTuple):
-    """A live run folder, or joint maps, that are being written."""
+@dataclass
+class _Output:
+    """Results that copies of the worker write now and then: the live run folder, or the joint maps."""
 
-    task: Background
-    applied: int
-    """How many packets it shows."""
-    began_s: float
+    name: str
+    shared_as: str
+    place: Path
+    task: RecurringTask
+    writer: Callable[[], Callable[[], None]]
+    """Gives what writes the output as it is now."""
+    shown: int = -1
+    """How many packets it shows, or will when it is written; -1: it is to be written anew."""
+    begun: int = -1
+    """How many packets the newest copy writes."""
+
+
+def _written(name: str, write: Callable[[], None]) -> None:
+    """Write an output in a copy of the worker, which ends with code 1 if it fails."""
+    try:
+        write()
+    except Exception as error:
+        _log.error("%s cannot be written: %s: %s", name, type(error).__name__, error)
+        sys.exit(1)
 
 
 def _chained(before: bytes, data: bytes) -> bytes:

@@ -12,7 +12,7 @@ from typing import Any
 from fcslam.errors import StoreError
 from fcslam.storage.group_commit import GroupCommit
 from fcslam.storage.row_store import Result, StoreTable
-from fcslam.untrusted import open_database
+from fcslam.untrusted import LimitError, open_database
 
 BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
@@ -50,7 +50,9 @@ class Database:
         StoreError: from every method: the disk is full or broken, and nothing has changed.
     """
 
-    def __init__(self, path: Path, schema: str, version: int, *, exclusive: bool = False) -> None:
+    def __init__(
+        self, path: Path, schema: str, version: int, *, exclusive: bool = False, is_checked: bool = False
+    ) -> None:
         """Open the file, or create it with ``schema``.
 
         Args:
@@ -59,6 +61,7 @@ class Database:
             version: version of the schema.
             exclusive: no other process may open the file. A loss of power may then take the last transactions, but a
                 transaction costs no wait for the disk.
+            is_checked: the file is a copy of one that ``check_file`` passed just now.
 
         Raises:
             StoreError: the file is damaged, was made by something else, or cannot be used.
@@ -81,8 +84,9 @@ class Database:
                 if not _shape(connection)[1]:
                     _check_content(connection)  # its tables may be lost
                     _make(connection, schema, version)
-            with translate_errors(path):
-                _check(path, self._reading, schema, version)
+            if not is_checked:
+                with translate_errors(path):
+                    _check(path, self._reading, schema, version)
         except BaseException:
             self.close()
             raise
@@ -164,7 +168,10 @@ def seal(*values: Any) -> bytes:
     plain = [value + 0.0 if isinstance(value, float) else value for value in values]
     blobs = [value for value in plain if isinstance(value, bytes)]
     sizes = [len(value) if isinstance(value, bytes) else value for value in plain]
-    return blake2b(b"".join((repr(sizes).encode(), *blobs)), digest_size=16).digest()
+    checksum = blake2b(repr(sizes).encode(), digest_size=16)
+    for blob in blobs:  # joined, they would be copied
+        checksum.update(blob)
+    return checksum.digest()
 
 
 def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> SealedConnection:
@@ -225,6 +232,8 @@ def translate_errors(path: Path) -> Iterator[None]:
     """Raise errors of the disk and of SQLite as a ``StoreError`` of one line."""
     try:
         yield
+    except LimitError as error:
+        raise StoreError(f"{path}: {error}") from error
     except (OSError, sqlite3.DatabaseError, UnicodeDecodeError) as error:
         told = " ".join(str(error).split())
         if _is_damage(error):

@@ -1,6 +1,7 @@
-"""Files that only the user who wrote them reads again: a keyed hash of the content comes first.
+"""Files that only the user who wrote them reads again: keyed hashes of the size and of the content come first.
 
-The key is in the user's state folder. So a file that somebody else made or changed is as good as none.
+The key is in the user's state folder. So a file that somebody else made or changed is as good as none, and one of
+another size is not even read.
 """
 
 import hashlib
@@ -11,10 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.storage.files import write_file
-from fcslam.untrusted import read_bytes
+from fcslam.untrusted import open_file, read_bytes
 
-MOST_BYTES: Final = 4 * 2**30
-"""A larger file is not read."""
 _KEY_BYTES: Final = 32
 _HASH_BYTES: Final = 32
 
@@ -28,7 +27,7 @@ def write_own(path: Path, data: bytes) -> bool:
     key = _key()
     if key is None:
         return False
-    write_file(path, _hash(key, data) + data)
+    write_file(path, _hash(key, _size(len(data))) + _hash(key, data) + data)
     return True
 
 
@@ -40,11 +39,19 @@ def read_own(path: Path) -> bytes | None:
     try:
         if key is None:
             return None
-        content = read_bytes(path, most=MOST_BYTES)
+        with open_file(path) as file:
+            size = os.fstat(file.fileno()).st_size - 2 * _HASH_BYTES
+            hash_of_size, hash_of_data = file.read(_HASH_BYTES), file.read(_HASH_BYTES)
+            if not hmac.compare_digest(hash_of_size, _hash(key, _size(size))):
+                return None
+            data = file.read(size)
     except OSError:
         return None
-    data = content[_HASH_BYTES:]
-    return data if hmac.compare_digest(content[:_HASH_BYTES], _hash(key, data)) else None
+    return data if hmac.compare_digest(hash_of_data, _hash(key, data)) else None
+
+
+def _size(count: int) -> bytes:
+    return count.to_bytes(8, "big", signed=True)
 
 
 def _hash(key: bytes, data: bytes) -> bytes:

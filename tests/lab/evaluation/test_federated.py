@@ -80,7 +80,7 @@ def with_shapes(finished, folder):
     return folder
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_path):
     whole = finished[1]
 
@@ -108,7 +108,7 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
     assert again.robots == ("north", "south")
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     arms = {"frozen": Arm(settings={"normalisation": "frozen"}, seeds=1)}
@@ -117,7 +117,7 @@ def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
     assert shapes == {"start": (1, 1), "central": (2, 1), "local": (1, 2), "alone": (1, 2), "frozen": (1, 1)}
 
 
-@pytest.mark.slow
+@pytest.mark.training
 def test_robots_own_networks_share_the_pairs_out(finished):
     local = finished[1].measured["local"]
     shown = np.isfinite(local[..., 0])
@@ -125,7 +125,7 @@ def test_robots_own_networks_share_the_pairs_out(finished):
     assert (shown.sum(axis=0) == 1).all()  # over two seeds each of both networks sees each pair once
 
 
-@pytest.mark.slow
+@pytest.mark.training
 def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
     folder, first = finished
     seen = set()
@@ -137,7 +137,7 @@ def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.training
 def test_every_network_sees_as_many_samples(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     steps = {}
@@ -153,7 +153,7 @@ def test_every_network_sees_as_many_samples(finished, robots, tmp_path):
     assert steps["wide, seed 1"] == 2 * 2
 
 
-@pytest.mark.slow
+@pytest.mark.training
 def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()

@@ -31,7 +31,7 @@ from tests.learning.federated.authority import free_port
 from tests.learning.federated.fakes import Fake
 from tests.learning.federated.live import LiveFleet, honest_update
 
-pytestmark = [pytest.mark.system, pytest.mark.attack]
+pytestmark = [pytest.mark.training, pytest.mark.attack]
 
 HONEST = ("one", "two", "three", "four")
 HOSTILE = "hostile"

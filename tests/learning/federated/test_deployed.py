@@ -125,7 +125,7 @@ def assert_same(deployed, embedded):
     assert (deployed / "detector.onnx").read_bytes() == (embedded / "detector.onnx").read_bytes()
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_a_deployed_fleet_ends_as_one_in_a_process(deployment, embedded):
     server = deployment.server()
     deployment.until("server", "waiting: 0 robots are there, 2 needed")
@@ -141,7 +141,7 @@ def test_a_deployed_fleet_ends_as_one_in_a_process(deployment, embedded):
     assert_same(deployment.folder / "deployed", embedded / "out")
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_a_server_whose_robots_all_die_waits_and_one_that_is_killed_goes_on(deployment, embedded):
     """Power cuts: both robots after the first round, then the server; who comes back ends as if nothing had been."""
     server = deployment.server()

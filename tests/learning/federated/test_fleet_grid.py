@@ -1,14 +1,18 @@
 """Requests and replies of a fleet, with a clock that the test moves."""
 
+import asyncio
 import threading
 
+import httpx
 import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.learning.federated.fleet_grid import MAX_ROBOTS, ONLINE_S, FleetGrid
+from fcslam.learning.federated.fleet_server import PATH, FleetApp
 from fcslam.learning.federated.flower import Message, MessageType, RecordDict, message_to_bytes, request_from_bytes
+from fcslam.service.http.authentication import Authenticator
 
 
 class Clock:
@@ -69,6 +73,30 @@ def test_a_reply_that_is_none_becomes_an_error(grid):
     assert grid.store_reply("one", grid.next_request("one").number, b"\xff")
     (reply,) = grid.pull_messages([number])
     assert "cannot be read" in reply.error.reason
+
+
+@pytest.mark.attack
+def test_a_reply_beyond_the_limit_is_read_no_further(grid):
+    (number,) = ask(grid, 2)
+    found = grid.next_request("one")
+    limit, read, part = grid.reply_limit("one", found.number), 0, bytes(10_000)
+
+    async def endless():
+        nonlocal read
+        while read < 10 * limit:
+            read += len(part)
+            yield part
+
+    async def reply():
+        app = FleetApp(grid, Authenticator(None), lambda _: None).asgi()
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
+            return await client.post(PATH.format(robot="one") + f"/reply/{found.number}", content=endless())
+
+    answer = asyncio.run(reply())
+    assert (answer.status_code, answer.text) == (413, f"one: a reply of more than {limit} bytes")
+    assert read <= limit + len(part)
+    (refused,) = grid.pull_messages([number])
+    assert refused.error.reason == f"a reply of more than {limit} bytes"
 
 
 def test_a_robot_is_online_for_a_while(grid, clock):

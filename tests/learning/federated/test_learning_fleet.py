@@ -89,7 +89,7 @@ def camera_places(folder):
     return found
 
 
-@pytest.mark.system
+@pytest.mark.training
 def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp_path):
     require_gl()
     settings = SimulationSettings(

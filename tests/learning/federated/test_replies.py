@@ -110,6 +110,21 @@ def test_an_odd_answer_leaves_the_others_their_round(odd, tmp_path):
     assert len(read_rows(tmp_path / ROUNDS_FILE, 9)) == 2
 
 
+@pytest.mark.attack
+def test_a_reply_of_another_round_does_not_count(tmp_path):
+    """A robot answers every round as it did the first one."""
+    first = {}
+
+    def again(content):
+        for part in content:
+            content[part] = first.setdefault(part, content[part])
+
+    robots = [Fake("bad"), Fake("good", 0.25)]
+    _, reports = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.TRAIN, again))
+    assert [report.robots for report in reports] == [("bad", "good"), ("good",)]
+    assert "an answer by bad about version" in reports[1].left_out["bad"]
+
+
 @pytest.mark.parametrize("odd", ["no metrics", "odd names", "long names", "many", "NaN", "infinity", "beyond measure"])
 def test_who_judges_oddly_does_not_judge(odd, tmp_path):
     robots = [Fake("bad"), Fake("good", 0.25)]

@@ -60,7 +60,7 @@ class InlineWorker:
     def applied(self) -> int:
         return self._worker._applied
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         self._now += 1000.0
         while self._worker.step():
             self._now += 1.0

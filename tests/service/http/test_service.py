@@ -243,8 +243,9 @@ def test_tiles_show_what_the_map_shows(mapped):
     assert mapped.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
 
 
-def test_a_tile_that_did_not_change_is_not_sent_again(mapped):
-    path = f"{API}/maps/0/tiles/5/0/0.png"
+@pytest.mark.parametrize("part", ["tiles/5/0/0.png", "layers/changes"])
+def test_a_part_of_a_map_that_did_not_change_is_not_sent_again(mapped, part):
+    path = f"{API}/maps/0/{part}"
     first = mapped.ask("GET", path, "eye")
     again = mapped.ask("GET", path, "eye", headers={"If-None-Match": first.headers["ETag"]})
     assert (again.status_code, again.content) == (304, b"")
@@ -285,7 +286,7 @@ def test_a_full_disk_is_507_and_the_result_comes_when_there_is_room(mapped, monk
         response = mapped.ask("POST", f"{API}/finalize", "boss")
         assert response.status_code == 507
         assert "free" in response.json()["error"]
-    mapped.state.mission.worker.ring()
+    mapped.state.mission.worker.notify()
     asked = mapped.state.mission.store.finalizations()[-1]
     assert asked.run
     assert len(open_run(mapped.state.mission.folder.run(asked.run)).trajectories) == 2
@@ -447,7 +448,7 @@ def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
     assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
     worker = desk.state.mission.worker
     with monkeypatch.context() as patched:
-        patched.setattr(worker, "ring", lambda: None)
+        patched.setattr(worker, "notify", lambda: None)
         patched.setattr(operations, "LARGEST_BACKLOG", 5)
         for count, status in ((5, 200), (6, 503)):
             desk.told(desk.send("a", A[:count]))
@@ -455,7 +456,7 @@ def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
             assert (answer.status_code, answer.json()["backlog"]) == (status, count)
         assert "6 packets" in answer.json()["error"]
         assert desk.ask("GET", "/healthz").status_code == 200
-    worker.ring()
+    worker.notify()
     assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
     worker.is_ready = False
     assert desk.ask("GET", "/readyz").status_code == 503
@@ -516,7 +517,7 @@ def test_a_mission_travels_as_one_file(mapped, tmp_path, scripted):
         response = other.ask("POST", f"{API}/missions/import?name=brought", "boss", content=content)
         assert response.json() == {"open": "mission", "missions": ["brought", "mission"]}
         other.ask("POST", f"{API}/missions/brought/open", "boss")
-        other.state.mission.worker.ring()
+        other.state.mission.worker.notify()
         assert get(other, "maps").json() == get(mapped, "maps").json()
         assert other.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
         for name, wrong, status in (

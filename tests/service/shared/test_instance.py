@@ -27,7 +27,7 @@ class Started:
     def __init__(self, mission, lease):
         self.mission, self.lease, self.is_stopped = mission, lease, False
 
-    def ring(self):
+    def notify(self):
         pass
 
     def stop(self):

@@ -62,7 +62,7 @@ def test_what_is_imported_is_exported_again(registry, postgres, tmp_path):
     store.export(tmp_path / "before.sqlite")
     store.close()
     tables = MissionTables(postgres, registry.create("imported"))
-    tables.take_in(tmp_path / "before.sqlite")
+    tables.import_mission(tmp_path / "before.sqlite")
     tables.export(tmp_path / "after.sqlite")
     assert rows(tmp_path / "after.sqlite") == rows(tmp_path / "before.sqlite")
     assert MissionStore(tables).put([packet(sequence=30)], 0.0) == 1
@@ -154,3 +154,22 @@ def test_text_that_a_server_does_not_take_loses_no_packet(registry, postgres):
     ((_, found),) = store.arrivals(0, 1)
     assert found.data == b"\0"
     assert found.refusal == "of \N{REPLACEMENT CHARACTER} and \N{SNOWMAN}"
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize("name", ["a'; DROP TABLE packets; --", "' OR '1'='1", "%s %(robot)s {0} ?1", 'a"b\\c$$'])
+def test_names_that_look_like_statements_are_names(registry, postgres, name):
+    other = MissionStore(MissionTables(postgres, registry.create("theirs")))
+    other.put([packet(), packet("b")], 0.0)
+    store = MissionStore(MissionTables(postgres, registry.create(name)))
+    store.put([packet(name), packet()], 0.0)
+    store.refuse(name, 0, 0, name)
+    store.edit(Removal("a"), name, 1.0)
+    store.progress(1, [correction(name, 1.0)])
+    store.answer(store.ask_to_finalize(), name, name)
+    assert name in [mission.name for mission in registry.missions()]
+    assert [(p.robot, p.refusal) for _, p in store.arrivals(0, 9)] == [(name, name), ("a", None)]
+    assert [(edit.author, edit.content) for edit in store.edits()] == [(name, Removal("a"))]
+    assert store.correction(name, 0) is not None
+    assert [(asked.run, asked.failure) for asked in store.finalizations()] == [(name, name)]
+    assert (len(other.arrivals(0, 9)), other.refusal_count(name), other.edits()) == (2, 0, [])

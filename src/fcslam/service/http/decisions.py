@@ -48,7 +48,7 @@ def decision_router(state: ServiceState) -> APIRouter:
         """Write the result of all packets that arrived as a run folder of the service; the response waits for it."""
         mission = state.mission
         number = await run_in_threadpool(mission.store.ask_to_finalize)
-        mission.worker.ring()
+        mission.worker.notify()
         while not state.closing and mission is state.mission:
             asked = await run_in_threadpool(mission.store.finalization, number)
             if asked.failure:

@@ -96,7 +96,7 @@ def file_router(state: ServiceState) -> APIRouter:
             except StoreError as error:
                 raise HTTPException(400, f"the body is not an exported mission ({error})") from error
             async with state.changing:
-                await run_in_threadpool(state.missions.take_in, name, path)
+                await run_in_threadpool(state.missions.import_mission, name, path)
         return _missions(state)
 
     @router.get(

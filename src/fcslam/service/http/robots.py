@@ -74,7 +74,7 @@ def robot_router(state: ServiceState) -> APIRouter:
             return mission.intake.take(robot, agent, body, correction)
 
         reply = await run_in_threadpool(take)
-        mission.worker.ring()
+        mission.worker.notify()
         state.measures.answer(robot, reply.batch)
         state.measures.arrived(mission)
         headers = {REFUSED_HEADER: str(reply.refused), REMOVED_HEADER: str(int(reply.removed))}

@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.errors import EvaluationError
@@ -76,6 +76,7 @@ MEDIA = {
 
 _ROWS = {"type": "array", "items": {"type": "object", "required": ["name", "value", "unit"]}}
 _SETTINGS = {"type": "object"}
+_SHAPES = TypeAdapter(list[MapShape])
 
 
 def fleet_router(state: ViewerState) -> APIRouter:
@@ -205,20 +206,24 @@ def map_router(state: ViewerState) -> APIRouter:
 
     turn = asyncio.Lock()  # one at a time: changes take all packets and several maps, an archive all its files
 
-    @router.get("/maps/{k}/layers/{layer}", responses=refusals(400))
-    async def get_layer(k: Index, layer: MapLayer) -> list[MapShape]:
+    @router.get(
+        "/maps/{k}/layers/{layer}",
+        response_model=list[MapShape],
+        responses={**refusals(400), 304: {"description": "as you have it"}},
+    )
+    async def get_layer(request: Request, k: Index, layer: MapLayer) -> Response:
         """What is drawn over a map: floor plan and deviations, changes since the first day, tags, certificate."""
         async with turn:
-            return await run_in_threadpool(map_shapes, state.mission, k, layer)
+            shapes = await run_in_threadpool(map_shapes, state.mission, k, layer)
+            return _if_changed(request, _SHAPES.dump_json(shapes), JSON)
 
     @router.get("/maps/{k}/walls", responses=refusals(400, 404))
     async def get_walls(k: Index) -> WallDirection:
         """The direction of most walls of a map."""
-        folder = _folder_of(state)
-        _existing(state, f"{map_stem(k)}.pgm")
+        image = _existing(state, f"{map_stem(k)}.pgm")
         with _or_404():
             async with turn:
-                return await run_in_threadpool(walls_of, folder, k)
+                return await run_in_threadpool(walls_of, image.parent, k)
 
     @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
     def get_metrics() -> FileResponse:

@@ -39,7 +39,7 @@ class Elsewhere(NamedTuple):
     pid: int | None = None
     starts: int = 0
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         """It looks for itself."""
 
     def stop(self) -> None:

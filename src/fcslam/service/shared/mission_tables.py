@@ -45,7 +45,7 @@ class MissionTables(PostgresTables):
         else:
             check_lease(transaction, self._lease)
 
-    def take_in(self, path: Path) -> None:
+    def import_mission(self, path: Path) -> None:
         """Insert the rows of a mission file into a mission that has none.
 
         Raises:

@@ -234,7 +234,7 @@ class SharedMissions:
         """
         MissionTables(self._server, self._known(name).number).export(path)
 
-    def take_in(self, name: str, path: Path) -> None:
+    def import_mission(self, name: str, path: Path) -> None:
         """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open.
 
         Raises:
@@ -242,7 +242,7 @@ class SharedMissions:
             StoreError: it cannot be written.
         """
         self.folder(name)
-        MissionTables(self._server, self._registry.create(name)).take_in(path)
+        MissionTables(self._server, self._registry.create(name)).import_mission(path)
         self._instance.look()
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ from fcslam.mission.driving import legs
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionEnd
-from fcslam.robot.beside import Inline
+from fcslam.robot.backend_runner import InlineBackend
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.runs import Run
@@ -58,7 +58,7 @@ def map_drives(sources: Sequence[Source], config: MissionConfig, detector: Featu
     return {name: _drive(fronts[name], runner.kept, run, detector) for name, runner in runners.items()}
 
 
-class _Keeping(Inline):
+class _Keeping(InlineBackend):
     """A back end whose keyframes are kept beyond the end of its first session."""
 
     def __init__(self, backend: RobotBackend) -> None:

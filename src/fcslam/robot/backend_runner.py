@@ -28,7 +28,7 @@ class BackendRunner(Protocol):
         """Start to handle the next input; see ``RobotBackend.process``."""
 
 
-class Inline:
+class InlineBackend:
     """Runs the back end at once; its errors are errors of the caller."""
 
     def __init__(self, backend: RobotBackend) -> None:
@@ -44,7 +44,7 @@ class Inline:
         return done
 
 
-class Beside:
+class WorkerBackend:
     """Runs the back end in the only worker of an executor, which may be another process."""
 
     def __init__(self, robot: str, config: SessionConfig, executor: Executor, keyframes: Path | None = None) -> None:
@@ -73,11 +73,11 @@ def worker_process() -> ProcessPoolExecutor:
 
 
 @contextmanager
-def backend_process(robot: str, config: SessionConfig) -> Iterator[Beside]:
+def backend_process(robot: str, config: SessionConfig) -> Iterator[WorkerBackend]:
     """A back end in a process of its own, which ends with this block."""
     executor = worker_process()
     try:
-        yield Beside(robot, config, executor)
+        yield WorkerBackend(robot, config, executor)
     finally:
         executor.shutdown(cancel_futures=True)
 

@@ -29,7 +29,7 @@ class MapState:
     losses: int
 
 
-class LocalizerBeside:
+class WorkerLocalizer:
     """Runs a ``MapLocalizer`` in the only worker of an executor; a ``BackendRunner`` for ``RobotFrontend``."""
 
     def __init__(self, robot: str, occupancy: OccupancyMap, initial: FloatArray | None, executor: Executor) -> None:

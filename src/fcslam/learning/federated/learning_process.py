@@ -29,7 +29,7 @@ class RobotLearningPlan:
     """Folder with the robot's credentials."""
 
 
-class LearningBeside:
+class LearningProcess:
     """The process; it ends with ``close``."""
 
     def __init__(self, plan: RobotLearningPlan, robot: str, on_notice: Callable[[str], None]) -> None:

@@ -7,7 +7,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 import pytest
 
 from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Place
-from fcslam.robot.beside import Beside, backend_process
+from fcslam.robot.backend_runner import WorkerBackend, backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
@@ -61,7 +61,7 @@ def contents(packets):
 def test_poses_are_known_while_the_back_end_is_busy(scans):
     inline, expected = driven(scans)
     executor = Held()
-    robot = RobotFrontend("r", CONFIG, Beside("r", CONFIG, executor))
+    robot = RobotFrontend("r", CONFIG, WorkerBackend("r", CONFIG, executor))
     executor.holds = True
     for number, scan in enumerate(scans, start=1):
         assert robot.process(scan) == []
@@ -78,7 +78,7 @@ def test_poses_are_known_while_the_back_end_is_busy(scans):
 def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
     scans, _ = kidnapping()
     executor = Held()
-    backend = Beside("r", CONFIG, executor)
+    backend = WorkerBackend("r", CONFIG, executor)
     robot, packets = RobotFrontend("r", CONFIG, backend), []
     for number, scan in enumerate(scans):
         executor.holds = number % 40 != 0
@@ -90,7 +90,7 @@ def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
 
 def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
     expected = driven(scans)[1]
-    robot, packets = driven(scans, Beside("r", CONFIG, Held(breaks_after=10)))
+    robot, packets = driven(scans, WorkerBackend("r", CONFIG, Held(breaks_after=10)))
     assert robot.backend_failure == "BrokenExecutor: it was killed"
     assert contents(packets[:10]) == contents(expected[:10])
     kept = [p.body for p in expected if not isinstance(p.body, Place) and not is_closure(p.body)]
@@ -99,7 +99,7 @@ def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
 
 
 def test_a_back_end_that_breaks_at_once_leaves_a_map(scans):
-    robot, packets = driven(scans, Beside("r", CONFIG, Held(breaks_after=1)))
+    robot, packets = driven(scans, WorkerBackend("r", CONFIG, Held(breaks_after=1)))
     assert packets[0].body == Hello("r", 0, (scans[0].laser,), {})
     keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
     assert len(keyscans) > max(pose.keyscan for pose in robot.scan_poses)
