@@ -173,7 +173,7 @@ def test_viewers_see_the_fleet(mapped):
     assert len(accepted) == 4
     assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
     assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
-    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["changes"])]
+    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["quality", "changes"])]
 
 
 def test_the_extent_of_a_map_is_that_of_its_image(mapped):
@@ -418,11 +418,11 @@ def test_a_vetoed_closure_says_so_and_the_maps_come_apart_with_a_reason(mapped):
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     removed = edit(mapped, "removal", {"robot": "b"}).json()
     assert (removed["number"], removed["kind"], removed["author"]) == (1, "removal", "boss")
-    assert get(mapped, "maps").json() == [one_map(["a"], [])]
+    assert get(mapped, "maps").json() == [one_map(["a"], ["quality"])]
     assert get(mapped, "closures").json() == []
     undone = mapped.ask("POST", f"{API}/edits/1/undo", "boss").json()
     assert (undone["kind"], undone["content"]) == ("undo", {"number": 1})
-    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["changes"])]
+    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["quality", "changes"])]
     edits = mapped.ask("GET", f"{API}/edits", "boss").json()
     assert [(edit["number"], edit["undone_by"]) for edit in edits] == [(1, 2), (2, None)]
     for kind, wrong, status in (
@@ -583,7 +583,7 @@ def test_the_age_is_that_of_the_oldest_packet_without_effect(desk):
     """The desk's worker stands still, as does the clock until it is moved."""
     now = [100.0]
     metrics = measures.ServiceMetrics(lambda: now[0])
-    desk.state.mission.worker.ring = lambda: None
+    desk.state.mission.worker.notify = lambda: None
 
     def age():
         text = metrics.text(desk.state.mission).decode()
