@@ -27,6 +27,8 @@ SYMBOL = re.compile(r"`(\w+)`(?:(?:,| and) `(\w+)`)? in `([\w/]+\.py)`")
 INLINE_COMMAND = re.compile(r"`(fcslam [^`\n]+)`")
 BLOCK = re.compile(r"^```.*?^```|^ {4}.*?$", re.MULTILINE | re.DOTALL)
 COMMAND_LINE = re.compile(r"^(?: {4})?(fcslam .+)$", re.MULTILINE)
+OTHERS_LAUNCH = re.compile(r"^ros2 launch \w+ \S+", re.MULTILINE)
+"""A launch file of another package."""
 TARGET = re.compile(r"(?:^|`| {4})make ([a-z-]+)", re.MULTILINE)
 TEST = re.compile(r"`(test_\w+)`")
 SETTING = re.compile(r"`((?:robot|fleet|map)\.[a-z][\w.]*)`")
@@ -40,7 +42,7 @@ def is_there(name: str, page: Path) -> bool:
 
 
 def missing_files(text: str, page: Path) -> list[str]:
-    return [name for name in PATH.findall(text) if not is_there(name, page)]
+    return [name for name in PATH.findall(OTHERS_LAUNCH.sub("", text)) if not is_there(name, page)]
 
 
 def missing_symbols(text: str) -> list[str]:

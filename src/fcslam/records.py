@@ -161,6 +161,16 @@ class LaserScan:
     """Shape (3,); NaN: unknown."""
     sweep: Sweep | None = None
     """None: all beams were measured at the stamp. The motion is that of the odometry; zeros without odometry."""
+    on_teammates: NDArray[np.bool_] | None = None
+    """Beams that hit another robot of the fleet, shape (beam_count,): they stay in the scan, but no scan is matched by
+    them. None: none is known."""
+
+    @property
+    def matched_ranges_m(self) -> Ranges:
+        """The ranges by which scans are matched, shape (beam_count,): those on other robots are 0."""
+        return (
+            self.ranges_m if self.on_teammates is None else np.where(self.on_teammates, np.float32(0.0), self.ranges_m)
+        )
 
 
 class Transform(NamedTuple):

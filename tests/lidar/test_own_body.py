@@ -8,6 +8,8 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
+from fcslam.config import parse
+from fcslam.errors import ConfigError
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.own_body import body_sectors, is_in_sectors
 from fcslam.records import LaserModel, frozen
@@ -73,6 +75,42 @@ def test_beams_in_the_sectors_are_left_out_of_the_map():
     assert np.count_nonzero(mapped.ranges_m == 0.0) == pytest.approx(10 + 11 + 7 + 3, abs=3)
     kept = MappedScans().of(scan)
     assert np.array_equal(mapped.ranges_m[mapped.ranges_m > 0.0], kept.ranges_m[mapped.ranges_m > 0.0])
+
+
+BODY = [[0.55, 0.22], [0.55, -0.22], [-0.11, -0.22], [0.0, 0.0], [-0.11, 0.22]]
+"""A body with a notch at its back, by which the laser looks out."""
+
+
+def test_returns_within_the_footprint_are_left_out_and_those_behind_it_are_not():
+    """The posts are 0.3 m from a laser at (0.2, 0) that looks to the left."""
+    scan = with_posts()[0]
+    kept, mapped = MappedScans().of(scan), MappedScans(footprint=LidarConfig(footprint=BODY).footprint).of(scan)
+    headings = LASER.angles_rad() + LASER.T_base_laser[2]
+    x, y = 0.2 + kept.ranges_m * np.cos(headings), kept.ranges_m * np.sin(headings)
+    is_body = (x < 0.55) & (np.abs(y) < 0.22) & (x > -0.11) & ((x > 0.0) | (np.abs(y) > -2.0 * x))
+    assert 0 < np.count_nonzero(is_body) < np.count_nonzero(kept.ranges_m < 0.31)
+    assert np.array_equal(mapped.ranges_m, np.where(is_body, 0.0, kept.ranges_m))
+
+
+def test_a_footprint_says_nothing_about_beams_without_a_return():
+    nothing = replace(SCANS[0], ranges_m=frozen(np.full(360, np.inf), np.float32))
+    mapped = MappedScans(footprint=LidarConfig(footprint=BODY).footprint).of(nothing)
+    assert np.isposinf(mapped.ranges_m).all()
+
+
+def test_the_footprint_is_written_as_in_nav2():
+    assert LidarConfig(footprint=str(BODY)) == LidarConfig(footprint=BODY)
+    assert LidarConfig(footprint="[]") == LidarConfig()
+
+
+@pytest.mark.parametrize(
+    "corners",
+    ["0.3,0.2 0.3,-0.2 -0.3,0.0", [[0.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], [[1.0, 2.0, 3.0]],
+     [[0.0, 0.0], [1.0, 0.0], [0.0, math.nan]], [[0.0, 0.0], [99.0, 0.0], [0.0, 1.0]], 0.3],
+)  # fmt: skip
+def test_a_footprint_that_is_no_polygon_is_one_line(corners):
+    with pytest.raises(ConfigError, match=r"^my\.yaml: footprint.*: [^\n]+ \(given: [^\n]+\)$"):
+        parse(LidarConfig, {"footprint": corners}, "my.yaml")
 
 
 def test_the_proposed_line_is_a_configuration(tmp_path):

@@ -63,6 +63,22 @@ def test_each_robot_of_a_map_gets_its_frontiers_and_the_page_those_of_all_maps(d
     assert desk.ask("GET", "/api/v1/frontiers").status_code == 401
 
 
+def test_each_robot_knows_how_good_its_map_is(desk):
+    desk.send("a", A)
+    desk.send("b", B)
+    with closing(view(desk, "a")) as fleet:
+        follow(fleet)
+    certificate = desk.ask("GET", "/api/v1/quality.json", "eye").json()["0"]
+    (known,) = fleet.quality
+    assert (known.map_index, known.verdict, known.error_95_m) == (0, certificate["verdict"], certificate["error_95"])
+    assert known.drives == tuple(drive["text"] for drive in certificate["drives"])
+    (of_all,) = desk.ask("GET", "/api/v1/quality", "eye").json()
+    assert of_all == desk.ask("GET", "/api/v1/quality?robot=a", "a").json()[0]
+    assert desk.ask("GET", "/api/v1/quality?robot=nobody", "eye").json() == []
+    assert desk.ask("GET", "/api/v1/quality?robot=no/body", "eye").status_code == 400
+    assert desk.ask("GET", "/api/v1/quality").status_code == 401
+
+
 def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service(desk):
     desk.send("a", A)
     with closing(view(desk, "a")) as first:

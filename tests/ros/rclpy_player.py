@@ -30,6 +30,23 @@ def stamped(message, stamp, frame):
     return message
 
 
+def faults_of(grid):
+    """Why the static layer of a costmap of Nav2, which checks a map first, would reject it or misplace it."""
+    info, at, turn = grid.info, grid.info.origin.position, grid.info.origin.orientation
+    if grid.header.frame_id != "map":
+        yield f"frame {grid.header.frame_id}"
+    if not 0 <= grid.header.stamp.nanosec < 10**9 or grid.header.stamp.sec < 0:
+        yield "stamp"
+    if not (0 < info.width < 2**15 and 0 < info.height < 2**15 and len(grid.data) == info.width * info.height):
+        yield f"{info.width} x {info.height} cells, {len(grid.data)} values"
+    if not (np.isfinite(info.resolution) and info.resolution > 1e-6):
+        yield f"resolution {info.resolution}"
+    if not np.isfinite((at.x, at.y, at.z)).all() or (turn.x, turn.y, turn.z, turn.w) != (0.0, 0.0, 0.0, 1.0):
+        yield f"origin {at} {turn}"  # a costmap ignores a turn
+    if not set(grid.data) <= set(range(-1, 101)):
+        yield "values"
+
+
 class Driver:
     """The node of the robot's drivers."""
 
@@ -38,8 +55,12 @@ class Driver:
         self.scans = self.node.create_publisher(LaserScan, f"{namespace}/scan", qos_profile_sensor_data)
         self.odometry = self.node.create_publisher(Odometry, f"{namespace}/odom", 10)
         self.finish = self.node.create_publisher(Empty, f"{namespace}/fcslam/finish", 10)
-        self.latencies, self.sent = [], {}
+        self.latencies, self.sent, self.faults = [], {}, set()
         self.node.create_subscription(PoseWithCovarianceStamped, f"{namespace}/pose", self.saw, 100)
+        self.node.create_subscription(OccupancyGrid, f"{namespace}/map", self.mapped, LATCHED)
+
+    def mapped(self, grid):
+        self.faults |= set(faults_of(grid))
 
     def saw(self, pose):
         stamp_ns = pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
@@ -120,6 +141,7 @@ def main(path, namespace, speed):
     if maps:
         grid = maps[-1]
         answer |= {"map_s": map_s, "frame": grid.header.frame_id, "values": sorted(set(grid.data))}
+        answer["faults"] = sorted(driver.faults.union(faults_of(grid)))
         answer |= {"width": grid.info.width, "height": grid.info.height}
     answer["path"] = len(paths[-1].poses) if paths else 0
     sys.stdout.write(json.dumps(answer) + "\n")

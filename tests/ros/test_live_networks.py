@@ -165,6 +165,7 @@ def check_drive(played, scans, output, folder):
     assert played["played"] == played["posed"] == len(scans)
     assert played["frame"] == "map"
     assert played["values"] == [-1, 0, 100]
+    assert played["faults"] == []
     assert played["path"] > 5
     expected = poses(folder / "expected")
     assert np.abs(poses(output) - expected).max() < 1e-3
@@ -232,6 +233,7 @@ def test_three_robots_of_ros_2_share_one_map(drawn, tmp_path, port):
         for robot in robots:
             ended(robot)
     assert all(drive["posed"] == drive["played"] for drive in drives)
+    assert all(drive["faults"] == [] for drive in drives)
     end = time.monotonic() + LONGEST_S
     while len(maps := maps_of(port)) != 1 and time.monotonic() < end:
         time.sleep(1.0)

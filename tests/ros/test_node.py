@@ -23,7 +23,7 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap, parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
-from fcslam.wire.fleet_client import FrontierReply
+from fcslam.wire.fleet_client import FrontierReply, QualityReply
 from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
@@ -374,6 +374,7 @@ class FollowedFleet:
             FrontierReply(0, (5.0, 6.0), 1.0, 8.0, ()),
             FrontierReply(1, (7.0, 8.0), 1.0, 7.0, ()),
         )
+        self.quality = ()
 
     def robots(self):
         return [
@@ -415,10 +416,12 @@ def test_with_a_fleet_map_is_the_joint_map_and_own_map_what_the_robot_saw(networ
     changed = cells.copy()
     changed[20, 30] = Occupancy.OCCUPIED
     followed.joint = OccupancyMap(changed, 0.05, (-3.2, -6.4))
-    node.publish_map()
+    node._publish_joint_map(only_changes=True)
     assert len(network.sent["/robot1/map"]) == 1
     (update,) = network.sent["/robot1/map_updates"]
     assert (update.x, update.y, update.width, update.height, list(update.data)) == (30, 20, 1, 1, [100])
+    node.publish_map()
+    assert network.sent["/robot1/map"][-1].data.reshape(128, 192)[20, 30] == 100
     followed.joint = None  # the robot was taken out: its own map goes on
     node.publish_map()
     assert network.sent["/robot1/map"][-1].info.width == own.info.width
@@ -441,6 +444,26 @@ def test_poses_and_state_of_the_fleet_are_published_and_each_change_once(network
     assert status["maps 0 and 1"].message == "no two of their places look alike"
     events = [one.status[0] for one in network.sent["/diagnostics"] if one.status[0].name.endswith("fleet")]
     assert [event.message for event in events] == followed.fleet.news
+
+
+def test_how_good_the_map_is_is_published_when_it_changes(network, robot):
+    followed = FleetRobot(robot, None)
+    node = start(network, followed)
+    good = QualityReply(0, "9 of 9 m2 are good to 0.05 m within 10 m", 0.05, 10.0, 0.021, 1.0, ())
+    bad = good._replace(error_95_m=None, drives=("drive from (0.0, 1.0) to (2.0, 1.0) again",))
+    with running(node):
+        wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 2)
+        assert not network.sent["/robot1/fleet/quality"]
+        for count, quality in enumerate((bad, good), 1):
+            followed.fleet.quality = (quality,)
+            wait_for(lambda count=count: len(network.sent["/robot1/fleet/quality"]) == count)
+    (first,), (second,) = (message.status for message in network.sent["/robot1/fleet/quality"])
+    assert (first.name, first.message, second.message) == ("map 0", bad.verdict, good.verdict)
+    assert [int.from_bytes(one.level, "little") if isinstance(one.level, bytes) else one.level
+            for one in (first, second)] == [1, 0]  # fmt: skip
+    values = {pair.key: pair.value for pair in first.values}
+    assert values["drive_1"] == bad.drives[0]
+    assert {pair.key: pair.value for pair in second.values}["error_95_m"] == "0.021"
 
 
 def test_the_frontiers_of_the_own_map_and_the_own_goal_are_published_when_they_change(network, robot):

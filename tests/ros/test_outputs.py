@@ -45,6 +45,21 @@ def test_a_small_map_goes_out_whole(network, published):
     assert not network.sent["/robot1/map_updates"]
 
 
+def test_who_takes_no_updates_gets_their_cells_with_the_next_whole_map(network, published):
+    """As the static layer of Nav2 by default."""
+    cells = np.full((4, 5), Occupancy.FREE)
+    published.map(1, occupancy(cells))
+    cells = cells.copy()
+    cells[1, 2] = Occupancy.OCCUPIED
+    assert published.map(2, occupancy(cells), only_changes=True)
+    assert not published.map(3, occupancy(cells), only_changes=True)
+    assert len(network.sent["/robot1/map"]) == len(network.sent["/robot1/map_updates"]) == 1
+    assert published.map(4, occupancy(cells))
+    assert not published.map(5, occupancy(cells))
+    assert network.sent["/robot1/map"][-1].data.reshape(4, 5)[1, 2] == 100
+    assert len(network.sent["/robot1/map_updates"]) == 1
+
+
 def test_of_a_large_map_what_differs_from_the_last_whole_one_goes_out(network, published, monkeypatch):
     monkeypatch.setattr(outputs, "SMALL_MAP_CELLS", 1)
     first = np.full((4, 5), Occupancy.UNKNOWN)

@@ -146,7 +146,7 @@ def test_a_broken_file_is_named(tmp_path, monkeypatch, content):
     folder = write_run(tmp_path / "broken", (0,))
     (folder / "plan.json").write_text(content)
     if content.isspace():
-        monkeypatch.setattr(map_layers, "_MOST_BYTES", 4000)
+        monkeypatch.setattr(map_layers, "MOST_LAYER_BYTES", 4000)
     with ShownRun(folder, "broken") as shown, pytest.raises(EvaluationError, match=r"plan\.json"):
         map_shapes(shown, 0, MapLayer.PLAN)
 

@@ -12,7 +12,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.cloud import report
 from fcslam.cloud.settings import CloudConfig
+from fcslam.maps.certificate import certify
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import ClosureStatus, FloorLabel, Place, Removal, Undo, Veto
@@ -586,6 +588,24 @@ def test_the_live_run_follows_and_is_always_whole(cloud):
     assert seen == sorted(seen)
     assert seen[-1] == 2 * len(POSES)
     assert len(list((cloud.folder.path / "snapshots").iterdir())) <= 2
+
+
+def test_the_live_run_has_a_certificate_which_is_computed_seldom_or_when_maps_join(cloud, monkeypatch):
+    certified = []
+    monkeypatch.setattr(worker_module, "QUALITY_EVERY_S", 500.0)  # the clock moves at every look
+    monkeypatch.setattr(report, "certify", lambda *given: certified.append(cloud.now) or certify(*given))
+    packets = two_robots()
+    for packet in packets:
+        cloud.put([packet])
+        cloud.now += 2.0
+        cloud.work()
+        live = open_run(cloud.folder.live)
+        assert ("quality.json" in live.quality) == any(len(t.stamps) for t in live.trajectories.values())
+    assert 2 <= len(certified) < len(packets) / 3
+    apart_s = np.diff(certified)
+    early = (apart_s > 0.0) & (apart_s < worker_module.QUALITY_EVERY_S)  # 0 s: two maps at once
+    assert early.sum() <= 2, "b begins, and the maps join"
+    assert set(json.loads(live.quality["quality.json"])) == {"0"}
 
 
 def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):

@@ -15,7 +15,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
-from fcslam.lidar.own_body import Sectors
+from fcslam.lidar.own_body import Polygon, Sectors
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackingResult
@@ -78,6 +78,11 @@ class LidarConfig(Settings):
         default=(),
         description="sectors [from, to] whose beams are left out, as they see the robot itself; headings in base, "
         "counter-clockwise, which `fcslam info` proposes [deg]",
+    )
+    footprint: Polygon = Field(
+        default=(),
+        description="corners [[x, y], ...] of the robot's body in base, as the parameter `footprint` of Nav2; returns "
+        "within it are left out [m]",
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
@@ -217,7 +222,7 @@ class LidarFrontend:
         sweep = None if tracked.sweep is None else tracked.sweep.rounded()
         points = tracked.scan
         if points is None or sweep is not None:
-            points = point_scan(scan.ranges_m, scan.laser, sweep)
+            points = point_scan(scan.matched_ranges_m, scan.laser, sweep)
         self._tracker.insert(points, tracked.T_local_base, len(self.lasers))
         self._T_local_newest[laser] = tracked.T_local_base
         ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]

@@ -130,8 +130,8 @@ def _show_one_place(before: LaserScan, now: LaserScan, frontend: LidarFrontend) 
     x, y, turn = motion = se2.between(before.T_odom_base, now.T_odom_base)
     error = frontend.trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), frontend.odometry))
     field = SurfelField(np.zeros(3))
-    field.insert(point_scan(before.ranges_m, before.laser, before.sweep), np.zeros(3))
-    scan = point_scan(now.ranges_m, now.laser, now.sweep).thinned(POINT_SPACING_M, POINT_LIMIT)
+    field.insert(point_scan(before.matched_ranges_m, before.laser, before.sweep), np.zeros(3))
+    scan = point_scan(now.matched_ranges_m, now.laser, now.sweep).thinned(POINT_SPACING_M, POINT_LIMIT)
     match = match_scan(scan, field, motion, CORRELATED * error.information)
     return match.known >= CONTINUOUS_KNOWN and match.explained >= CONTINUOUS * match.known
 

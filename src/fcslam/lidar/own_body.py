@@ -1,23 +1,55 @@
-"""The parts of a robot that its own laser sees: beams that never change, and sectors that are left out.
+"""The parts of a robot that its own laser sees: beams that never change, and what is left out.
 
 Sectors are headings in ``base``, in degrees, counter-clockwise from the first to the second; 360 or more of them are
-the whole turn.
+the whole turn. All of their beams are left out: what stands near the laser hides the rest. Of a polygon in ``base``,
+only the returns within it are left out.
 """
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from fcslam.lidar.straightness import scans_apart
 from fcslam.records import FloatArray, LaserModel, LaserScan
 
 Heading = Annotated[float, Field(ge=-360.0, le=360.0)]
 Sectors = tuple[tuple[Heading, Heading], ...]
+Metres = Annotated[float, Field(ge=-20.0, le=20.0)]
+LEAST_AREA_M2: Final = 1e-4
+"""A smaller polygon has no inside."""
+HOW_TO_GIVE: Final = "give corners [[x, y], ...] in the order of the outline"
+
+
+def _as_list(corners: object) -> object:
+    """Nav2 has its footprint as a text."""
+    try:
+        return json.loads(corners) if isinstance(corners, str) else corners
+    except ValueError as error:
+        raise ValueError(f"no polygon: {HOW_TO_GIVE}") from error
+
+
+def _is_polygon(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    twice_area = sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in _sides(corners))
+    if corners and abs(twice_area) < 2.0 * LEAST_AREA_M2:  # also of fewer than three corners
+        raise ValueError(f"no polygon, as it has no inside: {HOW_TO_GIVE}")
+    return corners
+
+
+def _sides(corners: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """Both ends of each side of a polygon."""
+    return pairwise((*corners, *corners[:1]))
+
+
+Polygon = Annotated[
+    tuple[tuple[Metres, Metres], ...], Field(max_length=100), BeforeValidator(_as_list), AfterValidator(_is_polygon)
+]
+"""Corners in the order of the outline; empty: none."""
 
 FEWEST_PLACES, MOST_PLACES = 20, 200
 LARGEST_BODY_M: Final = 1.5
@@ -38,6 +70,16 @@ def is_in_sectors(laser: LaserModel, sectors: Sectors) -> NDArray[np.bool_]:
         width_deg = last_deg - first_deg if last_deg - first_deg >= 360.0 else np.remainder(last_deg - first_deg, 360.0)
         found |= np.remainder(headings - first_deg, 360.0) <= width_deg
     found.setflags(write=False)
+    return found
+
+
+def is_in_polygon(points: FloatArray, corners: Polygon) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie within a polygon, shape (N,)."""
+    found = np.zeros(len(points), np.bool_)
+    x, y = points.T
+    for (x1, y1), (x2, y2) in _sides(corners):
+        if y1 != y2:  # a ray to the right crosses the side
+            found ^= ((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
     return found
 
 

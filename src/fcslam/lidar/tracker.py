@@ -136,7 +136,7 @@ class ScanTracker:
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 2. Scan to points.
-        points = point_scan(scan.ranges_m, scan.laser, scan.sweep)
+        points = point_scan(scan.matched_ranges_m, scan.laser, scan.sweep)
         if not self._fields:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad

@@ -1,5 +1,5 @@
-"""What a live robot knows of its fleet: the joint map, where the others are, why maps are apart, and where to
-explore.
+"""What a live robot knows of its fleet: the joint map and how good it is, where the others are, why maps are apart,
+and where to explore.
 
 A thread follows the cloud. No scan waits for it, and while the cloud is away everything stays as it was last.
 """
@@ -18,12 +18,14 @@ from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
 from fcslam.runs.map_files import OccupancyMap
-from fcslam.wire.fleet_client import FleetClient, FleetReply, FrontierReply
+from fcslam.wire.fleet_client import FleetClient, FleetReply, FrontierReply, QualityReply
 
 POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
 FRONTIERS_S: Final = 5.0
 """Time between two looks at the frontiers."""
+QUALITY_S: Final = 10.0
+"""Time between two looks at how good the map is."""
 DOWNLINK_KBPS: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
 STOP_TIMEOUT_S: Final = 2.0
@@ -78,7 +80,9 @@ class FleetView:
         """Grows with every change of the joint map."""
         self.frontiers: tuple[FrontierReply, ...] = ()
         """Where the robot's map can be explored further, and who shall go where."""
-        self._frontiers_s = -np.inf
+        self.quality: tuple[QualityReply, ...] = ()
+        """How good the robot's map is; empty before the cloud has computed its certificate."""
+        self._frontiers_s = self._quality_s = -np.inf
         self.trouble: str | None = None
         """Why the cloud cannot be followed; None if it can."""
         self._current = self._failures = 0
@@ -161,6 +165,8 @@ class FleetView:
             self.drawn_s = stamp
         if self._clock() - self._frontiers_s >= FRONTIERS_S:
             self.frontiers, self._frontiers_s = client.frontiers(self._robot), self._clock()
+        if self._clock() - self._quality_s >= (QUALITY_S if self.quality else FRONTIERS_S):
+            self.quality, self._quality_s = client.quality(self._robot), self._clock()
 
     def _run(self) -> None:
         wait_s = 0.0

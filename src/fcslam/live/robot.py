@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fcslam.api import StrPath, settings_of
 from fcslam.cloud.sessions import session_name
@@ -35,6 +35,7 @@ from fcslam.live.inputs import (
 )
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import WIRED, EventKind, Playback, RobotEvent, RobotPose, RobotStatus, Wiring
+from fcslam.live.teammates import beams_on_teammates
 from fcslam.live.tracker import LiveTracker
 from fcslam.maps.joint_tiles import padded
 from fcslam.mission.driving import track_of
@@ -45,6 +46,7 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     LaserModel,
+    LaserScan,
     Ranges,
     SensorRecord,
     Sweep,
@@ -80,6 +82,8 @@ LARGEST_OUTBOX_BYTES = 256_000_000
 """Limit of the packets that wait for the server; above three quarters, places are left out."""
 MOST_DRAWN = 20_000
 """Most keyscans that wait to be drawn by the cloud: hours of an outage."""
+MOST_MET = 1000
+"""Scans that saw other robots and may become keyscans yet."""
 
 
 class _DrawnKeyscan(NamedTuple):
@@ -101,6 +105,10 @@ class _Ahead:
         """Keyscans that the joint map of the cloud may not show yet."""
         self.lasers: tuple[LaserModel, ...] = ()
         """As the robot announced them last."""
+        self.T_odom_base: FloatArray | None = None
+        """Pose of the newest scan by odometry without its jumps, or by the prediction in its place."""
+        self.met: dict[float, NDArray[np.bool_]] = {}
+        """Beams of the newest scans that hit other robots, by the stamp of the scan."""
         self.news = 0
         """Changes of the fleet that were told."""
 
@@ -460,7 +468,8 @@ class Robot(LiveTracker):
         self._part_base = 0 if outbox is None else outbox.first_epoch
         try:
             self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
-            self._frontend = RobotFrontend(self.name, robot, WorkerBackend(self.name, robot, executor, keyframes))
+            backend = WorkerBackend(self.name, robot, executor, keyframes)
+            self._frontend = RobotFrontend(self.name, robot, backend, self._beside_teammates)
         except BrokenExecutor as error:
             raise InputError(
                 f"{self.name}: the process of the back end does not start; a script that makes a Robot needs "
@@ -513,6 +522,27 @@ class Robot(LiveTracker):
             self._uplink.before_record()
         return super()._processed(record)
 
+    def _beside_teammates(self, scan: LaserScan) -> LaserScan:
+        """The scan with the beams marked that hit other robots of the fleet, as far as the newest joint map tells."""
+        fleet, pose, radius_m = self.fleet, self._pose, self._config.map.robot_radius_m
+        T_odom_before, self._ahead.T_odom_base = self._ahead.T_odom_base, scan.T_odom_base
+        joint = None if fleet is None else fleet.joint_map
+        if fleet is None or joint is None or pose is None or T_odom_before is None or radius_m <= 0.0:
+            return scan
+        known = fleet.robots()
+        own = next((mate.map_index for mate in known if mate.robot == self.name), None)
+        if own is None or own != pose.map_index:  # the joint map is that of ``own``
+            return scan
+        T_map_base = se2.compose(pose.T_map_base, se2.between(T_odom_before, scan.T_odom_base))
+        others = [mate for mate in known if mate.map_index == own and mate.robot != self.name]
+        on_teammates = beams_on_teammates(scan, T_map_base, others, joint, radius_m)
+        if on_teammates is None:
+            return scan
+        self._ahead.met[scan.stamp] = on_teammates
+        while len(self._ahead.met) > MOST_MET:
+            del self._ahead.met[next(iter(self._ahead.met))]
+        return replace(scan, on_teammates=on_teammates)
+
     def _take(self, packets: list[Packet]) -> None:
         """Pass the next packets on."""
         if not packets:
@@ -535,8 +565,10 @@ class Robot(LiveTracker):
                 keyscan, track = packet.body, self._frontend.tracks[packet.epoch]
                 T_odom_base = track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
                 laser = keyscan.laser_model(self._ahead.lasers)
+                on_teammates = self._ahead.met.pop(keyscan.stamp, np.zeros(1, np.bool_))
+                ranges_m = np.where(on_teammates, np.float32(0.0), keyscan.ranges_m)
                 self._ahead.drawn.append(
-                    _DrawnKeyscan(packet.epoch, keyscan.stamp, keyscan.ranges_m, laser, T_odom_base, keyscan.sweep)
+                    _DrawnKeyscan(packet.epoch, keyscan.stamp, ranges_m, laser, T_odom_base, keyscan.sweep)
                 )
                 if len(self._ahead.drawn) > MOST_DRAWN:
                     self._ahead.drawn.popleft()

@@ -246,7 +246,7 @@ def _tracked(
 ) -> tuple[ScanMotions, OdometryTrack | None]:
     """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
     frontend = LidarFrontend("calibration", config, PREDICTED)
-    prediction, mapped = MotionPrediction(), MappedScans(config.ignore)
+    prediction, mapped = MotionPrediction(), MappedScans(config.ignore, config.footprint)
     unknown = np.full(3, np.nan)
     stamps: list[float] = []
     poses: list[FloatArray] = []

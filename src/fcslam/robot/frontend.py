@@ -10,6 +10,7 @@ one begins with them, as after a restart. So no unmeasured motion enters a map.
 
 import math
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -102,8 +103,17 @@ class RobotFrontend:
     The epoch of a packet is the number of its session, from 0.
     """
 
-    def __init__(self, robot: str, config: RobotConfig, backend: BackendRunner | None = None) -> None:
-        """``backend`` runs the back end beside this front end; None: it runs inline.
+    def __init__(
+        self, robot: str, config: RobotConfig, backend: BackendRunner | None = None,
+        mark: Callable[[LaserScan], LaserScan] = lambda scan: scan,
+    ) -> None:  # fmt: skip
+        """Start the first session.
+
+        Args:
+            robot: its name.
+            config: its settings.
+            backend: runs the back end beside this front end; None: it runs inline.
+            mark: marks the beams of a scan that hit other robots, before it is matched.
 
         Raises:
             FeatureError: the detector of camera images is a network whose weights cannot be used.
@@ -119,8 +129,8 @@ class RobotFrontend:
         """Stands in for the odometry; None if there is odometry."""
         self.odometry_fault: str | None = None
         """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
-        self._config = config
-        self._mapped = MappedScans(config.lidar.ignore)
+        self._config, self._mark = config, mark
+        self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self._backend = InlineBackend(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
@@ -185,7 +195,7 @@ class RobotFrontend:
                     self.begin_session()
                     self.prediction = MotionPrediction() if self.prediction else None
                 self._before_s = self._before_s[1], record.stamp
-                self._process_scan(self._mapped.of(self._with_motion(record)))
+                self._process_scan(self._mark(self._mapped.of(self._with_motion(record))))
             case CameraImage() if self._config.uses_images:
                 image = self.odometry.image(record) if self.prediction is None else replace(record, T_odom_base=None)
                 if self._deferred:

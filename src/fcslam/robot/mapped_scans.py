@@ -7,7 +7,8 @@ import numpy as np
 
 from fcslam.geometry.beams import beam_step
 from fcslam.lidar.lasers import Lasers
-from fcslam.lidar.own_body import Sectors, is_in_sectors
+from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors
+from fcslam.lidar.scan import rays_of
 from fcslam.records import Beams, LaserModel, LaserScan, Ranges, Sweep
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
 from fcslam.wire.quantisation import dequantise, quantise
@@ -20,9 +21,9 @@ class MappedScans:
     remains one laser.
     """
 
-    def __init__(self, ignore: Sectors = ()) -> None:
-        """Beams in the sectors ``ignore`` are left out."""
-        self._ignore = ignore
+    def __init__(self, ignore: Sectors = (), footprint: Polygon = ()) -> None:
+        """Beams in the sectors ``ignore`` and returns within ``footprint`` are left out."""
+        self._ignore, self._footprint = ignore, footprint
         self._lasers = Lasers()
 
     def of(self, scan: LaserScan) -> LaserScan:
@@ -37,6 +38,10 @@ class MappedScans:
         returns = _returns(scan.ranges_m[::step], laser.max_range_m)
         if self._ignore:
             returns = np.where(is_in_sectors(laser, self._ignore), np.float32(0.0), returns)
+        if self._footprint:
+            rays = rays_of(laser)  # the body moves with the laser
+            points = rays.origins + np.minimum(returns, laser.max_range_m)[:, None] * rays.directions
+            returns = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), returns)
         sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
         return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser, sweep=sweep)
 

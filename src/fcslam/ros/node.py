@@ -227,25 +227,25 @@ class RobotNode:
             is_new = self._outputs.map(stamp_ns, own)
         else:
             is_new = self._outputs.map(stamp_ns, own, OWN_MAP)
-            if not self._publish_joint_map():
+            if not self._publish_joint_map(only_changes=False):
                 self._outputs.map(stamp_ns, own)
         if is_new or is_finished_map:
             trajectory = self._robot.trajectory()
             self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
             self._outputs.closures(stamp_ns, self._robot.closures())
 
-    def _publish_joint_map(self) -> bool:
-        """Publish the joint map as it is now: whole if its extent changed, else the area that did. False: there is none
-        yet."""
+    def _publish_joint_map(self, only_changes: bool) -> bool:
+        """Publish the joint map as it is now, as ``Outputs.map``. False: there is none yet."""
         joint = self._robot.joint_map()
         if joint is None or self._pose is None:
             return False
-        self._outputs.map(nanoseconds(self._pose.stamp), joint, only_changes=True)
+        self._outputs.map(nanoseconds(self._pose.stamp), joint, only_changes=only_changes)
         return True
 
     def _publish_fleet(self) -> None:
-        """Publish where the robots of the fleet are, at a fixed rate; frontiers and changes of the robot's map once."""
-        news, frontiers = 0, None
+        """Publish where the robots of the fleet are, at a fixed rate; frontiers, changes of the robot's map and how
+        good it is once."""
+        news, frontiers, quality = 0, None, None
         while not self._stop.wait(_FLEET_PERIOD_S):
             fleet = self._robot.fleet
             if fleet is None:
@@ -255,6 +255,9 @@ class RobotNode:
             if fleet.frontiers is not frontiers:
                 frontiers = fleet.frontiers
                 self._publish_frontiers(now_ns, fleet)
+            if fleet.quality and fleet.quality != quality:
+                quality = fleet.quality
+                self._outputs.quality(now_ns, self._robot.name, quality)
             for line in fleet.news[news:]:
                 news += 1
                 self._outputs.event(now_ns, self._robot.name, line)
@@ -320,7 +323,7 @@ class RobotNode:
             try:
                 if not is_due:
                     if self._robot.fleet is not None:  # what the others see comes in between
-                        self._publish_joint_map()
+                        self._publish_joint_map(only_changes=True)
                     continue
                 drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
                 self.publish_map()

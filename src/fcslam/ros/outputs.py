@@ -21,6 +21,7 @@ from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
     from fcslam.live.fleet_view import Teammate
+    from fcslam.wire.fleet_client import QualityReply
 
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
@@ -33,6 +34,7 @@ OWN_MAP: Final = "own_map"
 """Topic of what a robot of a fleet saw itself."""
 FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
 FLEET_FRONTIERS, FLEET_GOAL = "fleet/frontiers", "fleet/goal"
+FLEET_QUALITY = "fleet/quality"
 MOST_TEAMMATES: Final = 64
 """Robots with a topic of their own; the others are in ``fleet/poses`` only."""
 LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
@@ -107,6 +109,7 @@ class Outputs:
         self._fleet: tuple[Publish, Publish] | None = None
         self._exploration: tuple[Publish, Publish] | None = None
         self._goal_xy: FloatArray = np.full(2, np.nan)
+        self._quality: Publish | None = None
         self._grid_topic(MAP)
         self._pose = publisher("pose", POSE, STREAMED)
         self._path = publisher("path", PATH, LATCHED)
@@ -174,21 +177,40 @@ class Outputs:
                 goal = self._codec.make(POSE_STAMPED, header=header, pose=self._codec.pose(in_space(T_map_goal)))
                 self._send(self._exploration[1], POSE_STAMPED, goal)
 
+    def quality(self, now_ns: int, robot: str, maps: "Sequence[QualityReply]") -> None:
+        """Publish how good the map of a robot is, by its certificate."""
+        with self._lock:
+            if self._quality is None:
+                self._quality = self._publisher(FLEET_QUALITY, DIAGNOSTICS, LATCHED)
+            statuses = [
+                self._status(f"map {one.map_index}", robot, _WARN if one.drives else _OK, one.verdict, {
+                    "map": one.map_index, "bar_m": one.bar_m, "within_m": one.within_m, "error_95_m": one.error_95_m,
+                    "good_share": one.good_share,
+                    **{f"drive_{number}": text for number, text in enumerate(one.drives, 1)},
+                })
+                for one in maps
+            ]  # fmt: skip
+            message = self._codec.make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
+            self._send(self._quality, DIAGNOSTICS, message)
+
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
         """Publish a map if it changed; returns whether it did.
 
-        A small map goes out whole, unless ``only_changes``. Of a large map, only the cells go out that differ from the
-        last whole one or from the last update. So a late subscriber, who gets the whole one, is complete after any
-        update, and one who got all updates keeps no cell that changed back.
+        A small map goes out whole, unless ``only_changes``: the static layer of Nav2 takes no updates by default. Of a
+        large map, only the cells go out that differ from the last whole one or from the last update. So a late
+        subscriber, who gets the whole one, is complete after any update, and one who got all updates keeps no cell that
+        changed back.
         """
         grid = grid_of(occupancy)
         with self._lock:
             shown = self._grid_topic(topic)
-            if shown.newest is not None and _is_same(shown.newest, grid):
+            goes_whole = grid.values.size <= SMALL_MAP_CELLS and not only_changes
+            last = shown.whole if goes_whole else shown.newest
+            if last is not None and _is_same(last, grid):
                 return False
             before, shown.newest = (shown.whole, shown.newest), grid
             of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
-            if of_whole is None or of_newest is None or (grid.values.size <= SMALL_MAP_CELLS and not only_changes):
+            if goes_whole or of_whole is None or of_newest is None:
                 shown.whole = grid
                 self._send(shown.publish, GRID, self._grid_message(stamp_ns, grid))
             else:

@@ -23,14 +23,14 @@ from fcslam.untrusted import LimitError, read_bytes, read_text
 
 TAG_M: Final = 0.15
 """Half a side of the square that stands for a tag."""
-_MOST_BYTES: Final = 1 << 26
+MOST_LAYER_BYTES: Final = 1 << 26
 """Largest file that is shown as a layer; as objects, it takes many times as much memory."""
 
 _FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: f"{QUALITY}.json"}
 
 
 def layers_of(mission: ViewedMission, k: int) -> list[MapLayer]:
-    """The layers that map ``k`` may have; all but the changes are of finished runs."""
+    """The layers that map ``k`` may have; floor plan and tags are of finished runs."""
     folder = mission.run_folder
     if folder is None:
         return []
@@ -62,7 +62,7 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
             raise EvaluationError(found)
         return [*found]
     try:
-        content = json.loads(read_text(folder / _FILES[layer], folder, _MOST_BYTES))
+        content = json.loads(read_text(folder / _FILES[layer], folder, MOST_LAYER_BYTES))
         return _DRAWN[layer](content, k)
     except FileNotFoundError:
         return []

@@ -26,7 +26,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -49,7 +49,7 @@ from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.processes import RecurringTask, Start, start_copy, trim_memory
 from fcslam.records import Edit
-from fcslam.runs import Metric, Run
+from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
@@ -87,6 +87,8 @@ SHARED_LOOK_S = 0.25
 """Between two looks for packets that other instances stored."""
 LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
+QUALITY_EVERY_S = 30.0
+"""Its certificate is not computed more often than this, unless maps join or part."""
 
 _log = logging.getLogger(__name__)
 
@@ -128,6 +130,8 @@ class Worker:
         self._joint_maps = _Output("the joint maps", JOINT, folder.joint_maps, joint_task, self._joint_maps_writer)
         self._live = _Output("the live map", LIVE, folder.live, live_task, self._live_writer)
         self._outputs = self._joint_maps, self._live
+        self._certified, self._certify_at = dict[str, int](), -math.inf
+        """The map of each session as the certificate of the live run folder was computed, and when it is due again."""
         self._heard: dict[tuple[str, int], float] = {}
         """When the newest packet of each session took effect, seconds since 1970."""
         self._concluded: tuple[tuple[int, int], FleetResult] | None = None
@@ -432,16 +436,30 @@ class Worker:
     def _live_writer(self) -> Callable[[], None]:
         """As ``_joint_maps_writer``, for the live run folder."""
         result, traffic = self._fleet.estimate(), self._store.traffic()
-        return lambda: self._folder.publish(self._run(result, traffic, with_local_maps=False))
+        maps = {robot.robot: robot.map_index for robot in result.robots}
+        is_known = (self._folder.live / f"{QUALITY}.json").exists()
+        certifies = not is_known or self._clock() >= self._certify_at or maps != self._certified
+        if certifies:
+            self._certified, self._certify_at = maps, self._clock() + QUALITY_EVERY_S
+        return lambda: self._write_live(result, traffic, certifies)
 
-    def _run(self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True) -> Run:
+    def _write_live(self, result: FleetResult, traffic: Ledger, certifies: bool) -> None:
+        run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
+        if not certifies:
+            files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))
+            run = replace(run, quality={file.name: file.read_bytes() for file in files})
+        self._folder.publish(run)
+
+    def _run(
+        self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True, with_certificates: bool = True
+    ) -> Run:
         counts: Counter[str] = Counter()  # over all floors
         for state in self._fleet.vocabularies():
             counts[f"words_{state.channel}_{state.detector_version}"] += state.words
         words = [Metric(name, count, "1") for name, count in counts.items()]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
-        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
+        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps, with_certificates)
 
 
 @dataclass

@@ -42,6 +42,24 @@ class FrontierReply(NamedTuple):
     """Those that shall explore it."""
 
 
+class QualityReply(NamedTuple):
+    """How good a map is, by its certificate."""
+
+    map_index: int
+    verdict: str
+    """How much of it is good."""
+    bar_m: float
+    """A cell is good if its error stays below this in 95 % of cells."""
+    within_m: float
+    """Distance within which errors count."""
+    error_95_m: float | None
+    """Error that 95 % of cells stay below; None: no cell is known."""
+    good_share: float | None
+    """Share of good cells."""
+    drives: tuple[str, ...]
+    """What to drive again, that with the largest gain first."""
+
+
 class FleetClient(HttpClient):
     """Follows the fleet of one robot. Each method raises as ``BatchTransport.state``."""
 
@@ -85,6 +103,20 @@ class FleetClient(HttpClient):
         except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
             raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 
+    def quality(self, robot: str) -> tuple[QualityReply, ...]:
+        """How good the map is that a robot is in; none before its certificate is computed."""
+        response = self._ask("GET", f"quality?robot={robot}", accept="application/json")
+        self._require(response, 200)
+        self.received_bytes += len(response.content)
+        try:
+            return tuple(
+                QualityReply(int(one["map"]), str(one["verdict"]), float(one["bar"]), float(one["within"]),
+                             _number(one["error_95"]), _number(one["good_share"]), tuple(map(str, one["drives"])))
+                for one in response.json()
+            )  # fmt: skip
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
+
     def tiles(self, robot: str, known: str, limit_bytes: int) -> tuple[bytes, str] | None:
         """The changed tiles of the map that a robot is in (``fcslam.maps.joint_tiles``) and their ETag.
 
@@ -97,6 +129,10 @@ class FleetClient(HttpClient):
         self._require(response, 200)
         self.received_bytes += len(response.content)
         return response.content, response.headers.get("ETag", "")
+
+
+def _number(value: object) -> float | None:
+    return None if value is None else float(value)  # type: ignore[arg-type]
 
 
 def _pose(values: object) -> tuple[float, float, float]:

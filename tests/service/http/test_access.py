@@ -26,6 +26,7 @@ EXCEPTIONS = {
     ("GET", "/api/v1/detectors/{channel}/{version}"): set(Role),
     ("GET", "/api/v1/robots/{robot}/map"): set(Role),
     ("GET", "/api/v1/frontiers"): set(Role),
+    ("GET", "/api/v1/quality"): set(Role),
     ("GET", "/api/v1/missions"): READERS,
     ("GET", "/api/v1/audit"): {Role.ADMIN},
 }

@@ -1,9 +1,11 @@
 """Routes for the fleet's map on every robot: tiles that changed, the poses of all robots, and where to explore."""
 
+import json
 import math
 import time
 from collections.abc import Iterator
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Header, HTTPException, Query, Request
@@ -15,14 +17,17 @@ from fcslam.config import Settings
 from fcslam.lidar.occupancy import FARTHEST_M
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.records import NAME
-from fcslam.runs import Run, separations
+from fcslam.runs import QUALITY, Run, separations
+from fcslam.runs.folder import identity
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import Pose, content, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
+from fcslam.service.map_layers import MOST_LAYER_BYTES
 from fcslam.service.summaries import run_of
+from fcslam.untrusted import read_text
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
 
@@ -85,6 +90,18 @@ class MapFrontiers(Settings):
 
     map: int = Field(description="number of the map")
     frontiers: list[FrontierSummary]
+
+
+class MapQuality(Settings):
+    """How good a map is, by its certificate."""
+
+    map: int = Field(description="number of the map")
+    verdict: str = Field(description="how much of it is good")
+    bar: float = Field(description="a cell is good if its error stays below this in 95 % of cells, metres")
+    within: float = Field(description="distance within which errors count, metres")
+    error_95: float | None = Field(description="error that 95 % of cells stay below, metres")
+    good_share: float | None = Field(description="share of good cells")
+    drives: list[str] = Field(description="what to drive again, that with the largest gain first")
 
 
 def joint_map_router(state: ServiceState) -> APIRouter:
@@ -155,7 +172,34 @@ def joint_map_router(state: ServiceState) -> APIRouter:
             for number in sorted(of_robot & explored.keys())
         ]
 
+    @router.get("/quality", dependencies=as_reader)
+    def get_quality(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapQuality]:
+        """How good each map is, about half a minute old; with ``robot``, only the map that this robot is in."""
+        maps, folder = joint.follow(state.mission.joint_maps), state.mission.run_folder
+        of_robot = {one.map for one in maps.sessions if robot in (None, one.robot)}
+        return [] if folder is None else [one for one in _qualities(folder) if one.map in of_robot]
+
     return router
+
+
+def _qualities(folder: Path) -> tuple[MapQuality, ...]:
+    """The certificates of the run in a folder; none before there are some, and while it is replaced."""
+    try:
+        return _certified(folder, identity(folder))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return ()
+
+
+@lru_cache(maxsize=2)
+def _certified(folder: Path, _: tuple[int, int]) -> tuple[MapQuality, ...]:
+    content = json.loads(read_text(folder / f"{QUALITY}.json", folder, MOST_LAYER_BYTES))
+    return tuple(
+        MapQuality(
+            map=int(k), verdict=one["verdict"], bar=one["bar"], within=one["within"], error_95=one["error_95"],
+            good_share=one["good_share"], drives=[drive["text"] for drive in one["drives"]],
+        )
+        for k, one in content.items()
+    )  # fmt: skip
 
 
 def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierSummary]:

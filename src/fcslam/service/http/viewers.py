@@ -234,7 +234,7 @@ def map_router(state: ViewerState) -> APIRouter:
         "/quality.json", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_SETTINGS)}
     )
     def get_quality() -> FileResponse:
-        """The certificate of each map, by its number; only of a finished run."""
+        """The certificate of each map, by its number; of a live map about half a minute old."""
         return _file(state, f"{QUALITY}.json", JSON)
 
     @router.get(

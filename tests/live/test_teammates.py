@@ -1,0 +1,167 @@
+"""A robot sees others of its fleet: it is not matched by them, and nobody hides a wall by a false pose."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fcslam
+from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, classify
+from fcslam.live.fleet_view import Teammate
+from fcslam.live.records import Wiring
+from fcslam.live.teammates import OLDEST_S, beams_on_teammates
+from fcslam.records import Correction, LaserModel, LaserScan, frozen
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.wire.messages import Keyscan
+from tests.lidar import worlds
+from tests.live.same_thread import SameThread
+
+LASER = LaserModel(360, -math.pi, math.radians(1.0), 8.0)
+RADIUS_M = 0.3
+HERE = np.array((-1.0, 0.5, 0.4))
+
+
+def mate(x, y, age_s=0.2, name="b", map_index=0):
+    return Teammate(name, map_index, "", np.array((x, y, 0.0)), age_s)
+
+
+def with_disc(ranges, pose, centre):
+    """The ranges with a robot at ``centre``, and which beams hit it."""
+    angles = LASER.angles_rad() + pose[2]
+    rays, apart = np.stack((np.cos(angles), np.sin(angles)), axis=-1), np.asarray(centre) - pose[:2]
+    along = rays @ apart
+    half = RADIUS_M**2 - (apart @ apart - along**2)
+    reached = along - np.sqrt(np.maximum(half, 0.0))
+    hit = (half > 0.0) & (reached > 0.0) & (reached < ranges)
+    return np.where(hit, reached, ranges), hit
+
+
+def scan_at(pose, segments, centre=None):
+    ranges = worlds.ranges(pose, segments, LASER)[0]
+    ranges, hit = (ranges, np.zeros(360, bool)) if centre is None else with_disc(ranges, pose, centre)
+    return LaserScan(0.0, frozen(ranges, np.float32), LASER, frozen(np.zeros(3))), hit
+
+
+@pytest.fixture(scope="module")
+def joint():
+    """The map of the room without any robot in it."""
+    poses = worlds.drive([(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.3)
+    config = OccupancyConfig()
+    grid = cast([Casting(scan_at(pose, worlds.room())[0].ranges_m, LASER, pose) for pose in poses], config)
+    return OccupancyMap(classify(grid, config), grid.resolution_m, grid.origin_xy)
+
+
+def on(scan, joint, *mates, pose=HERE):
+    found = beams_on_teammates(scan, pose, mates, joint, 0.35)
+    return np.zeros(360, bool) if found is None else found
+
+
+def test_the_beams_on_a_teammate_are_found_and_no_others(joint):
+    scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
+    assert hit.sum() > 10
+    assert np.array_equal(on(scan, joint, mate(0.8, 0.2), mate(-3.0, 1.0, name="c")), hit)
+    moved_on = mate(0.8 - 0.4, 0.2, age_s=1.0)
+    assert np.array_equal(on(scan, joint, moved_on), hit), "where it may be grows with the age of its pose"
+    assert not on(scan, joint, mate(0.8, 0.2, age_s=OLDEST_S + 0.1)).any()
+
+
+def test_a_robot_that_says_it_is_elsewhere_does_not_hide_where_it_stands(joint):
+    scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
+    assert not (on(scan, joint, mate(-2.5, -1.0)) & hit).any()
+
+
+def test_poses_at_the_walls_hide_none_of_them_however_many_there_are(joint):
+    scan, _ = scan_at(HERE, worlds.room())
+    everywhere = [
+        mate(x, y, age_s=1.9, name=f"{x} {y}") for x in np.arange(-4, 4.1, 0.4) for y in np.arange(-3, 4, 0.4)
+    ]
+    assert not on(scan, joint, *everywhere).any()
+
+
+def test_a_wall_that_the_joint_map_does_not_know_yet_stays(joint):
+    known = replace(joint, cells=np.where(np.arange(joint.cells.shape[1]) * 0.05 + joint.origin_xy[0] < 1.0,
+                                          joint.cells, np.uint8(Occupancy.UNKNOWN)))  # fmt: skip
+    scan, hit = scan_at(HERE, worlds.room(), (1.6, 0.2))
+    assert on(scan, joint, mate(1.6, 0.2))[hit].all()
+    assert not on(scan, known, mate(1.6, 0.2)).any(), "nobody looked through there"
+    assert not on(scan, OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0)), mate(1.6, 0.2)).any()
+
+
+class Fleet:
+    """What the cloud says, in place of a connection."""
+
+    def __init__(self, joint):
+        self.joint_map, self.news, self.map_index, self.drawn_s = joint, [], 0, -np.inf
+        self.mates = []
+
+    def robots(self):
+        return self.mates
+
+
+def corridor_map():
+    cells = np.full((60, 1200), Occupancy.UNKNOWN, np.uint8)
+    cells[10:50], cells[10], cells[49] = Occupancy.FREE, Occupancy.OCCUPIED, Occupancy.OCCUPIED
+    return OccupancyMap(cells, 0.05, (-20.0, -1.5))
+
+
+def convoy(robot, fleet):
+    """Drive 10 m behind another robot through a corridor; returns the true and the estimated way."""
+    rng = np.random.default_rng(0)
+    truth = np.stack((np.arange(0.0, 10.0, 0.05), np.zeros(200), np.zeros(200)), axis=-1)
+    odometry = worlds.drifting(truth, rng)
+    measured = worlds.ranges(truth, worlds.corridor(), LASER, 0.01, rng)
+    poses = []
+    for k, (pose, empty) in enumerate(zip(truth, measured, strict=True)):
+        ahead = pose + np.array((1.0, 0.0, 0.0))
+        fleet.mates = [mate(*pose[:2], name="a"), mate(*ahead[:2])]
+        ranges, _ = with_disc(empty, pose, ahead[:2])
+        poses.append(robot.add_scan(ranges, 0.1 * k, odometry[k]).T_map_base)
+    return truth, np.array(poses)
+
+
+def test_a_robot_that_follows_another_through_a_corridor_knows_that_it_drives():
+    """In its own frame, the robot ahead stands still, and the walls say nothing."""
+    ends = {}
+    for radius_m in (0.35, 0.0):
+        config = {"map": {"robot_radius_m": radius_m}}
+        with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
+            robot.fleet = Fleet(corridor_map())
+            robot._correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
+            truth, poses = convoy(robot, robot.fleet)
+            ends[radius_m] = np.hypot(*(poses - truth)[-1, :2])
+    assert ends[0.35] < 0.3
+    assert ends[0.0] > 3.0, "or the test shows nothing"
+
+
+def test_a_robot_that_stands_is_no_ghost_in_what_this_robot_saw_last(joint):
+    """Until the cloud draws the newest scans, the robot draws them itself."""
+    start, standing = np.array((-1.5, 0.0)), np.array((0.3, 0.8))
+    poses = worlds.drive([start, (1.5, 0.0)], step_m=0.1)
+    shifted = replace(joint, origin_xy=tuple((np.array(joint.origin_xy) - start).tolist()))
+    ghosts = {}
+    for radius_m in (0.35, 0.0):
+        config = {"map": {"robot_radius_m": radius_m}}
+        with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
+            robot.fleet = Fleet(shifted)
+            robot.fleet.mates = [mate(0.0, 0.0, name="a"), mate(*(standing - start))]
+            robot._correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
+            for k, pose in enumerate(poses):
+                scan, _ = scan_at(pose, worlds.room(), standing)
+                robot.add_scan(scan.ranges_m, 0.1 * k, pose)
+            drawn = robot.joint_map()
+        rows, columns = np.nonzero(drawn.cells == Occupancy.OCCUPIED)
+        places = drawn.origin_xy + 0.05 * (np.stack((columns, rows), axis=-1) + 0.5)
+        ghosts[radius_m] = np.count_nonzero(np.hypot(*(places - (standing - start)).T) < RADIUS_M + 0.05)
+    assert ghosts[0.35] == 0
+    assert ghosts[0.0] > 0, "or the test shows nothing"
+
+
+def test_the_points_stay_in_the_scan_that_is_sent():
+    scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
+    frontend = RobotFrontend("a", RobotConfig())
+    packets = [*frontend.process(replace(scan, on_teammates=hit)), *frontend.finish()]
+    (keyscan,) = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
+    assert np.allclose(keyscan.ranges_m[hit], scan.ranges_m[hit], atol=1e-3)
+    assert len(frontend.newest.tracked.scan) == np.count_nonzero(~hit)
