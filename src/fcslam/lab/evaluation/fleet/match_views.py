@@ -22,6 +22,9 @@ from fcslam.runs import Run
 from fcslam.sources import Recording
 from fcslam.sources.recording.layout import META
 
+STAMP_DIGITS = 9
+"""Decimals of a stamp in the files of a run."""
+
 
 @dataclass(frozen=True, slots=True)
 class MatchViews:
@@ -67,9 +70,9 @@ def _overlap(run: Run, known: KnownPoses, folder: Path, pairs: Rows) -> FloatArr
     for number, robot in enumerate(run.trajectories):
         mine = rows[known.truth.robots[rows] == number]
         if len(mine):
-            row_of = dict(zip(known.truth.stamps[mine].tolist(), mine.tolist(), strict=True))
+            row_of = dict(zip(known.truth.stamps[mine].round(STAMP_DIGITS).tolist(), mine.tolist(), strict=True))
             sensors.add(_read_ranges(folder / robot, row_of, ranges_m))
-    if len(sensors) != 1 or (both := sensors.pop()) is None:
+    if len(sensors) != 1 or (both := sensors.pop()) is None or len(ranges_m) < len(rows):
         return np.full(len(pairs), np.nan)
     laser, camera = both
     T_building_laser = se2.compose(known.truth.T_map_base[rows], laser.T_base_laser)
@@ -87,6 +90,6 @@ def _read_ranges(
     for record in Recording(path, path.name).records() if (path / META).is_file() else ():
         if isinstance(record, CameraImage):
             camera = record.camera
-        elif isinstance(record, LaserScan) and record.stamp in row_of:
-            laser, ranges_m[row_of[record.stamp]] = record.laser, record.ranges_m
+        elif isinstance(record, LaserScan) and (stamp := round(record.stamp, STAMP_DIGITS)) in row_of:
+            laser, ranges_m[row_of[stamp]] = record.laser, record.ranges_m
     return None if laser is None or camera is None else (laser, camera)
