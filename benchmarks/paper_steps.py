@@ -16,11 +16,14 @@ Matches are verified closures between robots. They are off if their transform is
 paper takes the poses of two matching places for one. Camera matches are judged by what both cameras saw as well: more
 than a half of either view in the other (same view), or less than a tenth (other view). Recall: revisits between robots
 that matches with a right transform find. Intervals: 95 %, bootstrap over seeds; of what a change does to each fleet.
+
+The paper's figure 5, the robots' maps with the matched places, the fused map and the building, is drawn of the first
+and the last row of the first seed of --changes, into docs/images.
 """
 
 import itertools
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,6 +44,8 @@ class Step(NamedTuple):
 
 
 PAPER, DEFAULT = "the paper", "light network, words and bits, LiDAR places: the default"
+PICTURES = {step: common.REPOSITORY / "docs" / "images" / f"figure5-{name}.png" for step, name in
+            ((PAPER, "paper"), (DEFAULT, "default"))}  # fmt: skip
 CHANGES = (
     Step("delta -> geometric verification", {"decision": "geometry"}),
     Step("rebuild -> incremental", {"vocabulary": {"strategy": "incremental"}}),
@@ -67,22 +72,27 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         for seed in chosen.seeds:
             fleet, full = (chosen.fleets or Path(place)) / f"default-{seed}", seed in chosen.changes
-            rows += kept.rows((seed, full), lambda fleet=fleet, seed=seed, full=full: fleet_rows(fleet, seed, full))
+            pictures = PICTURES if [seed] == list(chosen.changes[:1]) else {}
+            of_fleet = (fleet, seed, full, pictures)
+            rows += kept.rows((seed, full), lambda of_fleet=of_fleet: fleet_rows(*of_fleet))
     report.table("Means", {"step": "", "fleets": "d", **dict.fromkeys(MEASURES, "")}, means(rows))
     report.table("Against the row above", {"step": "", **dict.fromkeys(MEASURES, "")}, differences(rows))
     report.table("Fleets", COLUMNS, rows)
     report.write()
 
 
-def fleet_rows(fleet: Path, seed: int, full: bool) -> Iterator[tuple]:
-    """One fleet, recorded into the folder ``fleet``, by the paper's system and, if ``full``, after each change."""
+def fleet_rows(fleet: Path, seed: int, full: bool, pictures: Mapping[str, Path]) -> Iterator[tuple]:
+    """One fleet, recorded into the folder ``fleet``, by the paper's system and, if ``full``, after each change.
+
+    ``pictures``: where figure 5 of a row goes.
+    """
     common.simulated(fleet, "--robots", simulated_fleet.ROBOTS, "--seed", seed)
     robots = sorted(fleet.glob("robot_*"))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         paper, run = folder / "paper", folder / "run"
         common.run_fcslam("map", *robots, "--config", Preset.PAPER, "--output", paper)
-        yield seed, PAPER, *measures(paper, fleet)
+        yield seed, PAPER, *measures(paper, fleet, pictures.get(PAPER))
         if not full:
             return
         for step, cloud in changed_clouds():
@@ -91,7 +101,7 @@ def fleet_rows(fleet: Path, seed: int, full: bool) -> Iterator[tuple]:
             common.run_fcslam("map", "--onto", paper, "--config", file, "--output", run, "--force")
             yield seed, step.name, *measures(run, fleet)
         common.run_fcslam("map", *robots, "--output", run, "--force")
-        yield seed, DEFAULT, *measures(run, fleet)
+        yield seed, DEFAULT, *measures(run, fleet, pictures.get(DEFAULT))
 
 
 def changed_clouds() -> Iterator[tuple[Step, dict[str, object]]]:
@@ -102,14 +112,15 @@ def changed_clouds() -> Iterator[tuple[Step, dict[str, object]]]:
         fleet["fusion"] = changes.pop("fusion", fleet["fusion"])
         vocabulary = {**fleet["matcher"]["vocabulary"], **changes.pop("vocabulary", {})}
         fleet["matcher"] = {**fleet["matcher"], **changes, "vocabulary": vocabulary}
-        yield step, fleet
+        yield step, dict(fleet)
 
 
-def measures(run: Path, fleet: Path) -> tuple[float, ...]:
-    """A run against the truth, as in ``MEASURES``."""
+def measures(run: Path, fleet: Path, picture: Path | None = None) -> tuple[float, ...]:
+    """A run against the truth, as in ``MEASURES``; ``picture``: file of its figure 5."""
     with tempfile.TemporaryDirectory() as place:
         result = Path(place) / "result.json"
-        common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result)
+        drawn = [] if picture is None else ["--figure", picture]
+        common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result, *drawn)
         found = simulated_fleet.read(result)
     robots = [f"robot_{k + 1}" for k in range(simulated_fleet.ROBOTS)]
     matches, views = "inter_robot_verified_both", "inter_robot_verified_camera_views"

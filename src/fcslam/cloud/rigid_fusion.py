@@ -26,7 +26,7 @@ from fcslam.graph.cluster import DIRECTION_M
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
 EQUAL_M = 0.5
-"""Largest difference of two equal distances: that of the positions of two robots that see the same place."""
+"""Largest difference of the distances of two points in both maps. If words alone decide, the robots stood apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
