@@ -1,23 +1,29 @@
 """From the paper's system to the default one, one change at a time: what does each change gain?
 
-    python benchmarks/paper_steps.py --paper VGG.onnx --vgg VGG.onnx --keep steps.jsonl
+    python benchmarks/paper_steps.py [--changes 101 102 103] [--fleets FOLDER --keep steps.jsonl]
 
-The first row is `fcslam map --config paper`. Each row below changes one thing and keeps it. Three robots with LiDAR and
-camera drive 60 m each in a simulated building from unknown starts; the seeds were not used while settings were chosen.
---paper is a network with the paper's encoder that was trained with eqs. (1)-(3), --vgg the same encoder with our losses
-(`benchmarks/paper_networks.py` trains both); without them, their rows are left out.
+The first row is `fcslam map --config paper`, for all seeds. Each row below changes one thing and keeps it, for the
+seeds of --changes. Three robots with LiDAR and camera drive 60 m each in the default simulated building from unknown
+starts. The seeds were not used while settings were chosen; the rule for two valid matching points was chosen on seeds
+201 and 202.
 
-Robots send their packets once for each detector and choice of places. The cloud then applies the same packets with the
-settings of each row (`fcslam map --onto`), so all rows have the same LiDAR SLAM. CPU is that of this second command.
-ATE is that of the worst robot, each map moved onto the truth as a whole: it says little where maps stay apart or are
-joined falsely. A join or a closure is wrong if it is off by 0.5 m or 10 deg. The paper takes the poses of two matching
-places for one, so its matches are right only if the robots stood at one spot. Recall: revisits between robots that
-correct verified closures find. Intervals: 95 %, bootstrap over seeds; over fleets, for what a change does to them.
+The cloud applies the packets of the first row with the settings of each row below (`fcslam map --onto`), but for the
+last row, whose robots send other places. A join is right if it is off by 0.5 m and 10 deg at most, otherwise false. ATE
+is that of the worst robot, each map moved onto the truth as a whole: it says little where maps stay apart or are joined
+falsely.
+
+Matches are verified closures between robots. They are off if their transform is off by more than 0.5 m or 10 deg; the
+paper takes the poses of two matching places for one. Camera matches are judged by what both cameras saw as well: more
+than a half of either view in the other (same view), or less than a tenth (other view). Recall: revisits between robots
+that matches with a right transform find. Intervals: 95 %, bootstrap over seeds; of what a change does to each fleet.
+
+The paper's figure 5, the robots' maps with the matched places, the fused map and the building, is drawn of the first
+and the last row of the first seed of --changes, into docs/images.
 """
 
 import itertools
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,141 +35,128 @@ import yaml
 from fcslam.lab.presets import Preset
 from fcslam.metrics.bootstrap import mean_interval
 
-CASES = ("default", "corridor", "default, other light")
-PAPER, VGG, LIGHT, BOTH = "paper's network, camera", "vgg, camera", "light, camera", "light, LiDAR and camera"
-"""What robots send: detector and places."""
-
 
 class Step(NamedTuple):
-    """One row: its name, what the robots send, and the settings of the cloud that it changes."""
+    """One row: its name and the settings of the cloud that it changes."""
 
     name: str
-    sends: str
     changes: dict[str, object]
 
 
-STEPS = (
-    Step("the paper", PAPER, {}),
-    Step("eqs. (1)-(3) -> our losses", VGG, {}),
-    Step("VGG -> light network", LIGHT, {}),
-    Step("delta -> geometric verification", LIGHT, {"decision": "geometry", "small_fleet": 0}),
-    Step("rebuild -> incremental", LIGHT, {"vocabulary": {"strategy": "incremental"}}),
-    Step("words -> words and bits", LIGHT, {"vocabulary": {"strategy": "incremental", "scoring": "matches"}}),
-    Step("few places: all compared", LIGHT, {"small_fleet": 150}),
-    Step("two points -> joint robust graph", LIGHT, {"fusion": "joint"}),
-    Step("LiDAR places on: the default", BOTH, {}),
+PAPER, DEFAULT = "the paper", "light network, words and bits, LiDAR places: the default"
+PICTURES = {step: common.REPOSITORY / "docs" / "images" / f"figure5-{name}.png" for step, name in
+            ((PAPER, "paper"), (DEFAULT, "default"))}  # fmt: skip
+CHANGES = (
+    Step("delta -> geometric verification", {"decision": "geometry"}),
+    Step("rebuild -> incremental", {"vocabulary": {"strategy": "incremental"}}),
+    Step("two points -> joint robust graph", {"fusion": "joint"}),
 )
+STEPS = (PAPER, *(step.name for step in CHANGES), DEFAULT)
 
-MEASURES = {"one map": ".2f", "false joins": ".2f", "worst ATE, m": ".3f", "F1": ".3f", "verified": ".0f",
-            "wrong": ".0f", "recall": ".3f", "sent by a robot, kB": ".0f", "CPU of the cloud, s": ".1f"}  # fmt: skip
-COLUMNS = {"building": "", "seed": "", "step": "", **MEASURES}
+MEASURES = {"right joins, of 3": ".2f", "false joins": ".2f", "worst ATE, m": ".3f", "F1": ".3f", "matches": ".0f",
+            "off": ".0f", "camera matches": ".0f", "same view": ".0f", "other view": ".0f", "recall": ".3f",
+            "sent by a robot, kB": ".0f"}  # fmt: skip
+COLUMNS = {"seed": "", "step": "", **MEASURES}
 
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=CASES, help="kinds of fleet")
     parser.add_argument("--seeds", nargs="+", type=int, default=simulated_fleet.SEEDS, help="of the fleets")
-    parser.add_argument("--paper", type=Path, help="the network of the first row")
-    parser.add_argument("--vgg", type=Path, help="the network of the second row")
+    parser.add_argument("--changes", nargs="*", type=int, default=simulated_fleet.SEEDS[:3], help="seeds of all rows")
     parser.add_argument("--keep", type=Path, help="file that keeps finished fleets; the same one resumes")
     parser.add_argument("--fleets", type=Path, help="folder that keeps the recordings [they are deleted]")
     chosen = parser.parse_args()
     kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__, chosen)
-    networks = {PAPER: chosen.paper, VGG: chosen.vgg}
-    steps = [step for step in STEPS if networks.get(step.sends, step) is not None]
     rows: list[tuple] = []
     with tempfile.TemporaryDirectory() as place:
-        for seed, case in itertools.product(chosen.seeds, chosen.cases):
-            folder = (chosen.fleets or Path(place)) / f"{case}-{seed}"
-            for sends in dict.fromkeys(step.sends for step in steps):
-                network = networks.get(sends)
-                key = (case, seed, sends, str(network and network.resolve()))
-                fleet = (folder, case, seed, sends, network)
-                rows += kept.rows(key, lambda fleet=fleet: fleet_rows(*fleet))
-    for case in chosen.cases:
-        report.table(f"Means: {case}", {"step": "", **dict.fromkeys(MEASURES, "")}, means(rows, case, steps))
-    report.table(
-        "Against the row above: all fleets", {"step": "", **dict.fromkeys(MEASURES, "")}, differences(rows, steps)
-    )
+        for seed in chosen.seeds:
+            fleet, full = (chosen.fleets or Path(place)) / f"default-{seed}", seed in chosen.changes
+            pictures = PICTURES if [seed] == list(chosen.changes[:1]) else {}
+            of_fleet = (fleet, seed, full, pictures)
+            rows += kept.rows((seed, full), lambda of_fleet=of_fleet: fleet_rows(*of_fleet))
+    report.table("Means", {"step": "", "fleets": "d", **dict.fromkeys(MEASURES, "")}, means(rows))
+    report.table("Against the row above", {"step": "", **dict.fromkeys(MEASURES, "")}, differences(rows))
     report.table("Fleets", COLUMNS, rows)
     report.write()
 
 
-def fleet_rows(fleet: Path, case: str, seed: int, sends: str, network: Path | None) -> Iterator[tuple]:
-    """One fleet, recorded into the folder ``fleet``, under every step whose robots send this."""
-    common.simulated(fleet, "--robots", simulated_fleet.ROBOTS, "--seed", seed, *simulated_fleet.CASES[case][0])
+def fleet_rows(fleet: Path, seed: int, full: bool, pictures: Mapping[str, Path]) -> Iterator[tuple]:
+    """One fleet, recorded into the folder ``fleet``, by the paper's system and, if ``full``, after each change.
+
+    ``pictures``: where figure 5 of a row goes.
+    """
+    common.simulated(fleet, "--robots", simulated_fleet.ROBOTS, "--seed", seed)
+    robots = sorted(fleet.glob("robot_*"))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        settings = settings_file(folder / "robots.yaml", {"robot": robot_settings(sends, network)})
-        common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--config", settings, "--output", folder / "sent")
-        (folder / "sent" / "mission.state").unlink()  # the step with its settings would begin at the end
-        for step, cloud in cloud_settings():
-            if step.sends != sends:
-                continue
-            run, result = folder / "run", folder / "result.json"
-            file = settings_file(folder / "cloud.yaml", {"fleet": cloud})
-            cost = common.run_fcslam("map", "--onto", folder / "sent", "--config", file, "--output", run, "--force")
-            common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result)
-            yield case, seed, step.name, *measures(simulated_fleet.read(result), cost)
+        paper, run = folder / "paper", folder / "run"
+        common.run_fcslam("map", *robots, "--config", Preset.PAPER, "--output", paper)
+        yield seed, PAPER, *measures(paper, fleet, pictures.get(PAPER))
+        if not full:
+            return
+        for step, cloud in changed_clouds():
+            file = folder / "cloud.yaml"
+            file.write_text(yaml.safe_dump({"fleet": cloud}), encoding="utf-8")
+            common.run_fcslam("map", "--onto", paper, "--config", file, "--output", run, "--force")
+            yield seed, step.name, *measures(run, fleet)
+        common.run_fcslam("map", *robots, "--output", run, "--force")
+        yield seed, DEFAULT, *measures(run, fleet, pictures.get(DEFAULT))
 
 
-def robot_settings(sends: str, network: Path | None) -> dict[str, object]:
-    settings: dict[str, object] = {"channels": ["lidar", "camera"] if sends == BOTH else ["camera"]}
-    if network is not None:
-        settings["views"] = {"onnx": {"weights": str(network.resolve())}}
-    return settings
-
-
-def cloud_settings() -> Iterator[tuple[Step, dict[str, object]]]:
-    """The settings of the cloud at each step: the preset, then one change after the other."""
+def changed_clouds() -> Iterator[tuple[Step, dict[str, object]]]:
+    """The settings of the cloud after each change: the preset, then one change after the other."""
     fleet = yaml.safe_load(Preset.PAPER.file.read_text(encoding="utf-8"))["fleet"]
-    for step in STEPS:
+    for step in CHANGES:
         changes = dict(step.changes)
-        if "fusion" in changes:
-            fleet["fusion"] = changes.pop("fusion")
+        fleet["fusion"] = changes.pop("fusion", fleet["fusion"])
         vocabulary = {**fleet["matcher"]["vocabulary"], **changes.pop("vocabulary", {})}
         fleet["matcher"] = {**fleet["matcher"], **changes, "vocabulary": vocabulary}
-        yield step, fleet
+        yield step, dict(fleet)
 
 
-def settings_file(path: Path, content: dict[str, object]) -> Path:
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    return path
-
-
-def measures(found: dict[str, float], cost: common.Cost) -> tuple[float, ...]:
+def measures(run: Path, fleet: Path, picture: Path | None = None) -> tuple[float, ...]:
+    """A run against the truth, as in ``MEASURES``; ``picture``: file of its figure 5."""
+    with tempfile.TemporaryDirectory() as place:
+        result = Path(place) / "result.json"
+        drawn = [] if picture is None else ["--figure", picture]
+        common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result, *drawn)
+        found = simulated_fleet.read(result)
     robots = [f"robot_{k + 1}" for k in range(simulated_fleet.ROBOTS)]
+    matches, views = "inter_robot_verified_both", "inter_robot_verified_camera_views"
     return (
-        float(found["maps"] == 1),
+        found["joins"] - found["false_joins"],
         found["false_joins"],
         max(found[f"ate_rmse_{robot}"] for robot in robots),
         found["map_f1"],
-        found["inter_robot_verified_both_closures"],
-        found["inter_robot_verified_both_wrong"],
-        found["inter_robot_verified_both_recall"],
+        found[f"{matches}_closures"],
+        found[f"{matches}_wrong"],
+        found[f"{views}_judged"],
+        found[f"{views}_same"],
+        found[f"{views}_different"],
+        found[f"{matches}_recall"],
         sum(found[f"uplink_bytes_{robot}"] for robot in robots) / len(robots) / 1e3,
-        cost.cpu_s,
     )
 
 
-def means(rows: Sequence[tuple], case: str, steps: Sequence[Step]) -> Iterable[tuple]:
-    for step in steps:
-        mine = [row[3:] for row in rows if row[0] == case and row[2] == step.name]
-        yield (
-            step.name,
-            *(cell(values, spec) for values, spec in zip(zip(*mine, strict=True), MEASURES.values(), strict=True)),
-        )
+def means(rows: Sequence[tuple]) -> Iterable[tuple]:
+    for step in STEPS:
+        mine = [row[2:] for row in rows if row[1] == step]
+        if mine:
+            yield (
+                step,
+                len(mine),
+                *(cell(*each) for each in zip(zip(*mine, strict=True), MEASURES.values(), strict=True)),
+            )
 
 
-def differences(rows: Sequence[tuple], steps: Sequence[Step]) -> Iterable[tuple]:
-    """What each change does to the same fleets; fleets that lack one of the two rows do not count."""
-    found = {(*row[:2], row[2]): np.asarray(row[3:], np.float64) for row in rows}
-    fleets = dict.fromkeys(row[:2] for row in rows)
-    for before, step in itertools.pairwise(steps):
-        both = [fleet for fleet in fleets if {(*fleet, before.name), (*fleet, step.name)} <= found.keys()]
-        changes = np.transpose([found[(*fleet, step.name)] - found[(*fleet, before.name)] for fleet in both])
-        yield step.name, *(cell(values, f"+{spec}") for values, spec in zip(changes, MEASURES.values(), strict=True))
+def differences(rows: Sequence[tuple]) -> Iterable[tuple]:
+    """What each change does to the same fleets."""
+    found = {row[:2]: np.asarray(row[2:], np.float64) for row in rows}
+    seeds = [seed for seed, step in found if step == DEFAULT]
+    for before, step in itertools.pairwise(STEPS if seeds else ()):
+        changes = np.transpose([found[seed, step] - found[seed, before] for seed in seeds])
+        yield step, *(cell(values, f"+{spec}") for values, spec in zip(changes, MEASURES.values(), strict=True))
 
 
 def cell(values: Sequence[float], spec: str) -> str:

@@ -51,6 +51,10 @@ def test_the_docstring_names_the_command(path):
     assert f"python benchmarks/{path.name}" in docstring
 
 
+def test_every_script_has_a_report():
+    assert [path.name for path in SCRIPTS if not (FOLDER / "results" / f"{path.stem}.md").exists()] == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 @pytest.mark.usefixtures("common")

@@ -17,6 +17,7 @@ import urllib.request
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from glob import glob
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from fcslam import open_run
 from fcslam.cli import main
 from fcslam.geometry import se2
 from fcslam.sources import open_source, write_carmen
+from tests.lab.simulation.gl import require_gl
 from tests.sources.test_bag_robots import fleet_bag
 from tests.test_docs import PAGES, ROOT, command_lines
 
@@ -119,7 +121,15 @@ def make_map_of_another_program(path: Path) -> None:
     path.with_suffix(".pgm").write_bytes(building.with_suffix(".pgm").read_bytes())
 
 
+def make_demo(path: Path) -> None:
+    """Short drives of two robots with cameras, as `fcslam demo` leaves them."""
+    require_gl()
+    arguments = ["--robots", "2", "--path-length", "8", "--seed", "1", "--output", str(path)]
+    assert main(["tools", "simulate", *arguments]) == 0
+
+
 MADE = {
+    "demo/recordings": make_demo,
     "building.relations.gz": make_relations("in-one"),
     "intel.relations.gz": make_relations("intel"),
     "wednesday.clf.gz": make_another_day,
@@ -157,7 +167,7 @@ def as_here(command: str) -> str:
 
 def run(command: str) -> int:
     words = shlex.split(command.partition(">")[0])
-    return main(words[1:])
+    return main([name for word in words[1:] for name in sorted(glob(word)) or [word]])
 
 
 @pytest.mark.slow

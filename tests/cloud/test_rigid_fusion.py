@@ -137,8 +137,8 @@ def test_corrections_and_graph_say_the_same_as_the_poses(results, strategy):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("strategy", "off_m"), [("two_point", 3.0), ("n_point", 0.5), ("joint", 0.0)])
-def test_a_false_first_match_ruins_who_trusts_it(scripted, strategy, off_m):
-    script = [*closures(A, B, MEETINGS[:1], shift=ALIAS), *closures(A, B, MEETINGS[1:])]
+def test_two_false_matches_that_fit_each_other_ruin_who_trusts_them(scripted, strategy, off_m):
+    script = [*closures(A, B, MEETINGS[:2], shift=ALIAS), *closures(A, B, MEETINGS[2:])]
     result = feed(scripted(script, fusion=strategy), two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 0}
     assert error_m(result) > off_m if off_m else error_m(result) < 1e-3
@@ -299,6 +299,15 @@ def test_the_two_most_similar_points_that_lie_apart_are_taken():
         used[strategy] = [c.status is ClosureStatus.ACCEPTED for c in fused.closures]
     assert used[FusionStrategy.TWO_POINT] == [False, False, True, False, True]
     assert used[FusionStrategy.FIRST_TWO] == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize("strategy", [FusionStrategy.TWO_POINT, FusionStrategy.FIRST_TWO])
+def test_two_points_that_no_rigid_motion_lays_on_one_another_are_not_taken(strategy):
+    """The first match names two places that lie apart, by more than two robots do that see one place."""
+    false = [replace(line, T_i_j=np.zeros(3)) for line in closures(A, B, [(0, 8)])]
+    log = ledger_of(false, closures(A, B, [(8, 8), (24, 24)]))
+    fused = fuse_rigidly(log, own_maps(a=(0, 0, 0), b=(3, 4, 2)), strategy)
+    assert [c.status is ClosureStatus.ACCEPTED for c in fused.closures] == [False, True, True]
 
 
 @rigid

@@ -225,7 +225,7 @@ def test_a_robot_on_another_floor_was_not_lost(scans, tmp_path):
             robot.add(scan)
         robot.change_floor("2")
         robot.add(scans[half])
-        robot._correct_by_server(1, replace(CORRECTION, map_index=1, quality=0.5))
+        robot._map_poses.correct_by_server(1, replace(CORRECTION, map_index=1, quality=0.5))
         for scan in scans[half + 1 :]:
             robot.add(scan)
         robot.finish()
@@ -253,8 +253,8 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     assert list(cloud.stored) == [(packet.epoch, packet.sequence) for packet in said]
     assert list(dict.fromkeys(seen)) == [LocalizationState.MAPPING, LocalizationState.LOST]
     assert robot.status().map_index is None
-    robot._correct_by_server(0, replace(CORRECTION, map_index=1))
-    robot._correct_by_server(1, replace(CORRECTION, quality=0.5))
+    robot._map_poses.correct_by_server(0, replace(CORRECTION, map_index=1))
+    robot._map_poses.correct_by_server(1, replace(CORRECTION, quality=0.5))
     now = robot.status()
     assert (now.localization, now.quality, now.map_index, now.times_lost) == (LocalizationState.RELOCALISED, 0.5, 0, 1)
     path = robot.trajectory()
@@ -262,7 +262,7 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     assert np.array_equal(stamps, [scan.stamp for scan in scans if scan.stamp >= stamps[0]])
     assert stamps[0] > moment, "where it was before is known as of then only"
     assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
-    robot._correct_by_server(0, replace(CORRECTION, version=CORRECTION.version + 1))
+    robot._map_poses.correct_by_server(0, replace(CORRECTION, version=CORRECTION.version + 1))
     assert np.array_equal(robot.trajectory().stamps, stamps), "not even if it was called the same map then"
 
 
@@ -335,10 +335,10 @@ def test_own_closures_move_the_pose_while_the_server_is_away(scans, monkeypatch,
         for scan in scans[:-2]:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
         monkeypatch.setattr(robot, "_is_server_away", lambda: is_away)
-        robot._correct_by_server(0, replace(CORRECTION, T_map_odom=frozen([10.0, 0.0, 0.0])))
+        robot._map_poses.correct_by_server(0, replace(CORRECTION, T_map_odom=frozen([10.0, 0.0, 0.0])))
         before = robot.add_scan(scans[-2].ranges_m, scans[-2].stamp, scans[-2].T_odom_base)
         drawn = robot.map()
-        own = robot._localizers[0][0].correction
+        own = robot._map_poses._own[0].correction
         closed = se2.compose(np.array([-2.0, 0.0, 0.0]), own.T_map_odom)
         robot._correct(0, replace(own, version=own.version + 1, T_map_odom=frozen(closed)))
         after = robot.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)

@@ -9,6 +9,7 @@ import pytest
 import fcslam
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, classify
 from fcslam.live.fleet_view import Teammate
+from fcslam.live.joint_map import JointMap
 from fcslam.live.records import Wiring
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
 from fcslam.records import Correction, LaserModel, LaserScan, frozen
@@ -128,7 +129,8 @@ def test_a_robot_that_follows_another_through_a_corridor_knows_that_it_drives():
         config = {"map": {"robot_radius_m": radius_m}}
         with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
             robot.fleet = Fleet(corridor_map())
-            robot._correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
+            robot._joint = JointMap("a", robot.fleet, robot._config.map)
+            robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
             truth, poses = convoy(robot, robot.fleet)
             ends[radius_m] = np.hypot(*(poses - truth)[-1, :2])
     assert ends[0.35] < 0.3
@@ -145,8 +147,9 @@ def test_a_robot_that_stands_is_no_ghost_in_what_this_robot_saw_last(joint):
         config = {"map": {"robot_radius_m": radius_m}}
         with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
             robot.fleet = Fleet(shifted)
+            robot._joint = JointMap("a", robot.fleet, robot._config.map)
             robot.fleet.mates = [mate(0.0, 0.0, name="a"), mate(*(standing - start))]
-            robot._correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
+            robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
             for k, pose in enumerate(poses):
                 scan, _ = scan_at(pose, worlds.room(), standing)
                 robot.add_scan(scan.ranges_m, 0.1 * k, pose)

@@ -592,16 +592,19 @@ def test_the_live_run_follows_and_is_always_whole(cloud):
 
 def test_the_live_run_has_a_certificate_which_is_computed_seldom_or_when_maps_join(cloud, monkeypatch):
     certified = []
-    monkeypatch.setattr(worker_module, "QUALITY_EVERY_S", 1000.0)
+    monkeypatch.setattr(worker_module, "QUALITY_EVERY_S", 500.0)  # the clock moves at every look
     monkeypatch.setattr(report, "certify", lambda *given: certified.append(cloud.now) or certify(*given))
     packets = two_robots()
     for packet in packets:
         cloud.put([packet])
+        cloud.now += 2.0
         cloud.work()
         live = open_run(cloud.folder.live)
         assert ("quality.json" in live.quality) == any(len(t.stamps) for t in live.trajectories.values())
-    assert cloud.now > 3000.0
-    assert 3 <= len(set(certified)) <= cloud.now / 1000.0 + 4.0, "and as b comes and joins a"
+    assert 2 <= len(certified) < len(packets) / 3
+    apart_s = np.diff(certified)
+    early = (apart_s > 0.0) & (apart_s < worker_module.QUALITY_EVERY_S)  # 0 s: two maps at once
+    assert early.sum() <= 2, "b begins, and the maps join"
     assert set(json.loads(live.quality["quality.json"])) == {"0"}
 
 

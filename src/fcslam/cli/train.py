@@ -10,6 +10,7 @@ from fcslam.cli.mission_options import SettingsFiles, chosen_settings
 from fcslam.cli.options import output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
 from fcslam.cli.training_options import (
+    QUICK_IMAGES,
     TRAINING_OUTPUT,
     Quick,
     Start,
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
 QUICK = {"steps": 20, "shape_steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
-QUICK_IMAGES = 4
-"""Images of ``--quick``: labelling one takes vgg some seconds."""
 FIGURES = ("repeatability", "mma_3px", "shift_repeatability")
 
 

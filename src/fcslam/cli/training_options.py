@@ -21,6 +21,8 @@ Start = Annotated[
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to see that everything works.")]
 
+QUICK_IMAGES = 4
+"""Images of a robot: labelling one takes vgg some seconds."""
 QUICK_VALIDATION_PAIRS = 2
 """A validation of vgg on all pairs takes half a minute."""
 

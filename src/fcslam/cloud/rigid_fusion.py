@@ -1,11 +1,11 @@
 """Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps aligned by matched points.
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
-translation between the two, eqs. (5) and (6). The paper does not say which two. ``two_point`` takes the two most
-similar matches, ``first_two`` the first two to arrive; in both maps the two lie ``DIRECTION_M`` or more apart. No
-closure is doubted and nothing is optimised: a false match turns a whole map, and the drift within the robots' maps
-stays. ``n_point`` is the same with all matched points, in the least squares sense. All are here to be compared with the
-joint graph.
+translation between the two, eqs. (5) and (6). The paper does not say which two. Here two points are valid if they lie
+``DIRECTION_M`` or more apart and equally far in both maps, as maps are rigid. ``two_point`` takes the two most similar
+such matches, ``first_two`` the first two to arrive. No other closure is asked and nothing is optimised: two false
+matches that fit each other turn a whole map, and the drift within the robots' maps stays. ``n_point`` is the same with
+all matched points, in the least squares sense. All are here to be compared with the joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
@@ -25,6 +25,9 @@ from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
 from fcslam.graph.cluster import DIRECTION_M
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
+EQUAL_M = 0.5
+"""Largest difference of the distances of two points in both maps. If words alone decide, the robots stood apart."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Match:
@@ -36,10 +39,11 @@ class _Match:
     xy_a: FloatArray
     xy_b: FloatArray
 
-    def is_distinct(self, other: "_Match") -> bool:
-        """Whether the two points give a direction, in both maps: places are the same place until they lie apart."""
-        sides = self.xy_a - other.xy_a, self.xy_b - other.xy_b
-        return all(float(np.hypot(*side)) >= DIRECTION_M for side in sides)
+    def is_valid_with(self, other: "_Match") -> bool:
+        """Whether one rigid motion can lay both points of one map on those of the other and they give its direction."""
+        apart_a = float(np.hypot(*(self.xy_a - other.xy_a)))
+        apart_b = float(np.hypot(*(self.xy_b - other.xy_b)))
+        return min(apart_a, apart_b) >= DIRECTION_M and abs(apart_a - apart_b) <= EQUAL_M
 
 
 _Links = Mapping[tuple[str, str], Sequence[_Match]]
@@ -91,7 +95,7 @@ def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
         if match.robots in two and strategy is not FusionStrategy.N_POINT:
             continue
         earlier = known.setdefault(match.robots, [])
-        partner = next((other for other in earlier if match.is_distinct(other)), None)
+        partner = next((other for other in earlier if match.is_valid_with(other)), None)
         if partner is not None:
             two.setdefault(match.robots, (partner, match))
         earlier.append(match)

@@ -268,11 +268,12 @@ def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
     """The sweep with its velocity moved by a correction, shape (3,)."""
     if sweep is None:
         return None
-    x, y, theta = (
-        min(max(assumed + correction, -LARGEST_VELOCITY), LARGEST_VELOCITY)
-        for assumed, correction in zip(sweep.velocity, velocity.tolist(), strict=True)
-    )
-    return sweep._replace(velocity=(x, y, theta))
+    (x, y, theta), (dx, dy, dtheta) = sweep.velocity, velocity.tolist()
+    return sweep._replace(velocity=(_bounded(x + dx), _bounded(y + dy), _bounded(theta + dtheta)))
+
+
+def _bounded(velocity: float) -> float:
+    return min(max(velocity, -LARGEST_VELOCITY), LARGEST_VELOCITY)
 
 
 def _learn_usual(usual: float, likelihood: float) -> float:

@@ -6,25 +6,21 @@ beside it, which is another process, so no pose waits for it.
 
 import math
 import shutil
-import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fcslam.api import StrPath, settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import ScanPose
-from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.live.fleet_view import FleetView, following
 from fcslam.live.inputs import (
     Lasers,
@@ -33,11 +29,11 @@ from fcslam.live.inputs import (
     checked_pose,
     checked_stamp,
 )
+from fcslam.live.joint_map import JointMap
+from fcslam.live.map_poses import MapPoses
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import WIRED, EventKind, Playback, RobotEvent, RobotPose, RobotStatus, Wiring
-from fcslam.live.teammates import beams_on_teammates
 from fcslam.live.tracker import LiveTracker
-from fcslam.maps.joint_tiles import padded
 from fcslam.mission.driving import track_of
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import (
@@ -45,18 +41,14 @@ from fcslam.records import (
     Correction,
     FloatArray,
     Keyscan,
-    LaserModel,
     LaserScan,
-    Ranges,
     SensorRecord,
-    Sweep,
     frozen,
 )
 from fcslam.robot.backend_runner import WorkerBackend
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
-from fcslam.robot.localization import Localizer
 from fcslam.robot.outbox import Outbox, WaitingPackets
 from fcslam.robot.sender import CONNECTING
 from fcslam.robot.uplink import Uplink
@@ -80,37 +72,6 @@ time never has as many."""
 
 LARGEST_OUTBOX_BYTES = 256_000_000
 """Limit of the packets that wait for the server; above three quarters, places are left out."""
-MOST_DRAWN = 20_000
-"""Most keyscans that wait to be drawn by the cloud: hours of an outage."""
-MOST_MET = 1000
-"""Scans that saw other robots and may become keyscans yet."""
-
-
-class _DrawnKeyscan(NamedTuple):
-    """A keyscan that the cloud may not have drawn yet."""
-
-    part: int
-    stamp: float
-    ranges_m: Ranges
-    laser: LaserModel
-    T_odom_base: FloatArray
-    sweep: Sweep | None
-
-
-class _Ahead:
-    """What this robot knows before its fleet does, and what it told of its fleet."""
-
-    def __init__(self) -> None:
-        self.drawn: deque[_DrawnKeyscan] = deque()
-        """Keyscans that the joint map of the cloud may not show yet."""
-        self.lasers: tuple[LaserModel, ...] = ()
-        """As the robot announced them last."""
-        self.T_odom_base: FloatArray | None = None
-        """Pose of the newest scan by odometry without its jumps, or by the prediction in its place."""
-        self.met: dict[float, NDArray[np.bool_]] = {}
-        """Beams of the newest scans that hit other robots, by the stamp of the scan."""
-        self.news = 0
-        """Changes of the fleet that were told."""
 
 
 class Robot(LiveTracker):
@@ -174,12 +135,7 @@ class Robot(LiveTracker):
         """The part that the newest pose is of."""
         self._applied: Correction | None = None
         """The correction that the newest pose was made with."""
-        self._localizers: tuple[dict[int, Localizer], dict[int, Localizer]] = {}, {}
-        """Corrections by part: those of the robot's own map, and those of the server. After being lost, the robot goes
-        on in another part."""
-        self._T_map_own: dict[int, FloatArray] = {}
-        """By part, where the robot's own map lies in the map of the server, by its newest correction."""
-        self._correcting = threading.Lock()
+        self._map_poses = MapPoses(wiring.clock)
         self._keyscans = self._part_base = 0
         self._is_placed = False
         """Whether the poses of all keyframes are written."""
@@ -188,7 +144,10 @@ class Robot(LiveTracker):
         self._sleep = wiring.sleep
         self.fleet: FleetView | None = None
         """What the robot knows of its fleet; None without a server or without a map of its own."""
-        self._ahead = _Ahead()
+        self._uplink: Uplink | None = None
+        self._joint: JointMap | None = None
+        self._news = 0
+        """Changes of the fleet that were told."""
         with ExitStack() as stack:
             executor = wiring.started(stack)
             folder = _state_folder(state, server is not None, stack)
@@ -205,16 +164,16 @@ class Robot(LiveTracker):
                 if own_map:
                     followed = [FleetClient(url, *shown) for url in urls]
                     self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
+                    self._joint = JointMap(name, self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)
             keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)
             self._outbox = outbox
-            self._uplink: Uplink | None = None
             if outbox is not None and folder is not None:
                 # Not the seed of the configuration: robots must not retry at the same moments.
                 self._uplink = Uplink(
                     self._frontend, outbox, transport, folder, np.random.default_rng(), self._clock,
-                    self._correct_by_server,
+                    self._map_poses.correct_by_server,
                     known, None if budget_kbps is None else Budget(1e3 * budget_kbps),
                 )  # fmt: skip
                 stack.callback(self._uplink.close)
@@ -259,7 +218,7 @@ class Robot(LiveTracker):
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: its pose, its connection, and counts since its start."""
-        uplink, localizer = self._uplink, self._localizer(self._part)
+        uplink, localizer = self._uplink, self._map_poses.localizer(self._part)
         failure = self._frontend.backend_failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
@@ -294,22 +253,11 @@ class Robot(LiveTracker):
 
     def joint_map(self) -> OccupancyMap | None:
         """As ``map``; None instead of ``own_map``."""
-        fleet = self.fleet
-        joint = None if fleet is None else fleet.joint_map
-        if fleet is None or joint is None:
+        if self._joint is None:
             return None
         with self._lock:
-            localizer = self._localizer(self._part)
-            if fleet.map_index is None or fleet.map_index != localizer.map_index:
-                return None  # the server is about to draw the map that the robot's poses are in
-            while self._ahead.drawn and self._ahead.drawn[0].stamp <= fleet.drawn_s:
-                self._ahead.drawn.popleft()
-            lately = [
-                Casting(one.ranges_m, one.laser, moved, one.sweep)
-                for one in self._ahead.drawn
-                if one.part == self._part and (moved := localizer.T_map_base(one.T_odom_base)) is not None
-            ]
-        return padded(draw_over(joint, lately, self._config.map))
+            part = self._part
+        return self._joint.draw(part, self._map_poses.localizer(part))
 
     def own_map(self) -> OccupancyMap:
         """The map of all that this robot has seen so far, corrected by all loop closures.
@@ -328,7 +276,7 @@ class Robot(LiveTracker):
         self._catch_up()
         with self._lock:
             part = self._part
-        return own.draw(self._session(part), self._own_map_pose(part))
+        return own.draw(self._session(part), self._map_poses.T_map_own(part))
 
     def closures(self) -> FloatArray:
         """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``.
@@ -340,7 +288,7 @@ class Robot(LiveTracker):
         own = self._require_own_map()
         with self._lock:
             part = self._part
-        return own.closures(self._session(part), self._own_map_pose(part))
+        return own.closures(self._session(part), self._map_poses.T_map_own(part))
 
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost or changed its floor; it waits for the worker.
@@ -359,14 +307,14 @@ class Robot(LiveTracker):
             T_odom_keyscan = track.T_odom_keyscan
         known = np.empty((0, 3)) if self._own is None else self._own.poses(self._session(part))
         # The map may have got keyscans since the track was read.
-        known = se2.compose(self._own_map_pose(part), known[: len(T_odom_keyscan)])
+        known = se2.compose(self._map_poses.T_map_own(part), known[: len(T_odom_keyscan)])
         # Keyscans that the map does not have yet go on from the last one that it has.
-        moved = self._localizer(part).T_map_base(np.zeros(3))
+        moved = self._map_poses.localizer(part).T_map_base(np.zeros(3))
         T_map_odom = np.zeros(3) if moved is None else moved
         if len(known):
             T_map_odom = se2.compose(known[-1], se2.inverse(T_odom_keyscan[len(known) - 1]))
         poses = np.concatenate((known, se2.compose(T_map_odom, T_odom_keyscan[len(known) :])))
-        index = self._localizer(part).map_index
+        index = self._map_poses.localizer(part).map_index
         T_map_base = se2.compose(poses[keyscans], offsets)
         return RobotTrajectory(
             self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base), self._floor(part)
@@ -469,7 +417,7 @@ class Robot(LiveTracker):
         try:
             self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
             backend = WorkerBackend(self.name, robot, executor, keyframes)
-            self._frontend = RobotFrontend(self.name, robot, backend, self._beside_teammates)
+            self._frontend = RobotFrontend(self.name, robot, backend, self._mark_teammates)
         except BrokenExecutor as error:
             raise InputError(
                 f"{self.name}: the process of the back end does not start; a script that makes a Robot needs "
@@ -503,10 +451,6 @@ class Robot(LiveTracker):
         if self._uplink is not None and self._uplink.failure is not None:
             raise self._uplink.failure
 
-    def _own_map_pose(self, part: int) -> FloatArray:
-        """Where the robot's own map lies in the map of its poses, shape (3,)."""
-        return self._T_map_own.get(part, np.zeros(3))
-
     def _catch_up(self) -> None:
         """Wait, without keeping scans waiting, until the back end has handled everything so far."""
         with self._lock:
@@ -522,26 +466,8 @@ class Robot(LiveTracker):
             self._uplink.before_record()
         return super()._processed(record)
 
-    def _beside_teammates(self, scan: LaserScan) -> LaserScan:
-        """The scan with the beams marked that hit other robots of the fleet, as far as the newest joint map tells."""
-        fleet, pose, radius_m = self.fleet, self._pose, self._config.map.robot_radius_m
-        T_odom_before, self._ahead.T_odom_base = self._ahead.T_odom_base, scan.T_odom_base
-        joint = None if fleet is None else fleet.joint_map
-        if fleet is None or joint is None or pose is None or T_odom_before is None or radius_m <= 0.0:
-            return scan
-        known = fleet.robots()
-        own = next((mate.map_index for mate in known if mate.robot == self.name), None)
-        if own is None or own != pose.map_index:  # the joint map is that of ``own``
-            return scan
-        T_map_base = se2.compose(pose.T_map_base, se2.between(T_odom_before, scan.T_odom_base))
-        others = [mate for mate in known if mate.map_index == own and mate.robot != self.name]
-        on_teammates = beams_on_teammates(scan, T_map_base, others, joint, radius_m)
-        if on_teammates is None:
-            return scan
-        self._ahead.met[scan.stamp] = on_teammates
-        while len(self._ahead.met) > MOST_MET:
-            del self._ahead.met[next(iter(self._ahead.met))]
-        return replace(scan, on_teammates=on_teammates)
+    def _mark_teammates(self, scan: LaserScan) -> LaserScan:
+        return scan if self._joint is None else self._joint.mark_teammates(scan, self._pose)
 
     def _take(self, packets: list[Packet]) -> None:
         """Pass the next packets on."""
@@ -549,29 +475,12 @@ class Robot(LiveTracker):
             return
         packets = [packet.on_floor(self._floor(packet.epoch)) for packet in packets]
         self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
-        if self.fleet is not None:
-            self._draw_later(packets)
+        if self._joint is not None:
+            self._joint.add(packets, self._frontend.tracks)
         if self._uplink is not None:
             self._uplink.put(packets)
         if self._own is not None:
             self._own.put([_in_epoch(packet, self._part_base + packet.epoch) for packet in packets])
-
-    def _draw_later(self, packets: list[Packet]) -> None:
-        """Keep the next keyscans until the cloud has drawn them."""
-        for packet in packets:
-            if isinstance(packet.body, Hello):
-                self._ahead.lasers = packet.body.lasers
-            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
-                keyscan, track = packet.body, self._frontend.tracks[packet.epoch]
-                T_odom_base = track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
-                laser = keyscan.laser_model(self._ahead.lasers)
-                on_teammates = self._ahead.met.pop(keyscan.stamp, np.zeros(1, np.bool_))
-                ranges_m = np.where(on_teammates, np.float32(0.0), keyscan.ranges_m)
-                self._ahead.drawn.append(
-                    _DrawnKeyscan(packet.epoch, keyscan.stamp, ranges_m, laser, T_odom_base, keyscan.sweep)
-                )
-                if len(self._ahead.drawn) > MOST_DRAWN:
-                    self._ahead.drawn.popleft()
 
     def _place(self) -> tuple[int, FloatArray] | None:
         """Index of the robot's map and its pose there, in any thread."""
@@ -579,24 +488,8 @@ class Robot(LiveTracker):
         return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
     def _correct(self, epoch: int, correction: Correction) -> None:
-        """Take a correction of the robot's own map, in any thread. While the server is away, it counts for the pose."""
-        part = epoch - self._part_base
-        with self._correcting:
-            own = self._localizers[0].setdefault(part, Localizer(self._clock))
-            own.correct(correction)
-            if part in self._T_map_own and own.correction is not None and self._is_server_away():
-                T_map_odom = se2.compose(self._T_map_own[part], own.correction.T_map_odom)
-                self._localizers[1][part].move(T_map_odom)
-
-    def _correct_by_server(self, part: int, correction: Correction) -> None:
-        """Take a correction of the server, in any thread."""
-        with self._correcting:
-            by_server = self._localizers[1].setdefault(part, Localizer(self._clock))
-            by_server.correct(correction)
-            if by_server.correction is correction:
-                own = self._localizers[0].get(part)
-                T_own_odom = np.zeros(3) if own is None or own.correction is None else own.correction.T_map_odom
-                self._T_map_own[part] = se2.compose(correction.T_map_odom, se2.inverse(T_own_odom))
+        """Take a correction of the robot's own map, in any thread."""
+        self._map_poses.correct(epoch - self._part_base, correction, self._is_server_away())
 
     def _is_server_away(self) -> bool:
         return self._uplink is None or self._uplink.trouble is not None
@@ -608,13 +501,8 @@ class Robot(LiveTracker):
         """The part with which the robot came to the floor of this one."""
         return max(first for first in self._floors if first <= part)
 
-    def _localizer(self, part: int) -> Localizer:
-        """The localizer of a part: with the server's corrections as soon as there is one, else the robot's own."""
-        own, by_server = self._localizers
-        return by_server.get(part) or own.setdefault(part, Localizer(self._clock))
-
     def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
-        localizer = self._localizer(self._part)
+        localizer = self._map_poses.localizer(self._part)
         corrected = localizer.T_map_base(T_smooth_base)
         is_found = self._part in self._floors or localizer.quality > 0.0
         return RobotPose(
@@ -626,7 +514,7 @@ class Robot(LiveTracker):
 
     def _tell(self) -> None:
         """Tell what happened between two scans."""
-        part, correction = self._part, self._localizer(self._part).correction
+        part, correction = self._part, self._map_poses.localizer(self._part).correction
         if part > self._newest_part:
             self._newest_part, self._applied = part, None
             if part in self._floors:
@@ -641,8 +529,8 @@ class Robot(LiveTracker):
             self._applied = correction
         self._tell_connection()
         if self.fleet is not None:
-            for line in self.fleet.news[self._ahead.news :]:
-                self._ahead.news += 1
+            for line in self.fleet.news[self._news :]:
+                self._news += 1
                 self._event(EventKind.FLEET, line)
         broken = self._frontend.backend_failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):

@@ -72,8 +72,9 @@ class OdometryGate:
         sweep, limits = scan.sweep, self._limits
         if sweep is None:
             return scan
-        x, y, theta = (max(abs(v), abs(mean)) for v, mean in zip(sweep.velocity, sweep.mean_velocity, strict=True))
-        if math.hypot(x, y) <= limits.speed_m_s and theta <= limits.turn_rad_s:
+        (x, y, theta), (mean_x, mean_y, mean_theta) = sweep.velocity, sweep.mean_velocity
+        speed_m_s = math.hypot(max(abs(x), abs(mean_x)), max(abs(y), abs(mean_y)))
+        if speed_m_s <= limits.speed_m_s and max(abs(theta), abs(mean_theta)) <= limits.turn_rad_s:
             self._velocity = sweep.velocity
             return scan
         return replace(scan, sweep=sweep._replace(velocity=self._velocity, acceleration=(0.0, 0.0, 0.0)))

@@ -177,7 +177,7 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
 
     Args:
         folder: the run folder.
-        maps: read the maps and the mission file too, which may be large.
+        maps: read the maps, the pose graph and the mission file too, which may be large.
 
     Raises:
         EvaluationError: ``folder`` is not a run folder, or a file of it is missing or broken.
@@ -194,7 +194,7 @@ def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
             closures=read_closures(path / CLOSURES, path),
             metrics=read_metrics(path / METRICS, path),
             config_yaml=read_text(path / CONFIG, path),
-            pose_graph_g2o=read_text(path / POSE_GRAPH, path),
+            pose_graph_g2o=read_text(path / POSE_GRAPH, path) if maps else "",
             map_files={file.name: read_bytes(file, path) for file in _map_files(path) if maps},
             local_maps=_read_local_maps(path, robots) if maps else {},
             quality={file.name: read_bytes(file, path) for file in sorted(path.glob(f"{QUALITY}*.*")) if maps},

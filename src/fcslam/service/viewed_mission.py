@@ -1,8 +1,8 @@
 """A mission as viewers see it. A live mission and a finished run have the same form, so one page shows both."""
 
-from functools import lru_cache
+import threading
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import Run, open_run
@@ -48,15 +48,26 @@ class ViewedMission(Protocol):
         """How far the packets of all robots are."""
 
 
+_MOST_KEPT: Final = 4
+"""Missions whose runs are kept in memory."""
+_lock = threading.Lock()
+"""Many robots and pages ask at once: one request reads the run, the others wait for it."""
+_kept: dict[Path, tuple[object, Run]] = {}
+"""The newest run of each mission, by the folder of its run folders. The one that was asked for last is the last."""
+
+
 def viewed_run(folder: Path) -> Run:
-    """The run in a ``run_folder`` of a viewed mission, without its maps.
+    """The run in a ``run_folder`` of a viewed mission, without its large files.
 
     Raises:
         EvaluationError: it is broken, or not there any more.
     """
-    return _read(folder, identity(folder) if folder.exists() else None)
-
-
-@lru_cache(maxsize=4)
-def _read(folder: Path, _: tuple[int, int] | None) -> Run:
-    return open_run(folder, maps=False)
+    with _lock:
+        key = folder, identity(folder) if folder.exists() else None
+        known, run = _kept.pop(folder.parent, (None, None))
+        if run is None or known != key:
+            run = open_run(folder, maps=False)
+        _kept[folder.parent] = key, run
+        if len(_kept) > _MOST_KEPT:
+            del _kept[next(iter(_kept))]
+        return run

@@ -444,7 +444,6 @@ class Worker:
         return lambda: self._write_live(result, traffic, certifies)
 
     def _write_live(self, result: FleetResult, traffic: Ledger, certifies: bool) -> None:
-        """Write the live run folder; it keeps its certificate unless another one is due."""
         run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
         if not certifies:
             files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))

@@ -6,9 +6,24 @@ import pytest
 
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
+from fcslam.lab.evaluation.fleet.match_views import MatchViews
+from fcslam.lab.evaluation.fleet.report import evaluate_fleet
 from fcslam.lab.evaluation.places.sets import read_place_set
 from fcslam.lab.evaluation.places.simulated_views import lidar_overlap, read_fleet_views
-from fcslam.records import CameraImage, CameraModel, GroundTruth, LaserModel, LaserScan, Transform, frozen
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    Channel,
+    ClosureStatus,
+    GroundTruth,
+    LaserModel,
+    LaserScan,
+    Reason,
+    ReasonCode,
+    Transform,
+    frozen,
+)
+from fcslam.runs import ClosureRow, RobotTrajectory, Run, read_tum
 from fcslam.sources import RecordingWriter
 
 LASER = LaserModel(360, -np.pi, 2.0 * np.pi / 360, 30.0)
@@ -113,6 +128,37 @@ def test_a_fleet_is_a_set_of_places_between_robots(fleet):
     assert not truth.matches[-1].any()  # the other way
     assert truth.different[-1].any()
     assert not (truth.matches & truth.different).any()
+
+
+def views_of_matches(fleet, *matches):
+    """The counts of a run of ``fleet`` whose closures join these images of a and b, of a status each."""
+    trajectories, closures = {}, []
+    for robot in "ab":
+        stamps, poses = read_tum(fleet / robot / "ground_truth.tum")
+        trajectories[robot] = RobotTrajectory(robot, 0, stamps, poses)
+    for i, j, status in matches:
+        ends = "a", float(trajectories["a"].stamps[i]), "b", float(trajectories["b"].stamps[j])
+        closures.append(
+            ClosureRow(*ends, Channel.CAMERA, 0.5, frozen(np.zeros(3)), status, Reason(ReasonCode.VERIFIED))
+        )
+    run = Run(trajectories, closures=tuple(closures))
+    run.save(fleet / "run")
+    return evaluate_fleet(fleet / "run", fleet).views
+
+
+def test_matches_are_judged_by_what_both_cameras_see(fleet):
+    """The third is of one position and opposite headings, the fourth of positions two metres apart."""
+    accepted, candidate = ClosureStatus.ACCEPTED, ClosureStatus.CANDIDATE
+    matches = (5, 5, accepted), (5, 7, candidate), (27, 58, accepted), (3, 23, candidate)
+    views = views_of_matches(fleet, *matches)
+    assert views[accepted] == MatchViews(same=1, different=1, judged=2)
+    assert views[candidate].judged == 4
+    assert views[candidate].same >= 2
+
+
+def test_matches_without_recordings_are_not_judged(fleet):
+    (fleet / "a" / "meta.yaml").unlink()
+    assert views_of_matches(fleet, (5, 5, ClosureStatus.ACCEPTED))[ClosureStatus.ACCEPTED] == MatchViews(0, 0, 0)
 
 
 def test_what_is_no_fleet_with_cameras_is_refused(fleet, tmp_path_factory):

@@ -84,6 +84,11 @@ def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     assert {file: file.read_bytes() for file in labels_in(tmp_path)} == labels
 
 
+def test_a_robot_labels_no_more_images_than_asked(folder, start, tmp_path):
+    RobotClient("rover", folder, tmp_path, most_images=2).train(start, 0, "run", settings())
+    assert len(labels_in(tmp_path)) == 2
+
+
 @pytest.mark.slow
 def test_the_optimiser_goes_on_from_the_robots_last_round(folder, start, tmp_path):
     def train(cache, round_number, run="run"):

@@ -11,7 +11,14 @@ from fcslam.cli.federate.rounds import show_rounds
 from fcslam.cli.mission_options import SettingsFiles
 from fcslam.cli.options import output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
-from fcslam.cli.training_options import TRAINING_OUTPUT, Quick, Start, compute_budget, require_training_libraries
+from fcslam.cli.training_options import (
+    QUICK_IMAGES,
+    TRAINING_OUTPUT,
+    Quick,
+    Start,
+    compute_budget,
+    require_training_libraries,
+)
 
 
 def local(
@@ -40,7 +47,8 @@ def local(
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {job.output}") as display:
-        files = federate_locally(folders, job, compute_budget(quick), show_rounds(display, console, settings))
+        shown, most_images = show_rounds(display, console, settings), QUICK_IMAGES if quick else None
+        files = federate_locally(folders, job, compute_budget(quick), shown, most_images)
     for file in files:
         typer.echo(str(file))
     print_line(console, f"{time.perf_counter() - began:.0f} s")

@@ -69,6 +69,8 @@ class RobotClient:
     device: str = "cpu"
     on_step: Callable[[str, int], None] = lambda _robot, _steps: None
     """Called with the name and the number of steps done in a round."""
+    most_images: int | None = None
+    """It trains on the first ones alone; None for all."""
     images: TrainingImages | None = None
     """The images with their labels; None until they are read."""
     images_settings: TrainingSettings | None = None
@@ -147,7 +149,9 @@ class RobotClient:
             device = torch.device(self.device)
             labeller = keypoint_response(weights_to_network(weights, settings.training.encoder).to(device), device)
             files = find_images([self.folder])
-            self.images = read_labelled_images(files, self.cache, settings.training, labeller, None, _ignore_progress)
+            self.images = read_labelled_images(
+                files, self.cache, settings.training, labeller, None, _ignore_progress, self.most_images
+            )
             self.images_settings = settings.training
         return self.images
 

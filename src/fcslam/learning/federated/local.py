@@ -11,7 +11,11 @@ from fcslam.learning.trainer import ExecutionOptions
 
 
 def federate_locally(
-    folders: Sequence[Path], job: FederatedJob, options: ExecutionOptions, callbacks: ProgressCallbacks
+    folders: Sequence[Path],
+    job: FederatedJob,
+    options: ExecutionOptions,
+    callbacks: ProgressCallbacks,
+    most_images: int | None = None,
 ) -> list[Path]:
     """Run or continue federated training.
 
@@ -20,6 +24,7 @@ def federate_locally(
         job: what to do.
         options: where and how to compute.
         callbacks: receive the progress.
+        most_images: each robot trains on its first ones alone; None for all.
 
     Returns:
         The files for the user, see ``run_job``.
@@ -37,7 +42,9 @@ def federate_locally(
         if not folder.is_dir():
             raise TrainingError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = [
-        RobotClient(name, folder, job.output / "robots" / name, options.device, callbacks.steps)
+        RobotClient(
+            name, folder, job.output / "robots" / name, options.device, callbacks.steps, most_images=most_images
+        )
         for name, folder in zip(names, folders, strict=True)
     ]
     return run_job(job, options, callbacks, in_process_grid(clients))

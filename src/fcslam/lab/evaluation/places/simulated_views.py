@@ -65,7 +65,7 @@ def read_fleet_views(folder: Path) -> FleetViews:
         raise EvaluationError(f"{folder}: no image at a time when it is known where the robot was")
     T_building_laser = se2.compose(np.array([view.T_building_base for view in everything]), laser.T_base_laser)
     ranges_m = np.array([view.ranges_m for view in everything], np.float64)
-    overlap = lidar_overlap(T_building_laser, ranges_m, laser, _half_view_rad(camera))
+    overlap = lidar_overlap(T_building_laser, ranges_m, laser, half_view_rad(camera))
     numbers = np.repeat(np.arange(len(robots)), [len(own) for own in views])
     return FleetViews(tuple(view.image for view in everything), numbers, overlap)
 
@@ -139,6 +139,6 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
             yield view
 
 
-def _half_view_rad(camera: CameraModel) -> float:
+def half_view_rad(camera: CameraModel) -> float:
     """Angle from straight ahead to the nearer edge of the image."""
     return float(np.arctan2(min(camera.cx, camera.width - 1.0 - camera.cx) + 0.5, camera.fx))

@@ -1,0 +1,109 @@
+"""The joint map of the fleet on one robot, with what the robot saw lately drawn into it."""
+
+import threading
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.lidar.frontend import ScanPose
+from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
+from fcslam.live.fleet_view import FleetView
+from fcslam.live.records import RobotPose
+from fcslam.live.teammates import beams_on_teammates
+from fcslam.maps.joint_tiles import padded
+from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, Ranges, Sweep
+from fcslam.robot.localization import Localizer
+from fcslam.robot.track import ScanTrack
+from fcslam.runs.map_files import OccupancyMap
+from fcslam.wire.messages import Hello, Packet
+
+MOST_DRAWN = 20_000
+"""Most keyscans that wait to be drawn by the cloud: hours of an outage."""
+MOST_MET = 1000
+"""Scans that saw other robots and may become keyscans yet."""
+
+
+class _DrawnKeyscan(NamedTuple):
+    """A keyscan that the cloud may not have drawn yet."""
+
+    part: int
+    stamp: float
+    ranges_m: Ranges
+    laser: LaserModel
+    T_odom_base: FloatArray
+    sweep: Sweep | None
+
+
+class JointMap:
+    """What a robot makes of the joint map of its fleet. Any thread may call."""
+
+    def __init__(self, robot: str, fleet: FleetView, config: OccupancyConfig) -> None:
+        self._robot, self._fleet, self._config = robot, fleet, config
+        self._drawn: deque[_DrawnKeyscan] = deque(maxlen=MOST_DRAWN)
+        """Keyscans that the joint map of the cloud may not show yet."""
+        self._lasers: tuple[LaserModel, ...] = ()
+        """As the robot announced them last."""
+        self._T_odom_base: FloatArray | None = None
+        """Pose of the newest scan by odometry without its jumps, or by the prediction in its place."""
+        self._met: dict[float, NDArray[np.bool_]] = {}
+        """Beams of the newest scans that hit other robots, by the stamp of the scan."""
+        self._lock = threading.Lock()
+
+    def add(self, packets: Iterable[Packet], tracks: Sequence[ScanTrack]) -> None:
+        """Keep the next keyscans until the cloud has drawn them; ``tracks`` are the robot's, by part."""
+        for packet in packets:
+            if isinstance(packet.body, Hello):
+                self._lasers = packet.body.lasers
+            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
+                keyscan = packet.body
+                T_odom_base = tracks[packet.epoch].in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
+                laser = keyscan.laser_model(self._lasers)
+                on_teammates = self._met.pop(keyscan.stamp, np.zeros(1, np.bool_))
+                ranges_m = np.where(on_teammates, np.float32(0.0), keyscan.ranges_m)
+                with self._lock:
+                    self._drawn.append(
+                        _DrawnKeyscan(packet.epoch, keyscan.stamp, ranges_m, laser, T_odom_base, keyscan.sweep)
+                    )
+
+    def draw(self, part: int, localizer: Localizer) -> OccupancyMap | None:
+        """The joint map, with the keyscans of a part drawn into it that the cloud has not drawn yet.
+
+        None: the server has not drawn the map that the robot's poses are in.
+        """
+        fleet, joint = self._fleet, self._fleet.joint_map
+        if joint is None or fleet.map_index is None or fleet.map_index != localizer.map_index:
+            return None
+        with self._lock:
+            while self._drawn and self._drawn[0].stamp <= fleet.drawn_s:
+                self._drawn.popleft()
+            lately = [
+                Casting(one.ranges_m, one.laser, moved, one.sweep)
+                for one in self._drawn
+                if one.part == part and (moved := localizer.T_map_base(one.T_odom_base)) is not None
+            ]
+        return padded(draw_over(joint, lately, self._config))
+
+    def mark_teammates(self, scan: LaserScan, newest: RobotPose | None) -> LaserScan:
+        """The next scan with the beams marked that hit other robots; ``newest`` is the pose of the one before."""
+        joint, radius_m = self._fleet.joint_map, self._config.robot_radius_m
+        T_odom_before, self._T_odom_base = self._T_odom_base, scan.T_odom_base
+        if joint is None or newest is None or T_odom_before is None or radius_m <= 0.0:
+            return scan
+        known = self._fleet.robots()
+        own = next((mate.map_index for mate in known if mate.robot == self._robot), None)
+        if own is None or own != newest.map_index:  # the joint map is that of ``own``
+            return scan
+        T_map_base = se2.compose(newest.T_map_base, se2.between(T_odom_before, scan.T_odom_base))
+        others = [mate for mate in known if mate.map_index == own and mate.robot != self._robot]
+        on_teammates = beams_on_teammates(scan, T_map_base, others, joint, radius_m)
+        if on_teammates is None:
+            return scan
+        self._met[scan.stamp] = on_teammates
+        while len(self._met) > MOST_MET:
+            del self._met[next(iter(self._met))]
+        return replace(scan, on_teammates=on_teammates)
