@@ -122,9 +122,8 @@ def main() -> None:
             stack.callback(robot.kill)
         for number in range(1, chosen.hours + 1):
             watch(robots, links, minutes, hour)
-            settle(port, server.process.pid)
             pids = {"service": server.process.pid, **{f"robot {k + 1}": each.pid for k, each in enumerate(robots)}}
-            processes.append(measured(pids))
+            processes.append(measured(port, pids))
             rows.append((
                 number, *sums(processes[-1]), number * scans_an_hour(chosen) * chosen.robots,
                 sum(link.connections for link in links), *stored(Path(folder)), time.perf_counter() - began,
@@ -209,8 +208,17 @@ def settle(port: int, service: int) -> None:
         time.sleep(0.2)
 
 
-def measured(pids: Mapping[str, int]) -> dict[str, tuple[float, int]]:
+def measured(port: int, pids: Mapping[str, int]) -> dict[str, tuple[float, int]]:
     """Memory, MB, and open files of each process, and those of the ones that it started together."""
+    while True:
+        settle(port, pids["service"])
+        found = usages(pids)
+        if len(children(pids["service"])) == 1:  # no copy of the worker began meanwhile
+            return found
+
+
+def usages(pids: Mapping[str, int]) -> dict[str, tuple[float, int]]:
+    """As ``measured``, at this moment."""
     found = {}
     for name, pid in pids.items():
         found[name] = usage(pid)

@@ -176,6 +176,7 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypat
 def configured(files):
     """Dask's configuration with the certificates of a client."""
     import dask
+    import distributed  # noqa: F401  its defaults must be there before: they would go with these
 
     keys = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert", "distributed.comm.tls.client.key")
     return dask.config.set(dict(zip(keys, map(str, files), strict=True)))

@@ -83,6 +83,7 @@ def serve(
     from fcslam.cluster.workers import Workers
     from fcslam.errors import ServiceError
     from fcslam.page.routes import page_router, report_router
+    from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.app import create_app
     from fcslam.service.shared.missions import NAMED
     from fcslam.service.warmup import warm_up_decoding
@@ -105,6 +106,7 @@ def serve(
             pass
     plan = learning_plan(learn, data, store)
     keep_private()
+    keep_memory_trimmed()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
         authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
@@ -126,9 +128,10 @@ def serve(
         )
         server = _server(app, certificate, key, client_ca, state.close)
         scheme, (address, number) = "https" if certificate else "http", listening.getsockname()[:2]
-        mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address
-        typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")
+        typer.echo(
+            f"fcslam serves mission '{state.mission.folder.name}' at {scheme}://{shown}:{number}; Ctrl-C stops it"
+        )
         server.run(sockets=[listening])
 
 
@@ -140,11 +143,9 @@ def _server(
 
     import uvicorn
 
-    from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 
     allow_many_connections()
-    keep_memory_trimmed()
     return GuardedServer(
         uvicorn.Config(
             app,
