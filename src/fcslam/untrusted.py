@@ -134,9 +134,16 @@ def read_arrays(path: Path) -> Arrays:
             with np.load(file, allow_pickle=False) as found:
                 return {name: found[name] for name in found.files}
         except (
-            zipfile.BadZipFile, EOFError, KeyError, AttributeError, RuntimeError, TypeError, zlib.error,
-            lzma.LZMAError, MemoryError,
-        ) as error:  # fmt: skip
+            zipfile.BadZipFile,
+            EOFError,
+            KeyError,
+            AttributeError,
+            RuntimeError,
+            TypeError,
+            zlib.error,
+            lzma.LZMAError,
+            MemoryError,
+        ) as error:
             raise ValueError(f"no archive of arrays: {error}") from error
 
 
@@ -307,8 +314,11 @@ def _zstd() -> Any:
 
 
 _DECOMPRESSORS: Final[dict[str, Callable[[], Any]]] = {
-    "zlib": zlib.decompressobj, "bz2": bz2.BZ2Decompressor, "lz4": _lz4, "zstd": _zstd
-}  # fmt: skip
+    "zlib": zlib.decompressobj,
+    "bz2": bz2.BZ2Decompressor,
+    "lz4": _lz4,
+    "zstd": _zstd,
+}
 
 
 def open_database(path: Path) -> sqlite3.Connection:

@@ -236,8 +236,11 @@ def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
     low = np.floor(np.min([corner[0] for corner in corners], axis=0) / side) * side
     size = np.ceil((np.max([corner[1] for corner in corners], axis=0) - low) / side).astype(int) + 1
     lines, walls, free = (np.zeros(size[::-1], bool) for _ in range(3))
-    for one, state, mask in ((plan, Occupancy.OCCUPIED, lines), *((m, Occupancy.OCCUPIED, walls) for m in maps),
-                             *((m, Occupancy.FREE, free) for m in maps)):  # fmt: skip
+    for one, state, mask in (
+        (plan, Occupancy.OCCUPIED, lines),
+        *((m, Occupancy.OCCUPIED, walls) for m in maps),
+        *((m, Occupancy.FREE, free) for m in maps),
+    ):
         rows, columns = np.nonzero(one.cells == state)
         at = (np.column_stack((columns, rows)) + 0.5) * one.resolution_m + np.array(one.origin_xy) - low
         column, row = np.floor(at / side).astype(np.int64).T

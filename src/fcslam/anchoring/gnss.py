@@ -112,9 +112,10 @@ def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: b
     measured = _Measured(
         np.concatenate([robot.variables[rows] for robot, rows in zip(robots, at, strict=True)]),
         np.array([fix.antenna_xy for fix in kept]),
-        np.column_stack((east, north)), np.maximum(LEAST_SIGMA_M, [fix.sigma_m for fix in kept]),
+        np.column_stack((east, north)),
+        np.maximum(LEAST_SIGMA_M, [fix.sigma_m for fix in kept]),
         max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
-    )  # fmt: skip
+    )
     poses = graph.poses()
     T, agreeing = _vote(measured, measured.antennas(poses))
     refusal = _refusal(measured, agreeing)

@@ -64,9 +64,9 @@ def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> L
         along2 = np.maximum(0.0, np.einsum("na,na->n", apart, apart) - across**2)
         off = across - thickness
         weight = (width_m**2 / (width_m**2 + off**2 + 0.25 * along2)) ** 2
-        J = np.column_stack((
-            its, its[:, 1] * arms[:, 0] - its[:, 0] * arms[:, 1], np.einsum("na,na->n", its, arms), -np.ones(len(its))
-        ))  # fmt: skip
+        J = np.column_stack(
+            (its, its[:, 1] * arms[:, 0] - its[:, 0] * arms[:, 1], np.einsum("na,na->n", its, arms), -np.ones(len(its)))
+        )
         H = J.T @ (weight[:, None] * J) + 1e-6 * np.eye(5)
         step = -np.linalg.solve(H, J.T @ (weight * off))
         motion, scale, thickness = motion + step[:3], scale * (1.0 + step[3]), thickness + step[4]

@@ -161,19 +161,24 @@ class MapTags:
             x, y, heading = shown[0].pose.tolist()
             rows.append(
                 {
-                    "family": tag.family, "number": tag.number, "map": k, "x": round(x, 3), "y": round(y, 3),
+                    "family": tag.family,
+                    "number": tag.number,
+                    "map": k,
+                    "x": round(x, 3),
+                    "y": round(y, 3),
                     "heading_rad": round(heading, 4),
                     "sightings": sum(len(place.sightings) for place in places),
                     "doubtful": len(shown) > 1,
                     "places": [
                         {
-                            "x": round(float(place.pose[0]), 3), "y": round(float(place.pose[1]), 3),
+                            "x": round(float(place.pose[0]), 3),
+                            "y": round(float(place.pose[1]), 3),
                             "robots": sorted({one.id.robot for one in place.sightings}),
                         }
                         for place in shown
                     ],
                 }
-            )  # fmt: skip
+            )
         return rows
 
     def scales(self) -> dict[str, float]:

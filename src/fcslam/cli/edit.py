@@ -100,9 +100,7 @@ def veto(
 
 
 @app.command(epilog=examples("fcslam edit pin runs/building anna 1010.25 ben 1000.001"))
-def pin(
-    mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ,
-) -> None:  # fmt: skip
+def pin(mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ) -> None:
     """Accept a closure of closures.csv, whatever the other evidence says. It joins maps."""
     from fcslam.records import Pin
 

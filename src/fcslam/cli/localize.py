@@ -105,9 +105,14 @@ def localize(
     print_notes(console, survey.notes)
     with compiled(console), ProgressDisplay(console) as display:
         run = localize_recording(
-            recording, map_path, initial_pose=initial, config=settings, progress=_watch(display, survey.scan_count),
-            floor=floor, update=update,
-        )  # fmt: skip
+            recording,
+            map_path,
+            initial_pose=initial,
+            config=settings,
+            progress=_watch(display, survey.scan_count),
+            floor=floor,
+            update=update,
+        )
         run.save(output, force)
     print_faults(console, {recording.name: recording.faults})
     _report(run, recording.name, output)

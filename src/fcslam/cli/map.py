@@ -197,10 +197,16 @@ def map_sources(
         known = 0 if earlier is None else sum(len(track.stamps) for track in earlier.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
         run = api.map_recordings(
-            sources, config=settings, progress=progress, processes=cores(), onto=earlier,
-            live=None if page is None else page.look, floors=floors,
-            verify_pairs=verify_pairs or verify_here, anchors=anchors or NOTHING_KNOWN,
-        )  # fmt: skip
+            sources,
+            config=settings,
+            progress=progress,
+            processes=cores(),
+            onto=earlier,
+            live=None if page is None else page.look,
+            floors=floors,
+            verify_pairs=verify_pairs or verify_here,
+            anchors=anchors or NOTHING_KNOWN,
+        )
         display.start("writing")
         run.save(output, force)
     if page is not None:
@@ -263,9 +269,13 @@ def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
 
 
 def _report(
-    console: "Console", run: "Run", elapsed_s: float, output: Path, settings: "MissionConfig",
+    console: "Console",
+    run: "Run",
+    elapsed_s: float,
+    output: Path,
+    settings: "MissionConfig",
     earlier: "SavedMission | None",
-) -> None:  # fmt: skip
+) -> None:
     from rich.table import Table
 
     from fcslam.anchoring.anchors import anchoring_lines

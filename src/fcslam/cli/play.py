@@ -82,9 +82,14 @@ def play(
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kbps, floor)
     live = Robot(
-        opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor,
+        opened.name,
+        server=cloud,
+        state=state,
+        config=settings,
+        own_map=False,
+        floor=floor,
         wiring=Wiring(playback=Playback(fingerprint, resume), keeps_keyframes=learn),
-    )  # fmt: skip
+    )
     with closing(live):
         _play(live, opened, survey.scan_count, pace, plan, state, console)
         print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
@@ -92,9 +97,14 @@ def play(
 
 
 def _play(
-    live: "Robot", recording: "Source", scans: int, speed: float | None, plan: "RobotLearningPlan | None", state: Path,
+    live: "Robot",
+    recording: "Source",
+    scans: int,
+    speed: float | None,
+    plan: "RobotLearningPlan | None",
+    state: Path,
     console: "Console",
-) -> None:  # fmt: skip
+) -> None:
     """Play a recording of ``scans`` scans to its robot, which learns afterwards if there is a plan for it."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.live.playback import PlaybackPace, play
@@ -114,9 +124,12 @@ def _play(
 
 
 def _learn(
-    plan: "RobotLearningPlan", console: "Console", display: "ProgressDisplay",
-    watch: "Callable[[RobotStatus], None]", robot: "Robot",
-) -> None:  # fmt: skip
+    plan: "RobotLearningPlan",
+    console: "Console",
+    display: "ProgressDisplay",
+    watch: "Callable[[RobotStatus], None]",
+    robot: "Robot",
+) -> None:
     """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
     from fcslam.learning.federated.learning_process import LearningProcess
 

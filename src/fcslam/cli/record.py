@@ -44,7 +44,9 @@ def record(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE",
+            "--output",
+            "-o",
+            metavar="FILE",
             help="File to write. A live robot: .mcap from ROS 2, .bag from ROS 1. A recording: .clf or .log (and .gz, "
             ".xz, .bz2) a CARMEN log, .bag a ROS 1 bag, .mcap or .db3 a ROS 2 bag, no suffix a ROS 2 bag folder, "
             ".fcslam a recording folder.",
@@ -57,7 +59,7 @@ def record(
     sensors: Sensors = None,
     force: Force = False,
     quiet: Quiet = False,
-) -> None:  # fmt: skip
+) -> None:
     """Record the sensors of a live robot: everything that `fcslam map` needs. Or convert a recording."""
     console, options = notices(quiet), bag_options(sensors)
     if is_live(source):

@@ -212,9 +212,12 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", wo
     events = EventStream()
     command = (sys.executable, "-m", "fcslam.service.worker", *workers.options())
     missions = Missions(
-        data, config, time.monotonic, time.time,
+        data,
+        config,
+        time.monotonic,
+        time.time,
         lambda folder: Supervisor(folder.path, time.monotonic, events.publish, command),
-    )  # fmt: skip
+    )
     audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, data / "learning")
 

@@ -83,9 +83,16 @@ def learning_process(plan: FleetLearningPlan, state: "ServiceState") -> Iterator
     with tempfile.TemporaryDirectory(prefix="fcslam-") as folder:
         listener = Path(folder) / "learning"
         command = (
-            sys.executable, "-m", "fcslam.learning.federated.fleet_learning", "--listener", str(listener),
-            "--settings", plan.settings.model_dump_json(), "--output", str(plan.output),
-        )  # fmt: skip
+            sys.executable,
+            "-m",
+            "fcslam.learning.federated.fleet_learning",
+            "--listener",
+            str(listener),
+            "--settings",
+            plan.settings.model_dump_json(),
+            "--output",
+            str(plan.output),
+        )
         learner = Supervisor(state.missions.root, time.monotonic, announce, command)
         typer.echo(f"robots learn here; rounds are in {plan.output}")
         try:

@@ -67,9 +67,18 @@ def shared_state(
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)
         missions = SharedMissions(
-            data, config, server, name, secrets.token_hex(8), admission,
-            time.monotonic, time.time, launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM),
-        )  # fmt: skip
+            data,
+            config,
+            server,
+            name,
+            secrets.token_hex(8),
+            admission,
+            time.monotonic,
+            time.time,
+            launch,
+            events.publish,
+            lambda: os.kill(os.getpid(), signal.SIGTERM),
+        )
         log = AuditLog(audit, time.time)
         missions.closing = opened.pop_all().close
         return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log)

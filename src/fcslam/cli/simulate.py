@@ -57,12 +57,14 @@ def simulate(
     config: Annotated[
         list[str] | None,
         typer.Option(
-            "--config", "-c", metavar="FILE|KEY=VALUE",
+            "--config",
+            "-c",
+            metavar="FILE|KEY=VALUE",
             help="Settings of the simulation (YAML), or one of its keys, such as moved_furniture=0.5, over those of "
             "--scanner. Can be repeated. Each simulation writes its own to simulation.yaml.",
         ),
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.odometry import KINDS

@@ -94,9 +94,17 @@ class ClosureLog:
         """Add a match, as verified or, if its verification failed, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
         closure = LoopClosure(
-            match.i, match.j, match.channel, match.similarity, frozen(match.T_i_j), frozen(match.information), status,
-            match.reason.under(MATCHER), match.informative, match.tag,
-        )  # fmt: skip
+            match.i,
+            match.j,
+            match.channel,
+            match.similarity,
+            frozen(match.T_i_j),
+            frozen(match.information),
+            status,
+            match.reason.under(MATCHER),
+            match.informative,
+            match.tag,
+        )
         return self._add(ClosureEntry(closure, independent=not match.predicted))
 
     def add_local(self, constraint: Constraint, edge: int, tag: Tag | None = None) -> ClosureEntry:
@@ -105,9 +113,16 @@ class ClosureLog:
         found = Reason(ReasonCode.FOUND_BY_ROBOT) if tag is None else Reason(ReasonCode.SAME_TAG, tag.number)
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
         closure = LoopClosure(
-            i, j, Channel.LIDAR if tag is None else Channel.TAG, 0.0, constraint.T_i_j, constraint.information,
-            ClosureStatus.ACCEPTED, found, tag=tag,
-        )  # fmt: skip
+            i,
+            j,
+            Channel.LIDAR if tag is None else Channel.TAG,
+            0.0,
+            constraint.T_i_j,
+            constraint.information,
+            ClosureStatus.ACCEPTED,
+            found,
+            tag=tag,
+        )
         return self._add(ClosureEntry(closure, independent=False, edge=edge))
 
     def add_by_hand(
@@ -115,9 +130,15 @@ class ClosureLog:
     ) -> ClosureEntry:
         """Add a user's own closure between two keyscans, with its pose (3,) and information (3, 3)."""
         closure = LoopClosure(
-            i, j, Channel.LIDAR, 0.0, frozen(T_i_j), frozen(information), ClosureStatus.VERIFIED,
+            i,
+            j,
+            Channel.LIDAR,
+            0.0,
+            frozen(T_i_j),
+            frozen(information),
+            ClosureStatus.VERIFIED,
             Reason(ReasonCode.MADE_BY_HAND),
-        )  # fmt: skip
+        )
         return self._add(ClosureEntry(closure, independent=False, pinned=True, made_by_hand=made))
 
     def _add(self, entry: ClosureEntry) -> ClosureEntry:
@@ -142,12 +163,23 @@ class ClosureLog:
             "T_i_j": np.array([closure.T_i_j for closure in closures]).reshape(-1, 3),
             "information": np.array([closure.information for closure in closures]).reshape(-1, 3, 3),
             "facts": [
-                (c.i, c.j, c.channel, c.similarity, c.status, astuple(c.reason), c.informative,
-                 entry.independent, entry.edge, entry.vetoed, entry.pinned,
-                 entry.made_by_hand and edit_json(entry.made_by_hand))
+                (
+                    c.i,
+                    c.j,
+                    c.channel,
+                    c.similarity,
+                    c.status,
+                    astuple(c.reason),
+                    c.informative,
+                    entry.independent,
+                    entry.edge,
+                    entry.vetoed,
+                    entry.pinned,
+                    entry.made_by_hand and edit_json(entry.made_by_hand),
+                )
                 for entry, c in zip(self._entries, closures, strict=True)
             ],
-        }  # fmt: skip
+        }
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
@@ -157,9 +189,17 @@ class ClosureLog:
             i, j, channel, similarity, status, reason, informative, *entry, by_hand = fact
             code, *details = reason
             closure = LoopClosure(
-                KeyscanId(*i), KeyscanId(*j), Channel(channel), similarity, T_i_j, information, ClosureStatus(status),
-                Reason(ReasonCode(code), *details), informative, tags.get(row),
-            )  # fmt: skip
+                KeyscanId(*i),
+                KeyscanId(*j),
+                Channel(channel),
+                similarity,
+                T_i_j,
+                information,
+                ClosureStatus(status),
+                Reason(ReasonCode(code), *details),
+                informative,
+                tags.get(row),
+            )
             restored = self._add(ClosureEntry(closure, *entry))
             if by_hand is not None and isinstance(edit := read_edit("closure", by_hand), ManualClosure):
                 restored.made_by_hand = edit

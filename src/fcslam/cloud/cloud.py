@@ -57,9 +57,14 @@ class Cloud:
 
     @classmethod
     def restored(
-        cls, config: FleetConfig, seed: int, state: State, times: Mapping[PacketNumber, float],
-        read: Callable[[PacketNumber], Packet], verify_pairs: VerifyPairs = verify_here,
-    ) -> Self:  # fmt: skip
+        cls,
+        config: FleetConfig,
+        seed: int,
+        state: State,
+        times: Mapping[PacketNumber, float],
+        read: Callable[[PacketNumber], Packet],
+        verify_pairs: VerifyPairs = verify_here,
+    ) -> Self:
         """The cloud of a ``state``.
 
         Args:

@@ -61,8 +61,13 @@ class _Replayed(NamedTuple):
 class Fleet:
     """Applies packets; place recognition and decisions about closures have classes of their own."""
 
-    def __init__(self, config: FleetConfig, seed: int, verify_pairs: VerifyPairs = verify_here,
-                 read: Callable[[PacketNumber], Packet] | None = None) -> None:  # fmt: skip
+    def __init__(
+        self,
+        config: FleetConfig,
+        seed: int,
+        verify_pairs: VerifyPairs = verify_here,
+        read: Callable[[PacketNumber], Packet] | None = None,
+    ) -> None:
         """Start without packets.
 
         Args:
@@ -154,9 +159,13 @@ class Fleet:
 
     @classmethod
     def restored(
-        cls, config: FleetConfig, seed: int, state: State, read: Callable[[PacketNumber], Packet],
+        cls,
+        config: FleetConfig,
+        seed: int,
+        state: State,
+        read: Callable[[PacketNumber], Packet],
         verify_pairs: VerifyPairs = verify_here,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """The fleet of a ``state`` under the same configuration and seed.
 
         ``read`` gives the packets that it applied; the fleet reads keyscans when it needs them.

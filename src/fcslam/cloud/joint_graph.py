@@ -177,8 +177,13 @@ class JointGraph:
         return {
             "initial": self.graph.poses(),
             "poses": self._poses.values,
-            "edges": {"i": edges.i, "j": edges.j, "T_i_j": edges.T_i_j, "information": edges.information,
-                      "robust": edges.robust},
+            "edges": {
+                "i": edges.i,
+                "j": edges.j,
+                "T_i_j": edges.T_i_j,
+                "information": edges.information,
+                "robust": edges.robust,
+            },
             "left_out": sorted(self._left_out),
             "unsolved": self._unsolved,
             "robots": list(self._variables),
@@ -190,7 +195,7 @@ class JointGraph:
                 }
                 for robot, variables in self._variables.items()
             },
-        }  # fmt: skip
+        }
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""

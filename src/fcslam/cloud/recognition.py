@@ -47,9 +47,14 @@ class PlaceRecognition:
     """One matcher for each channel, detector version and floor."""
 
     def __init__(
-        self, config: FleetConfig, seed: int, sessions: SessionStore, graph: JointGraph, closures: ClosureLog,
+        self,
+        config: FleetConfig,
+        seed: int,
+        sessions: SessionStore,
+        graph: JointGraph,
+        closures: ClosureLog,
         verify_pairs: VerifyPairs,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._config = config
         self._seed = seed
         self._sessions = sessions

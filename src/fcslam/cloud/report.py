@@ -149,9 +149,16 @@ def _ids(robots: Sequence[MappedRobot]) -> list[int]:
 def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:
     i, j = closure.i, closure.j
     return ClosureRow(
-        i.robot, float(mapped[i.robot].stamps[i.number]), j.robot, float(mapped[j.robot].stamps[j.number]),
-        closure.channel, closure.similarity, closure.T_i_j, closure.status, closure.reason,
-    )  # fmt: skip
+        i.robot,
+        float(mapped[i.robot].stamps[i.number]),
+        j.robot,
+        float(mapped[j.robot].stamps[j.number]),
+        closure.channel,
+        closure.similarity,
+        closure.T_i_j,
+        closure.status,
+        closure.reason,
+    )
 
 
 def _map_files(
@@ -184,13 +191,13 @@ def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict
     return certificates
 
 
-def _quality_files(
-    certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]
-) -> dict[str, bytes]:  # fmt: skip
+def _quality_files(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]) -> dict[str, bytes]:
     if not certificates:
         return {}
-    pictures = {f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
-                for k, one in certificates.items()}  # fmt: skip
+    pictures = {
+        f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
+        for k, one in certificates.items()
+    }
     return {f"{QUALITY}.json": certificate_json(certificates), **pictures}
 
 

@@ -144,6 +144,16 @@ def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:
     robot, kind = j.id.robot, ConstraintKind.CLOSURE
     measured = Constraint(robot, 0, 1, kind, T_i_j, frozen(0.5 * (information + information.T)))
     return PlaceMatch(
-        i.id, j.id, Channel.TAG, 1.0, M=True, reason=Reason(ReasonCode.SAME_TAG, j.tag.number), T_i_j=T_i_j,
-        information=with_least_noise(measured).information, informative=True, explained=0.0, predicted=False, tag=j.tag,
-    )  # fmt: skip
+        i.id,
+        j.id,
+        Channel.TAG,
+        1.0,
+        M=True,
+        reason=Reason(ReasonCode.SAME_TAG, j.tag.number),
+        T_i_j=T_i_j,
+        information=with_least_noise(measured).information,
+        informative=True,
+        explained=0.0,
+        predicted=False,
+        tag=j.tag,
+    )

@@ -154,9 +154,13 @@ class DaskCluster:
         from distributed import Client
 
         client = Client(
-            self._workers.where, asynchronous=True, timeout=CONNECT_S, set_as_default=False, security=self._security(),
+            self._workers.where,
+            asynchronous=True,
+            timeout=CONNECT_S,
+            set_as_default=False,
+            security=self._security(),
             name="fcslam",
-        )  # fmt: skip
+        )
         self._client = client
         await client
 

@@ -71,10 +71,16 @@ _FIELDS: Final[dict[str, dict[str, tuple[int, str]]]] = {
     "Model": {"graph": (7, "Graph"), "functions": (25, "bytes")},
     "Graph": {"node": (1, "Node"), "initializer": (5, "Tensor"), "sparse_initializer": (15, "bytes")},
     "Node": {"op_type": (4, "bytes"), "attribute": (5, "Attribute"), "domain": (7, "bytes")},
-    "Attribute": {"t": (5, "Tensor"), "g": (6, "Graph"), "tensors": (10, "Tensor"), "graphs": (11, "Graph"),
-                  "sparse_tensor": (22, "bytes"), "sparse_tensors": (23, "bytes")},
+    "Attribute": {
+        "t": (5, "Tensor"),
+        "g": (6, "Graph"),
+        "tensors": (10, "Tensor"),
+        "graphs": (11, "Graph"),
+        "sparse_tensor": (22, "bytes"),
+        "sparse_tensors": (23, "bytes"),
+    },
     "Tensor": {"dims": (1, "int64"), "external_data": (13, "bytes"), "data_location": (14, "int64")},
-}  # fmt: skip
+}
 """The checked parts of onnx.proto (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto), all read as repeated."""
 
 

@@ -191,8 +191,11 @@ class _EdgeRows(Sequence[Edge]):
 
     def append(self, edge: Edge) -> int:
         for rows, value in (
-            (self._i, edge.i), (self._j, edge.j), (self._robust, edge.robust), (self._T_i_j, edge.T_i_j)
-        ):  # fmt: skip
+            (self._i, edge.i),
+            (self._j, edge.j),
+            (self._robust, edge.robust),
+            (self._T_i_j, edge.T_i_j),
+        ):
             rows.append(value)
         return self._information.append(edge.information)
 

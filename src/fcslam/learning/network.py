@@ -157,11 +157,18 @@ class VggBody(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder = nn.Sequential(
-            _convolution(1, 64), _convolution(64, 64), nn.MaxPool2d(2),
-            _convolution(64, 64), _convolution(64, 64), nn.MaxPool2d(2),
-            _convolution(64, 128), _convolution(128, 128), nn.MaxPool2d(2),
-            _convolution(128, 128), _convolution(128, 128),
-        )  # fmt: skip
+            _convolution(1, 64),
+            _convolution(64, 64),
+            nn.MaxPool2d(2),
+            _convolution(64, 64),
+            _convolution(64, 64),
+            nn.MaxPool2d(2),
+            _convolution(64, 128),
+            _convolution(128, 128),
+            nn.MaxPool2d(2),
+            _convolution(128, 128),
+            _convolution(128, 128),
+        )
         self.point_head = nn.Sequential(_convolution(128, 256), nn.Conv2d(256, CELL_PX**2 + 1, 1))
         self.code_head = nn.Sequential(_convolution(128, 256), nn.Conv2d(256, CODE_BITS, 1))
 

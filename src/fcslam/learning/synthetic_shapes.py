@@ -159,8 +159,17 @@ def noise(picture: GreyImage, rng: np.random.Generator) -> FloatArray:
 
 
 FAMILIES: Final[tuple[Drawer, ...]] = (
-    lines, polygon, polygons, star, stripes, checkerboard, checkerboard, cube, ellipses, noise,
-)  # fmt: skip
+    lines,
+    polygon,
+    polygons,
+    star,
+    stripes,
+    checkerboard,
+    checkerboard,
+    cube,
+    ellipses,
+    noise,
+)
 
 
 def _polygon(picture: GreyImage, rng: np.random.Generator, centre: FloatArray, radius: float) -> FloatArray:

@@ -138,9 +138,13 @@ class LidarBackend:
     def _constraint(self, closure: LocalClosure) -> Constraint:
         submaps = self._closer.submaps
         return Constraint(
-            self.robot, submaps[closure.earlier].keyscan, submaps[closure.later].keyscan, ConstraintKind.CLOSURE,
-            frozen(closure.check.T_a_b), frozen(closure.check.information),
-        )  # fmt: skip
+            self.robot,
+            submaps[closure.earlier].keyscan,
+            submaps[closure.later].keyscan,
+            ConstraintKind.CLOSURE,
+            frozen(closure.check.T_a_b),
+            frozen(closure.check.information),
+        )
 
     def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:
         """Solve at once if a closure contradicts the estimate, otherwise after ``SOLVE_AFTER`` closures.

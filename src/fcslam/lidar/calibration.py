@@ -195,9 +195,10 @@ def _mounting(
     sigma_x, sigma_y, sigma_a, sigma_b = np.sqrt(np.diag(covariance)).tolist()
     sigma = scale * float(np.hypot(sigma_a, sigma_b))
     mounting = (
-        Estimate(float(scale * x), scale * sigma_x), Estimate(float(scale * y), scale * sigma_y),
+        Estimate(float(scale * x), scale * sigma_x),
+        Estimate(float(scale * y), scale * sigma_y),
         Estimate(float(np.arctan2(b, a)), sigma),
-    )  # fmt: skip
+    )
     return Estimate(scale, scale * sigma), mounting
 
 

@@ -134,9 +134,18 @@ def search_pyramid(
     guess = np.array(T_field_guess, dtype=np.float64)  # a writable copy: code is compiled once
     start = np.full(3, np.nan) if better_than is None else np.array(better_than)
     pose, score = _branch_and_bound(
-        scan.points, pyramid.levels, pyramid.corner, pyramid.cell_m, guess, start,
-        shifts, turns, step_rad, window.distance_penalty, window.angle_penalty,
-    )  # fmt: skip
+        scan.points,
+        pyramid.levels,
+        pyramid.corner,
+        pyramid.cell_m,
+        guess,
+        start,
+        shifts,
+        turns,
+        step_rad,
+        window.distance_penalty,
+        window.angle_penalty,
+    )
     return SearchResult(pose, score)
 
 

@@ -244,9 +244,13 @@ class LidarFrontend:
             return None, 0.0
         motion = se2.between(self._newest.T_local_base, tracked.T_local_base)
         constraint = Constraint(
-            self.robot, self._count - 1, self._count, ConstraintKind.ODOMETRY, frozen(motion),
+            self.robot,
+            self._count - 1,
+            self._count,
+            ConstraintKind.ODOMETRY,
+            frozen(motion),
             frozen(motion_information(motion, tracked, self.odometry)),
-        )  # fmt: skip
+        )
         progress = float(np.hypot(motion[0], motion[1])) + TURN_AS_TRAVEL_M * abs(float(motion[2]))
         return constraint, self._newest.travel_m + progress
 

@@ -103,8 +103,11 @@ def match_scan(
     pose, velocity, information, explained, known, log_likelihoods = _match(
         _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
         np.array(T_field_guess),  # a writable copy: code is compiled once
-        prior_information, velocity_information, field.arrays, wide_scale_m,
-    )  # fmt: skip
+        prior_information,
+        velocity_information,
+        field.arrays,
+        wide_scale_m,
+    )
     return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihoods, velocity)
 
 
@@ -243,9 +246,12 @@ def _sums(scan, pose, velocity, field, scale):  # type: ignore[no-untyped-def]
             lxx, lxy, lxt = lxx + t * t * axx, lxy + t * t * axy, lxt + t * t * axt
             lyy, lyt, ltt = lyy + t * t * ayy, lyt + t * t * ayt, ltt + t * t * att
     return (
-        (hxx, hxy, hxt, hyy, hyt, htt), (kxx, kxy, kxt, kyy, kyt, ktt), (lxx, lxy, lxt, lyy, lyt, ltt),
-        (gx, gy, gt), (fx, fy, ft),
-    )  # fmt: skip
+        (hxx, hxy, hxt, hyy, hyt, htt),
+        (kxx, kxy, kxt, kyy, kyt, ktt),
+        (lxx, lxy, lxt, lyy, lyt, ltt),
+        (gx, gy, gt),
+        (fx, fy, ft),
+    )
 
 
 @njit(allocates=False)
@@ -288,9 +294,16 @@ def _terms(scan, i, pose, cos, sin, t, velocity, field, c2):  # type: ignore[no-
         w = (c2 / (c2 + e * e + ALONG * max(0.0, d2 - e * e))) ** 2
     lever = ny * rx - nx * ry
     return (
-        w * nx * nx, w * nx * ny, w * nx * lever, w * ny * ny, w * ny * lever, w * lever * lever,
-        w * nx * e, w * ny * e, w * lever * e,
-    )  # fmt: skip
+        w * nx * nx,
+        w * nx * ny,
+        w * nx * lever,
+        w * ny * ny,
+        w * ny * lever,
+        w * lever * lever,
+        w * nx * e,
+        w * ny * e,
+        w * lever * e,
+    )
 
 
 @njit(allocates=False)

@@ -197,9 +197,14 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
             counts = _counts(layout, is_open, by_scan=True)._replace(seen_from=first.seen_from)
             _cast_all(period, layout, config, counts)
             _supersede(
-                hits, passes, counts, config.contradicting_scans, CLEAR_RATIO, config.occupied_ratio,
+                hits,
+                passes,
+                counts,
+                config.contradicting_scans,
+                CLEAR_RATIO,
+                config.occupied_ratio,
                 config.minimum_passes,
-            )  # fmt: skip
+            )
         shown = hits.view(), passes.view()
         for view in shown:
             view.setflags(write=False)
@@ -293,10 +298,14 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams
         raise ValueError(f"poses must be finite and within {FARTHEST_M:g} m of the origin")
     sweeps = [scan.sweep or _AT_ONCE for scan in keyscans]
     return _Beams(
-        ranges_m, *rays_of(laser)[:2], beam_times(laser, times), poses,
-        np.array([sweep.velocity for sweep in sweeps]), np.array([sweep.acceleration for sweep in sweeps]),
+        ranges_m,
+        *rays_of(laser)[:2],
+        beam_times(laser, times),
+        poses,
+        np.array([sweep.velocity for sweep in sweeps]),
+        np.array([sweep.acceleration for sweep in sweeps]),
         laser.max_range_m,
-    )  # fmt: skip
+    )
 
 
 def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:

@@ -288,24 +288,35 @@ def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes)
 
 def _aligned_bytes(batch: Sequence[Aligned]) -> bytes:
     """float64, shape (N, 29)."""
-    return np.array([
-        (
-            *found.T_a_b, *found.information.ravel(), found.worse.explained, found.worse.violation, found.worse.count,
-            found.worse.overlap, *found.worse.normal_tensor.ravel(), found.weakest, *found.gap,
-        )
-        for found in batch
-    ]).tobytes()  # fmt: skip
+    return np.array(
+        [
+            (
+                *found.T_a_b,
+                *found.information.ravel(),
+                found.worse.explained,
+                found.worse.violation,
+                found.worse.count,
+                found.worse.overlap,
+                *found.worse.normal_tensor.ravel(),
+                found.weakest,
+                *found.gap,
+            )
+            for found in batch
+        ]
+    ).tobytes()
 
 
 def _read_aligned(data: bytes, count: int) -> list[Aligned]:
     return [
         Aligned(
-            row[:3].copy(), row[3:12].reshape(3, 3).copy(),
+            row[:3].copy(),
+            row[3:12].reshape(3, 3).copy(),
             Agreement(float(row[12]), float(row[13]), int(row[14]), float(row[15]), row[16:25].reshape(3, 3).copy()),
-            float(row[25]), row[26:29].copy(),
+            float(row[25]),
+            row[26:29].copy(),
         )
         for row in np.frombuffer(data).reshape(count, -1)
-    ]  # fmt: skip
+    ]
 
 
 def _split(count: int, processes: int, least: int) -> list[range]:

@@ -227,9 +227,13 @@ def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agre
         Shares of points, and the normal tensor.
     """
     known, explained, violating, tensor = _agreement(
-        query.surface.points, query.surface.normals, T_target_query,
-        target.field.arrays, target.free.cells, target.free.corner,
-    )  # fmt: skip
+        query.surface.points,
+        query.surface.normals,
+        T_target_query,
+        target.field.arrays,
+        target.free.cells,
+        target.free.corner,
+    )
     total = max(1, len(query.surface))
     return Agreement(explained / max(1, known), violating / max(1, known), explained, known / total, tensor)
 

@@ -19,8 +19,14 @@ def submap_bytes(submap: Submap) -> bytes:
     """The same bytes for the same submap, on every machine with this byte order."""
     surface, free = submap.surface, submap.free
     arrays = (
-        *submap.field.arrays, surface.points, surface.normals, surface.solitary, surface.origin, free.cells, free.corner
-    )  # fmt: skip
+        *submap.field.arrays,
+        surface.points,
+        surface.normals,
+        surface.solitary,
+        surface.origin,
+        free.cells,
+        free.corner,
+    )
     return _pack(arrays)
 
 

@@ -51,9 +51,13 @@ class FleetView:
     """Follows the fleet of one robot. Any thread may call."""
 
     def __init__(
-        self, clients: Sequence[FleetClient], robot: str, own_pose: Callable[[], tuple[int, FloatArray] | None],
-        limit_kbps: float | None = None, clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self,
+        clients: Sequence[FleetClient],
+        robot: str,
+        own_pose: Callable[[], tuple[int, FloatArray] | None],
+        limit_kbps: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Follow nothing before ``start``.
 
         Args:
@@ -214,9 +218,11 @@ class FleetView:
 
 @contextmanager
 def following(
-    clients: Sequence[FleetClient], robot: str, own_pose: Callable[[], tuple[int, FloatArray] | None],
+    clients: Sequence[FleetClient],
+    robot: str,
+    own_pose: Callable[[], tuple[int, FloatArray] | None],
     limit_kbps: float | None,
-) -> Iterator[FleetView]:  # fmt: skip
+) -> Iterator[FleetView]:
     """A view that follows its fleet in this block; arguments as for ``FleetView``."""
     with closing(FleetView(clients, robot, own_pose, limit_kbps)) as view:
         view.start()

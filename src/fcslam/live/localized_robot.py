@@ -124,12 +124,22 @@ class LocalizedRobot(LiveTracker):
         broken = f"not localised any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
-            scans=self._scans, keyscans=self._localizer.keyscans, waiting=WaitingPackets(0, 0), confirmed=0,
-            sent_bytes=0, left_out=0, refused=0, map_index=0, correction_age_s=None,
+            scans=self._scans,
+            keyscans=self._localizer.keyscans,
+            waiting=WaitingPackets(0, 0),
+            confirmed=0,
+            sent_bytes=0,
+            left_out=0,
+            refused=0,
+            map_index=0,
+            correction_age_s=None,
             times_lost=self._localizer.state.losses,
-            quality=0.0 if estimate is None else estimate.quality, trouble=None, catching_up=False,
-            notices=tuple(filter(None, (broken, jumps))), is_localized=estimate is not None,
-        )  # fmt: skip
+            quality=0.0 if estimate is None else estimate.quality,
+            trouble=None,
+            catching_up=False,
+            notices=tuple(filter(None, (broken, jumps))),
+            is_localized=estimate is not None,
+        )
 
     def map(self) -> OccupancyMap:
         """The map, which never changes."""
@@ -200,11 +210,17 @@ class LocalizedRobot(LiveTracker):
         self._drive.add(newest.pose.stamp, self._frontend.travel_m, T_smooth_base, known)
         estimate = known or _NOWHERE
         return RobotPose(
-            newest.pose.stamp, frozen(se2.compose(estimate.T_map_odom, T_smooth_base)),
-            T_odom_base, estimate.quality, known is not None, 0,
-            newest.pose.T_keyscan_base, newest.tracked, self._frontend.odometry_model,
+            newest.pose.stamp,
+            frozen(se2.compose(estimate.T_map_odom, T_smooth_base)),
+            T_odom_base,
+            estimate.quality,
+            known is not None,
+            0,
+            newest.pose.T_keyscan_base,
+            newest.tracked,
+            self._frontend.odometry_model,
             estimate.covariance,
-        )  # fmt: skip
+        )
 
     def _tell(self) -> None:
         estimate, was_localized = self._estimate(), self._was_localized

@@ -172,10 +172,16 @@ class Robot(LiveTracker):
             if outbox is not None and folder is not None:
                 # Not the seed of the configuration: robots must not retry at the same moments.
                 self._uplink = Uplink(
-                    self._frontend, outbox, transport, folder, np.random.default_rng(), self._clock,
+                    self._frontend,
+                    outbox,
+                    transport,
+                    folder,
+                    np.random.default_rng(),
+                    self._clock,
                     self._map_poses.correct_by_server,
-                    known, None if budget_kbps is None else Budget(1e3 * budget_kbps),
-                )  # fmt: skip
+                    known,
+                    None if budget_kbps is None else Budget(1e3 * budget_kbps),
+                )
                 stack.callback(self._uplink.close)
             warm_up_tracking(self._config.robot)
             self._stack = stack.pop_all()
@@ -230,9 +236,17 @@ class Robot(LiveTracker):
         )
         times_lost = self._part - self._first_on_floor(self._part)
         return RobotStatus(
-            self._scans, self._keyscans, *sent, localizer.map_index, localizer.age_s, localizer.quality, times_lost,
-            uplink.trouble if uplink else None, uplink is not None and uplink.is_catching_up, notices,
-        )  # fmt: skip
+            self._scans,
+            self._keyscans,
+            *sent,
+            localizer.map_index,
+            localizer.age_s,
+            localizer.quality,
+            times_lost,
+            uplink.trouble if uplink else None,
+            uplink is not None and uplink.is_catching_up,
+            notices,
+        )
 
     def map(self) -> OccupancyMap:
         """The map that the robot is in: with a server the joint map of its fleet, with what the robot saw lately drawn
@@ -506,11 +520,17 @@ class Robot(LiveTracker):
         corrected = localizer.T_map_base(T_smooth_base)
         is_found = self._part in self._floors or localizer.quality > 0.0
         return RobotPose(
-            newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
-            T_odom_base, newest.quality,
-            is_found and not newest.is_deferred, localizer.map_index, newest.pose.T_keyscan_base, newest.tracked,
-            self._frontend.odometry_model, np.zeros((3, 3)),
-        )  # fmt: skip
+            newest.pose.stamp,
+            frozen(T_smooth_base if corrected is None else corrected),
+            T_odom_base,
+            newest.quality,
+            is_found and not newest.is_deferred,
+            localizer.map_index,
+            newest.pose.T_keyscan_base,
+            newest.tracked,
+            self._frontend.odometry_model,
+            np.zeros((3, 3)),
+        )
 
     def _tell(self) -> None:
         """Tell what happened between two scans."""

@@ -25,9 +25,13 @@ from fcslam.wire.messages import Packet
 UNDETERMINED_S = 1.0
 """The robot reports scans without odometry that leave a direction open for longer."""
 QUIET = (
-    EventKind.CORRECTED, EventKind.ONLINE, EventKind.JOINED, EventKind.FLEET, EventKind.RELOCALISED,
+    EventKind.CORRECTED,
+    EventKind.ONLINE,
+    EventKind.JOINED,
+    EventKind.FLEET,
+    EventKind.RELOCALISED,
     EventKind.LOCALISED,
-)  # fmt: skip
+)
 """Events that are logged as information; the others are warnings."""
 
 _log = logging.getLogger(__name__)

@@ -91,9 +91,12 @@ class Places(NamedTuple):
 
 
 def certify(
-    graph: PoseGraph, paths: Sequence[MappedPath], occupancy: OccupancyMap, bar_m: float = BAR_M,
+    graph: PoseGraph,
+    paths: Sequence[MappedPath],
+    occupancy: OccupancyMap,
+    bar_m: float = BAR_M,
     within_m: float = WITHIN_M,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The certificate of one map, as ``quality.json`` has it; lengths in metres.
 
     Args:
@@ -117,22 +120,31 @@ def certify(
     is_good = bound <= bar_m
     cells = [
         {
-            "x": round(float(x), 3), "y": round(float(y), 3), "error": round(float(math.hypot(absolute[k], along)), 4),
-            "neighbours": round(float(local[k]), 4), "bound_95": round(float(bound[k]), 4), "good": bool(is_good[k]),
-            "passes": int(count), "last_seen": round(float(seen), 3) if count else None,
+            "x": round(float(x), 3),
+            "y": round(float(y), 3),
+            "error": round(float(math.hypot(absolute[k], along)), 4),
+            "neighbours": round(float(local[k]), 4),
+            "bound_95": round(float(bound[k]), 4),
+            "good": bool(is_good[k]),
+            "passes": int(count),
+            "last_seen": round(float(seen), 3) if count else None,
         }
         for (x, y), k, along, count, seen in zip(centres, nearest, lever, passes, seen_s, strict=True)
-    ]  # fmt: skip
+    ]
     good = [cell for cell in cells if cell["good"]]
     return {
-        "bar": bar_m, "within": within_m, "cell": CELL_M, "scale": round(places.scale, 4), "floor": FLOOR_M,
+        "bar": bar_m,
+        "within": within_m,
+        "cell": CELL_M,
+        "scale": round(places.scale, 4),
+        "floor": FLOOR_M,
         "error_95": round(float(np.percentile(bound[nearest], 95)), 4) if cells else None,
         "good_share": round(len(good) / len(cells), 4) if cells else None,
         "verdict": f"{len(good)} of {len(cells)} m2 are good to {bar_m:g} m within {within_m:g} m",
         "open_stretches": _open_stretches(graph, paths),
         "drives": _drives(places, nearest, is_good, bar_m, within_m),
         "cells": cells,
-    }  # fmt: skip
+    }
 
 
 def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
@@ -202,10 +214,14 @@ def relative_error(
             swing = apart @ _S.T  # change of the other's position by a turn of this place
             own, other, cross = blocks[k, k], blocks[near, near], blocks[near, k]
             variance = (
-                other[:, 0, 0] + other[:, 1, 1] + own[0, 0] + own[1, 1] - 2.0 * (cross[:, 0, 0] + cross[:, 1, 1])
+                other[:, 0, 0]
+                + other[:, 1, 1]
+                + own[0, 0]
+                + own[1, 1]
+                - 2.0 * (cross[:, 0, 0] + cross[:, 1, 1])
                 + own[2, 2] * (swing**2).sum(axis=1)
                 - 2.0 * (swing * (cross[:, :2, 2] - own[:2, 2])).sum(axis=1)
-            )  # fmt: skip
+            )
             result[k] = math.sqrt(max(float(variance.mean()), 0.0) + FLOOR_M**2)
     return result
 
@@ -290,14 +306,14 @@ def _open_stretches(graph: PoseGraph, paths: Sequence[MappedPath]) -> list[dict[
     edges = graph.arrays()
     weakest = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(edges.information)[:, 0], 1e-12))
     motion = {(int(i), int(j)): float(sigma) for i, j, sigma in zip(edges.i, edges.j, weakest, strict=True)}
-    chain = {pair for path in paths for pair in zip(path.variables[:-1].tolist(), path.variables[1:].tolist(),
-                                                    strict=True)}  # fmt: skip
+    chain = {
+        pair for path in paths for pair in zip(path.variables[:-1].tolist(), path.variables[1:].tolist(), strict=True)
+    }
     closed = {end for pair in motion if pair not in chain for end in pair}
     found = []
     for path in paths:
         variables, begin = path.variables.tolist(), 0
-        is_open = [motion.get(pair, 0.0) > OPEN_M and pair[1] not in closed
-                   for pair in pairwise(variables)]  # fmt: skip
+        is_open = [motion.get(pair, 0.0) > OPEN_M and pair[1] not in closed for pair in pairwise(variables)]
         for k, now in enumerate([*is_open, False]):
             if now:
                 continue
@@ -305,8 +321,16 @@ def _open_stretches(graph: PoseGraph, paths: Sequence[MappedPath]) -> list[dict[
             length_m = float(np.hypot(*steps.T).sum()) if len(steps) else 0.0
             if length_m >= OPEN_LENGTH_M:
                 ends = [[round(float(value), 2) for value in path.T_map_base[end, :2]] for end in (begin, k)]
-                found.append({"robot": path.session, "from": ends[0], "to": ends[1], "length": round(length_m, 2),
-                              "first": float(path.stamps[begin]), "last": float(path.stamps[k])})  # fmt: skip
+                found.append(
+                    {
+                        "robot": path.session,
+                        "from": ends[0],
+                        "to": ends[1],
+                        "length": round(length_m, 2),
+                        "first": float(path.stamps[begin]),
+                        "last": float(path.stamps[k]),
+                    }
+                )
             begin = k + 1
     return found
 
@@ -331,11 +355,15 @@ def _drives(
         gain = int(weight[bad[QUANTILE * after[bad] <= bar_m]].sum())
         if gain:
             ends = [[round(float(value), 1) for value in places.poses[k, :2]] for k in (a, b)]
-            found.append({
-                "from": ends[0], "to": ends[1], "gain_m2": gain,
-                "text": f"drive from ({ends[0][0]}, {ends[0][1]}) to ({ends[1][0]}, {ends[1][1]}) again: about {gain} "
-                "m2 more are good then",
-            })  # fmt: skip
+            found.append(
+                {
+                    "from": ends[0],
+                    "to": ends[1],
+                    "gain_m2": gain,
+                    "text": f"drive from ({ends[0][0]}, {ends[0][1]}) to ({ends[1][0]}, {ends[1][1]}) again: "
+                    f"about {gain} m2 more are good then",
+                }
+            )
     return sorted(found, key=lambda drive: -int(drive["gain_m2"]))[:3]
 
 

@@ -127,11 +127,23 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     cos, sin, top = math.cos(turn), math.sin(turn), y + occupancy.cells.shape[0] * side
     # (column, row) of a pixel's upper left corner -> (east, north): rows run against y.
     affine = (
-        side * cos, side * sin, 0.0, cos * x - sin * top,
-        side * sin, -side * cos, 0.0, sin * x + cos * top,
-        0.0, 0.0, 0.0, 0.0,
-        0.0, 0.0, 0.0, 1.0,
-    )  # fmt: skip
+        side * cos,
+        side * sin,
+        0.0,
+        cos * x - sin * top,
+        side * sin,
+        -side * cos,
+        0.0,
+        sin * x + cos * top,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
     numbers = (frame.longitude_deg, frame.latitude_deg, 0.0, 0.0, 1.0)
     # Key, tag of its value, number of values, value or index of the value.
     keys = (
@@ -151,8 +163,10 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     )
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     for tag, kind, values in (
-        (_TRANSFORMATION, _DOUBLE, affine), (_NUMBERS, _DOUBLE, numbers), (_KEYS, _SHORT, sum(keys, ())),
-    ):  # fmt: skip
+        (_TRANSFORMATION, _DOUBLE, affine),
+        (_NUMBERS, _DOUBLE, numbers),
+        (_KEYS, _SHORT, sum(keys, ())),
+    ):
         tags.tagtype[tag] = kind
         tags[tag] = values
     written = io.BytesIO()

@@ -188,9 +188,13 @@ def _draw_grid(axes: "Axes", panel: _Panel) -> None:
     corner, right, upper = panel.pixels(se2.transform(grid.T_frame_grid, in_grid))
     turned = Affine2D.from_values(*(right - corner), *(upper - corner), *corner)
     image = axes.imshow(
-        _colored(grid, panel.scale), origin="lower", extent=(0, 1, 0, 1), transform=turned + axes.transData,
-        aspect="auto", interpolation="bilinear",
-    )  # fmt: skip
+        _colored(grid, panel.scale),
+        origin="lower",
+        extent=(0, 1, 0, 1),
+        transform=turned + axes.transData,
+        aspect="auto",
+        interpolation="bilinear",
+    )
     box = panel.scale * panel.size_m
     image.set_clip_path(Rectangle((panel.corner_px[0], panel.corner_px[1]), box[0], box[1], transform=axes.transData))
 

@@ -50,8 +50,13 @@ class TileBatch(NamedTuple):
     def encode(self) -> bytes:
         """As bytes: a line of JSON with the sizes of the tiles, then their contents."""
         sizes = [[*number, len(data)] for number, data in self.tiles.items()]
-        head = {"frame": self.frame, "version": self.version, "resolution": self.resolution_m,
-                "complete": self.is_complete, "tiles": sizes}  # fmt: skip
+        head = {
+            "frame": self.frame,
+            "version": self.version,
+            "resolution": self.resolution_m,
+            "complete": self.is_complete,
+            "tiles": sizes,
+        }
         return json.dumps(head, separators=(",", ":")).encode() + b"\n" + b"".join(self.tiles.values())
 
 
@@ -139,8 +144,11 @@ class TiledMap:
         if tiles and np.prod(np.ptp(np.array(list(tiles)), axis=0) + 1.0) * TILE * TILE > LARGEST_GRID:
             raise ValueError(f"a map of more than {LARGEST_GRID} cells")
         self.frame, self.version, self._resolution_m, self._tiles = (
-            batch.frame, batch.version, batch.resolution_m, tiles,
-        )  # fmt: skip
+            batch.frame,
+            batch.version,
+            batch.resolution_m,
+            tiles,
+        )
 
     def occupancy(self) -> OccupancyMap | None:
         """The map, in whole tiles; None before the first tile."""

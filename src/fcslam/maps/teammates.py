@@ -83,9 +83,13 @@ def without_teammates(
 
 
 def _suspects(
-    scans: Sequence[Casting], stamps: FloatArray, senders: Sequence[str], robot: str, paths: Sequence[RobotPath],
+    scans: Sequence[Casting],
+    stamps: FloatArray,
+    senders: Sequence[str],
+    robot: str,
+    paths: Sequence[RobotPath],
     radius_m: float,
-) -> _Suspects | None:  # fmt: skip
+) -> _Suspects | None:
     """Points of other robots' scans that lie on ``robot``; None if there are none."""
     numbers, beams, points = [], [], []
     begin, end = _whereabouts(paths, stamps)

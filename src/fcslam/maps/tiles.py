@@ -49,9 +49,10 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
         cells = pixels[low[1] : high[1], low[0] : high[0]]
         shrinks = cells.shape[0] > top - bottom
         drawn = cv2.resize(
-            cells, (int(right - left), int(top - bottom)),
+            cells,
+            (int(right - left), int(top - bottom)),
             interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST,
-        )  # fmt: skip
+        )
         inside = (slice(max(bottom, 0), min(top, TILE_PX)), slice(max(left, 0), min(right, TILE_PX)))
         canvas[inside] = drawn[
             inside[0].start - bottom : inside[0].stop - bottom, inside[1].start - left : inside[1].stop - left

@@ -165,9 +165,12 @@ class MissionCloud:
     """The cloud of a mission within one process; it counts what is sent."""
 
     def __init__(
-        self, config: MissionConfig, onto: SavedMission = EMPTY, vetoes: Sequence[Veto] = (),
+        self,
+        config: MissionConfig,
+        onto: SavedMission = EMPTY,
+        vetoes: Sequence[Veto] = (),
         verify_pairs: VerifyPairs = verify_here,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
         self.config = config
         self._verify_pairs = verify_pairs
@@ -204,9 +207,13 @@ class MissionCloud:
             config, state = self.config, onto.state["cloud"]
             numbered = {PacketNumber(session_name(p.robot, p.epoch), p.sequence): p for p in packets}
             cloud = Cloud.restored(
-                config.fleet, config.seed, state, {number: packet.time for number, packet in numbered.items()},
-                lambda number: decode(numbered[number].data), self._verify_pairs,
-            )  # fmt: skip
+                config.fleet,
+                config.seed,
+                state,
+                {number: packet.time for number, packet in numbered.items()},
+                lambda number: decode(numbered[number].data),
+                self._verify_pairs,
+            )
             traffic = {
                 Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
                 for robot, kind, channel, count, size in onto.state["traffic"]

@@ -76,13 +76,13 @@ CREATE TABLE tracks (
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL, seal BLOB NOT NULL) STRICT
 """
 PACKETS = StoreTable(
-    "packets", ("arrival",),
+    "packets",
+    ("arrival",),
     ("arrival", "robot", "epoch", "sequence", "received", "time", "kind", "channel", "refusal", "data"),
-)  # fmt: skip
+)
 CORRECTIONS = StoreTable(
-    "corrections", ("robot", "epoch"),
-    ("robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality"),
-)  # fmt: skip
+    "corrections", ("robot", "epoch"), ("robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality")
+)
 EDITS = StoreTable("edits", ("number",), ("number", "author", "time", "kind", "content"))
 FINALIZATIONS = StoreTable("finalizations", ("number",), ("number", "arrivals", "edits", "run", "failure"))
 TRACKS = StoreTable("tracks", ("robot", "epoch"), ("robot", "epoch", "stamps", "keyscans", "offsets"))
@@ -555,9 +555,15 @@ def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
 
 
 def _packet(
-    robot: str, epoch: int, sequence: int, time: float, kind: str | None, channel: str | None, data: bytes,
+    robot: str,
+    epoch: int,
+    sequence: int,
+    time: float,
+    kind: str | None,
+    channel: str | None,
+    data: bytes,
     refusal: str | None,
-) -> StoredPacket:  # fmt: skip
+) -> StoredPacket:
     read = PacketKind(kind) if kind else None, Channel(channel) if channel else None
     return StoredPacket(robot, epoch, sequence, time, *read, data, refusal)
 

@@ -128,22 +128,36 @@ class PlaceMatch:
     ) -> Self:
         """Decision of geometry; a predicted pair needs less."""
         return cls(
-            i, j, channel, similarity,
+            i,
+            j,
+            channel,
+            similarity,
             M=check.loose if predicted else check.strict,
             reason=(check.loose_reason if predicted else check.reason).under("verification"),
-            T_i_j=check.T_a_b, information=check.information, informative=check.informative,
-            explained=check.worse.explained, predicted=predicted,
-        )  # fmt: skip
+            T_i_j=check.T_a_b,
+            information=check.information,
+            informative=check.informative,
+            explained=check.worse.explained,
+            predicted=predicted,
+        )
 
     @classmethod
     def similar(cls, i: KeyscanId, j: KeyscanId, channel: Channel, similarity: float, delta: float) -> Self:
         """Decision by words (Algorithm 1, lines 14-17). The paper takes both poses for one."""
         score = PAPER_SCALE * similarity
         return cls(
-            i, j, channel, similarity, M=score >= delta, reason=Reason(ReasonCode.SIMILAR, score, delta, "delta"),
-            T_i_j=frozen(np.zeros(3)), information=frozen(np.zeros((3, 3))), informative=False, explained=0.0,
+            i,
+            j,
+            channel,
+            similarity,
+            M=score >= delta,
+            reason=Reason(ReasonCode.SIMILAR, score, delta, "delta"),
+            T_i_j=frozen(np.zeros(3)),
+            information=frozen(np.zeros((3, 3))),
+            informative=False,
+            explained=0.0,
             predicted=False,
-        )  # fmt: skip
+        )
 
 
 class _Comparison(NamedTuple):

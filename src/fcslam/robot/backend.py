@@ -288,17 +288,27 @@ class _Session:
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
         features = self._own_places.features(submap.anchor)
         return Place(
-            KeyscanId(self._robot, submap.anchor), Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last,
-            features.keypoints_m, features.descriptors,
-        )  # fmt: skip
+            KeyscanId(self._robot, submap.anchor),
+            Channel.LIDAR,
+            DETECTOR_VERSION,
+            submap.first,
+            submap.last,
+            features.keypoints_m,
+            features.descriptors,
+        )
 
     def _camera_place(self, view: CameraView) -> Place:
         first, last = self._submaps[view.keyscan]
         self._described.add((view.keyscan, view.detector_version))
         return Place(
-            KeyscanId(self._robot, view.keyscan), Channel.CAMERA, view.detector_version, first, last, view.keypoints,
+            KeyscanId(self._robot, view.keyscan),
+            Channel.CAMERA,
+            view.detector_version,
+            first,
+            last,
+            view.keypoints,
             view.descriptors,
-        )  # fmt: skip
+        )
 
     @property
     def detector_versions(self) -> dict[Channel, str]:

@@ -104,9 +104,12 @@ class RobotFrontend:
     """
 
     def __init__(
-        self, robot: str, config: RobotConfig, backend: BackendRunner | None = None,
+        self,
+        robot: str,
+        config: RobotConfig,
+        backend: BackendRunner | None = None,
         mark: Callable[[LaserScan], LaserScan] = lambda scan: scan,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Start the first session.
 
         Args:

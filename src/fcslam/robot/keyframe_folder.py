@@ -71,7 +71,7 @@ class KeyframeFolder:
             "scores": features.scores,
             "descriptors": features.descriptors,
             "detector_version": detector_version,
-        }  # fmt: skip
+        }
         self._write(self._path(image.keyscan), state)
 
     def drop(self, keyscans: Iterable[int]) -> None:
@@ -128,9 +128,10 @@ def _keyframe(folder: Path, part: int, keyscan: int, T_own_keyscan: FloatArray) 
     )
     image = KeyframeImage(keyscan, state["encoded"].tobytes(), camera, surroundings, state["T_keyscan_image"])
     features = ImageFeatures(
-        frozen(state["keypoints_px"], np.float32), frozen(state["scores"], np.float32),
+        frozen(state["keypoints_px"], np.float32),
+        frozen(state["scores"], np.float32),
         frozen(state["descriptors"], np.uint8),
-    )  # fmt: skip
+    )
     return KeptKeyframe(
         part, image, features, state["detector_version"], se2.compose(T_own_keyscan, image.T_keyscan_image)
     )

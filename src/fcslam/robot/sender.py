@@ -36,10 +36,15 @@ class Sender:
     """Sends one request at a time, the oldest packets first, each packet until the cloud has confirmed it."""
 
     def __init__(
-        self, outbox: Outbox, transport: BatchTransport, rng: np.random.Generator, clock: Callable[[], float],
-        correct: Callable[[int, Correction], None], keep: Callable[[DetectorFile, bytes], None],
+        self,
+        outbox: Outbox,
+        transport: BatchTransport,
+        rng: np.random.Generator,
+        clock: Callable[[], float],
+        correct: Callable[[int, Correction], None],
+        keep: Callable[[DetectorFile, bytes], None],
         refused: Callable[[bytes, str], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Callbacks run in the thread of ``step``: ``correct`` gets the epoch and correction of the newest session,
         ``keep`` a downloaded detector, ``refused`` a refused packet and the reason."""
         self._outbox = outbox

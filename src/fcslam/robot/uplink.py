@@ -30,10 +30,17 @@ class Uplink:
     """Stores the packets of one start of a robot, and sends them if there is a cloud."""
 
     def __init__(
-        self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport | None, folder: Path,
-        rng: np.random.Generator, clock: Callable[[], float], correct: Callable[[int, Correction], None], known: int,
+        self,
+        frontend: RobotFrontend,
+        outbox: Outbox,
+        transport: BatchTransport | None,
+        folder: Path,
+        rng: np.random.Generator,
+        clock: Callable[[], float],
+        correct: Callable[[int, Correction], None],
+        known: int,
         budget: Budget | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Start both threads.
 
         Args:

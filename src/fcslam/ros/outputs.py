@@ -183,13 +183,22 @@ class Outputs:
             if self._quality is None:
                 self._quality = self._publisher(FLEET_QUALITY, DIAGNOSTICS, LATCHED)
             statuses = [
-                self._status(f"map {one.map_index}", robot, _WARN if one.drives else _OK, one.verdict, {
-                    "map": one.map_index, "bar_m": one.bar_m, "within_m": one.within_m, "error_95_m": one.error_95_m,
-                    "good_share": one.good_share,
-                    **{f"drive_{number}": text for number, text in enumerate(one.drives, 1)},
-                })
+                self._status(
+                    f"map {one.map_index}",
+                    robot,
+                    _WARN if one.drives else _OK,
+                    one.verdict,
+                    {
+                        "map": one.map_index,
+                        "bar_m": one.bar_m,
+                        "within_m": one.within_m,
+                        "error_95_m": one.error_95_m,
+                        "good_share": one.good_share,
+                        **{f"drive_{number}": text for number, text in enumerate(one.drives, 1)},
+                    },
+                )
                 for one in maps
-            ]  # fmt: skip
+            ]
             message = self._codec.make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
             self._send(self._quality, DIAGNOSTICS, message)
 
@@ -219,9 +228,12 @@ class Outputs:
             return True
 
     def fleet(
-        self, now_ns: int, teammates: "Sequence[Teammate]", separations: Sequence[tuple[tuple[int, int], str]],
+        self,
+        now_ns: int,
+        teammates: "Sequence[Teammate]",
+        separations: Sequence[tuple[tuple[int, int], str]],
         own: int | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Publish where the robots of the own map are, and which robots are in which map.
 
         Args:
@@ -234,8 +246,9 @@ class Outputs:
         with self._lock:
             if self._fleet is None:
                 self._fleet = (
-                    self._publisher(FLEET_POSES, POSES, STREAMED), self._publisher(FLEET_STATUS, DIAGNOSTICS, STREAMED)
-                )  # fmt: skip
+                    self._publisher(FLEET_POSES, POSES, STREAMED),
+                    self._publisher(FLEET_STATUS, DIAGNOSTICS, STREAMED),
+                )
             near = [mate for mate in teammates if mate.map_index == own]
             poses = [self._codec.pose(in_space(mate.T_map_base)) for mate in near]
             self._send(self._fleet[0], POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
@@ -248,13 +261,23 @@ class Outputs:
                 header = self._codec.header(max(0, now_ns - nanoseconds(mate.age_s)), frame)
                 self._send(self._teammates[name], POSE_STAMPED, make(POSE_STAMPED, header=header, pose=pose))
             statuses = [
-                self._status(f"robot {mate.robot}", mate.robot, _OK, f"map {mate.map_index}", {
-                    "map": mate.map_index, "floor": mate.floor, "age_s": f"{mate.age_s:.2f}",
-                    **{axis: f"{value:.4f}" for axis, value in zip(("x", "y", "theta"), mate.T_map_base.tolist(),
-                                                                  strict=True)},
-                })
+                self._status(
+                    f"robot {mate.robot}",
+                    mate.robot,
+                    _OK,
+                    f"map {mate.map_index}",
+                    {
+                        "map": mate.map_index,
+                        "floor": mate.floor,
+                        "age_s": f"{mate.age_s:.2f}",
+                        **{
+                            axis: f"{value:.4f}"
+                            for axis, value in zip(("x", "y", "theta"), mate.T_map_base.tolist(), strict=True)
+                        },
+                    },
+                )
                 for mate in teammates
-            ]  # fmt: skip
+            ]
             statuses += [
                 self._status(f"maps {a} and {b}", "", _WARN, why, {"map_a": a, "map_b": b})
                 for (a, b), why in separations
@@ -280,9 +303,13 @@ class Outputs:
         make = self._codec.make
         pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
         return make(
-            "diagnostic_msgs/DiagnosticStatus", level=level, name=name, message=message, hardware_id=hardware,
+            "diagnostic_msgs/DiagnosticStatus",
+            level=level,
+            name=name,
+            message=message,
+            hardware_id=hardware,
             values=pairs,
-        )  # fmt: skip
+        )
 
     def _grid_topic(self, topic: str) -> "_GridTopic":
         if topic not in self._grids:
@@ -295,9 +322,14 @@ class Outputs:
         publish(self._codec.encode(message, kind))
 
     def _marker(
-        self, stamp_ns: int, name: str, kind: int, scale_m: float, colour: tuple[float, float, float],
+        self,
+        stamp_ns: int,
+        name: str,
+        kind: int,
+        scale_m: float,
+        colour: tuple[float, float, float],
         points: FloatArray,
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         """A marker of points (..., 2), metres in ``map``."""
         make, vector = self._codec.make, self._codec.vector
         mesh = {} if self._codec.ros1 else self._new_fields(make)

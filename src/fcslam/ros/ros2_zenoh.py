@@ -98,10 +98,15 @@ class ZenohNetwork:
             history = ext.HistoryConfig(detect_late_publishers=True, max_samples=quality.depth)
             self._declare(
                 ext.declare_advanced_subscriber(
-                    self._session, key, take, allowed_origin=remote, history=history,
-                    recovery=ext.RecoveryConfig(heartbeat=True), subscriber_detection=True,
+                    self._session,
+                    key,
+                    take,
+                    allowed_origin=remote,
+                    history=history,
+                    recovery=ext.RecoveryConfig(heartbeat=True),
+                    subscriber_detection=True,
                 )
-            )  # fmt: skip
+            )
         else:
             self._declare(self._session.declare_subscriber(key, take, allowed_origin=remote))
         self._show("MS", topic, dds_type(kind), self._hash(kind), quality)
@@ -148,9 +153,10 @@ class ZenohNetwork:
                 response = self._codec.make(TRIGGER_RESPONSE, **done.result()._asdict())
                 try:
                     query.reply(
-                        key, self._codec.encode(response, TRIGGER_RESPONSE),
+                        key,
+                        self._codec.encode(response, TRIGGER_RESPONSE),
                         attachment=attachment(number, time.time_ns(), sender),
-                    )  # fmt: skip
+                    )
                 finally:
                     query.drop()  # ends the wait of the caller
 

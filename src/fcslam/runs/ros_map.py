@@ -132,8 +132,12 @@ def _along_the_axes(
     x, y = lowest + 0.5
     inverse = np.array([[c, s, c * x + s * y - 0.5], [-s, c, -s * x + c * y - 0.5]])
     turned = cv2.warpAffine(
-        np.ascontiguousarray(cells), inverse, (columns, rows), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=int(Occupancy.UNKNOWN),
-    )  # fmt: skip
+        np.ascontiguousarray(cells),
+        inverse,
+        (columns, rows),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=int(Occupancy.UNKNOWN),
+    )
     x, y = np.array(origin_xy) + lowest * resolution_m
     return turned, (float(x), float(y))

@@ -101,9 +101,13 @@ def _authority(folder: Path, now: datetime.datetime) -> Authority:
 
 
 def _make_leaf(
-    stem: Path, common_name: str, purposes: Sequence[x509.ObjectIdentifier], hosts: Sequence[x509.GeneralName],
-    authority: Authority, now: datetime.datetime,
-) -> None:  # fmt: skip
+    stem: Path,
+    common_name: str,
+    purposes: Sequence[x509.ObjectIdentifier],
+    hosts: Sequence[x509.GeneralName],
+    authority: Authority,
+    now: datetime.datetime,
+) -> None:
     """A certificate of the authority's, good for these purposes; that of a host names it."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
@@ -120,9 +124,16 @@ def _make_leaf(
 
 
 _USAGES = (
-    "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
-    "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
-)  # fmt: skip
+    "digital_signature",
+    "content_commitment",
+    "key_encipherment",
+    "data_encipherment",
+    "key_agreement",
+    "key_cert_sign",
+    "crl_sign",
+    "encipher_only",
+    "decipher_only",
+)
 
 
 def _builder(

@@ -61,9 +61,12 @@ class JointMaps:
     """The joint maps of one moment."""
 
     def __init__(
-        self, sessions: Sequence[JointSession], grids: Mapping[int, OccupancyMap], frames: Mapping[int, str],
+        self,
+        sessions: Sequence[JointSession],
+        grids: Mapping[int, OccupancyMap],
+        frames: Mapping[int, str],
         robot_radius_m: float = 0.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.sessions = tuple(sessions)
         """One for each robot: its newest session."""
         self.grids, self.frames = grids, frames
@@ -71,9 +74,7 @@ class JointMaps:
         self.robot_radius_m = robot_radius_m
 
 
-def joint_maps_of(
-    result: FleetResult, heard_s: Mapping[tuple[str, int], float], config: OccupancyConfig
-) -> JointMaps:  # fmt: skip
+def joint_maps_of(result: FleetResult, heard_s: Mapping[tuple[str, int], float], config: OccupancyConfig) -> JointMaps:
     """Draw the joint maps of an estimate; ``heard_s``: when the newest packet of each session took effect."""
     newest: dict[str, JointSession] = {}
     anchors: dict[int, str] = {}
@@ -86,9 +87,14 @@ def joint_maps_of(
         if robot not in newest or epoch > newest[robot].epoch:
             x, y, theta = mapped.T_map_base[-1].tolist()
             newest[robot] = JointSession(
-                robot, epoch, mapped.map_index, mapped.floor, (x, y, theta), float(mapped.stamps[-1]),
+                robot,
+                epoch,
+                mapped.map_index,
+                mapped.floor,
+                (x, y, theta),
+                float(mapped.stamps[-1]),
                 heard_s.get((robot, epoch), 0.0),
-            )  # fmt: skip
+            )
     return JointMaps(list(newest.values()), grids, anchors, config.robot_radius_m)
 
 
@@ -128,11 +134,12 @@ def read_joint_maps(path: Path) -> JointMaps:
             head = json.loads(archive.read("joint.json"))
             grids = {
                 int(k): OccupancyMap(
-                    np.load(io.BytesIO(archive.read(f"{k}.npy")), allow_pickle=False), about["resolution"],
+                    np.load(io.BytesIO(archive.read(f"{k}.npy")), allow_pickle=False),
+                    about["resolution"],
                     tuple(about["origin"]),
                 )
                 for k, about in head["maps"].items()
-            }  # fmt: skip
+            }
         frames = {int(k): about["frame"] for k, about in head["maps"].items()}
         radius_m = float(head["radius"])
         sessions = [JointSession(**{**one, "pose": tuple(one["pose"])}) for one in head["sessions"]]

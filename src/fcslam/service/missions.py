@@ -37,9 +37,13 @@ class OpenMission:
     """A mission with an intake and a worker. Viewers see it as a ``ViewedMission``."""
 
     def __init__(
-        self, folder: MissionFolder, store: MissionStore, intake: Intake, find_worker: Callable[[], RunningWorker],
+        self,
+        folder: MissionFolder,
+        store: MissionStore,
+        intake: Intake,
+        find_worker: Callable[[], RunningWorker],
         wall_clock: Callable[[], float],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.folder, self.store, self.intake = folder, store, intake
         self._find_worker, self._wall_clock = find_worker, wall_clock
 
@@ -170,9 +174,13 @@ class Missions:
     """All missions below one folder, which this service locks."""
 
     def __init__(
-        self, root: Path, config: CloudConfig, clock: Callable[[], float], wall_clock: Callable[[], float],
+        self,
+        root: Path,
+        config: CloudConfig,
+        clock: Callable[[], float],
+        wall_clock: Callable[[], float],
         launch: Launch,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Open the mission that was open last, or create the first one.
 
         Raises:

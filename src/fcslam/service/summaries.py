@@ -118,11 +118,20 @@ def newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> bytes
 def closure_summary(closure: ClosureRow) -> ClosureSummary:
     """One closure."""
     return ClosureSummary(
-        robot_i=closure.robot_i, stamp_i=closure.stamp_i, robot_j=closure.robot_j, stamp_j=closure.stamp_j,
-        channel=closure.channel, similarity=closure.similarity, T_i_j=closure.T_i_j.tolist(), status=closure.status,
-        reason=closure.reason.code, value=closure.reason.value, limit=closure.reason.limit,
-        setting=closure.reason.setting, explanation=str(closure.reason),
-    )  # fmt: skip
+        robot_i=closure.robot_i,
+        stamp_i=closure.stamp_i,
+        robot_j=closure.robot_j,
+        stamp_j=closure.stamp_j,
+        channel=closure.channel,
+        similarity=closure.similarity,
+        T_i_j=closure.T_i_j.tolist(),
+        status=closure.status,
+        reason=closure.reason.code,
+        value=closure.reason.value,
+        limit=closure.reason.limit,
+        setting=closure.reason.setting,
+        explanation=str(closure.reason),
+    )
 
 
 def all_edits(mission: ViewedMission) -> list[EditSummary]:
@@ -135,9 +144,13 @@ def all_edits(mission: ViewedMission) -> list[EditSummary]:
 def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
     """An edit; ``gone`` names the edits that undid others (``fcslam.cloud.edits.undone``)."""
     return EditSummary(
-        number=edit.number, kind=kind_of(edit.content), content=asdict(edit.content), author=edit.author,
-        time_s=edit.time_s, undone_by=gone.get(edit.number),
-    )  # fmt: skip
+        number=edit.number,
+        kind=kind_of(edit.content),
+        content=asdict(edit.content),
+        author=edit.author,
+        time_s=edit.time_s,
+        undone_by=gone.get(edit.number),
+    )
 
 
 def map_summaries(mission: ViewedMission) -> list[MapSummary]:

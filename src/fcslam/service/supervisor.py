@@ -88,9 +88,13 @@ class Supervisor:
     """One worker at a time, until ``stop``."""
 
     def __init__(
-        self, folder: Path, clock: Callable[[], float], listen: Listen,
-        command: Sequence[str] = WORKER, start: StartWorker = start_worker,
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        clock: Callable[[], float],
+        listen: Listen,
+        command: Sequence[str] = WORKER,
+        start: StartWorker = start_worker,
+    ) -> None:
         """``start`` makes a process of ``command``, to which the folder, of a mission for instance, is added."""
         self._command, self._start = (*command, str(folder)), start
         self._clock, self._listen = clock, listen

@@ -50,10 +50,18 @@ from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import decode, encode, measure
 from fcslam.wire.quantisation import dequantise, quantise
 
-_WALLS = np.array([
-    (0.0, 0.0, 16.0, 0.0), (16.0, 0.0, 16.0, 9.0), (16.0, 9.0, 0.0, 9.0), (0.0, 9.0, 0.0, 0.0),
-    (4.0, 0.0, 4.0, 1.5), (7.0, 9.0, 8.5, 7.0), (12.0, 0.0, 12.5, 2.0), (13.0, 6.5, 16.0, 6.0),
-])  # fmt: skip
+_WALLS = np.array(
+    [
+        (0.0, 0.0, 16.0, 0.0),
+        (16.0, 0.0, 16.0, 9.0),
+        (16.0, 9.0, 0.0, 9.0),
+        (0.0, 9.0, 0.0, 0.0),
+        (4.0, 0.0, 4.0, 1.5),
+        (7.0, 9.0, 8.5, 7.0),
+        (12.0, 0.0, 12.5, 2.0),
+        (13.0, 6.5, 16.0, 6.0),
+    ]
+)
 """x, y of both ends, metres."""
 _LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
 _STEP_M, _STEPS, _PLACE_EVERY, _AROUND = 0.4, 31, 3, 3
@@ -121,8 +129,13 @@ def warm_up_fleet() -> None:
 
 
 WARM_UPS: Final = (
-    warm_up_scanning, warm_up_matching, warm_up_searching, warm_up_robot, warm_up_recognition, warm_up_fleet,
-)  # fmt: skip
+    warm_up_scanning,
+    warm_up_matching,
+    warm_up_searching,
+    warm_up_robot,
+    warm_up_recognition,
+    warm_up_fleet,
+)
 """In the order in which a mission needs them."""
 
 
@@ -212,9 +225,14 @@ def _place(
     seen = np.hypot(*(landmarks[:, :2] - pose[:2]).T) < 8.0
     keypoints = np.column_stack((se2.transform(se2.inverse(pose), landmarks[seen, :2]), landmarks[seen, 2]))
     return Place(
-        KeyscanId(robot, anchor), channel, _DETECTOR, anchor - _AROUND, anchor + _AROUND,
-        frozen(keypoints[:, : KEYPOINT_AXES[channel]], np.float32), frozen(codes[seen], np.uint8),
-    )  # fmt: skip
+        KeyscanId(robot, anchor),
+        channel,
+        _DETECTOR,
+        anchor - _AROUND,
+        anchor + _AROUND,
+        frozen(keypoints[:, : KEYPOINT_AXES[channel]], np.float32),
+        frozen(codes[seen], np.uint8),
+    )
 
 
 def _ranges(pose: FloatArray) -> FloatArray:

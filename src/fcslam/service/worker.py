@@ -103,9 +103,15 @@ class Worker:
     """One mission's fleet; ``step`` by ``step`` it follows what the store holds."""
 
     def __init__(
-        self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell, start: Start,
-        verify_pairs: VerifyPairs = verify_here, share: Share = lambda *_: None,
-    ) -> None:  # fmt: skip
+        self,
+        folder: MissionFolder,
+        store: MissionStore,
+        clock: Callable[[], float],
+        tell: Tell,
+        start: Start,
+        verify_pairs: VerifyPairs = verify_here,
+        share: Share = lambda *_: None,
+    ) -> None:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell = folder, store, clock, tell

@@ -118,11 +118,24 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
     steps_s = np.diff(np.array(stamps))
     back_s = -steps_s[steps_s < 0.0]
     return Inspection(
-        path, name, bag, source.name, len(stamps), survey.duration_s, survey.path_length_m,
+        path,
+        name,
+        bag,
+        source.name,
+        len(stamps),
+        survey.duration_s,
+        survey.path_length_m,
         tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in by_laser),
-        odometry, origin.name if origin else None, survey.camera, images, _gaps(stamps), len(back_s),
-        float(back_s.max(initial=0.0)), str(source.faults) if source.faults else "", survey.notes,
-    )  # fmt: skip
+        odometry,
+        origin.name if origin else None,
+        survey.camera,
+        images,
+        _gaps(stamps),
+        len(back_s),
+        float(back_s.max(initial=0.0)),
+        str(source.faults) if source.faults else "",
+        survey.notes,
+    )
 
 
 def _rate_hz(stamps: list[float]) -> float | None:

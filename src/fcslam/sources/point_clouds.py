@@ -300,9 +300,13 @@ def _moved(points: FloatArray, times_s: FloatArray, motion: Sweep) -> FloatArray
 def _levelling(normal: FloatArray, heading_rad: float) -> FloatArray:
     """The rotation that takes ``normal`` to the vertical, and then a heading to the x axis, shape (3, 3)."""
     x, y, z = normal
-    level = np.array([[1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), -x],
-                      [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), -y],
-                      [x, y, z]])  # fmt: skip
+    level = np.array(
+        [
+            [1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), -x],
+            [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), -y],
+            [x, y, z],
+        ]
+    )
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     result: FloatArray = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ level
     return result

@@ -128,10 +128,13 @@ class Postgres:
         import psycopg
 
         return psycopg.connect(
-            self.url, autocommit=True, connect_timeout=_CONNECT_S, application_name=f"fcslam {self._name}",
+            self.url,
+            autocommit=True,
+            connect_timeout=_CONNECT_S,
+            application_name=f"fcslam {self._name}",
             options=f"-c statement_timeout={ANSWER_S:.0f}s -c idle_in_transaction_session_timeout={RETRY_S:.0f}s "
             "-c client_min_messages=error",
-        )  # fmt: skip
+        )
 
     def _give_back(self, connection: "_Connection") -> None:
         from psycopg.pq import TransactionStatus

@@ -101,9 +101,7 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
     versions = {channel: each.version for channel, each in zip(channels, message.detectors, strict=True)}
     words = {channel: each.vocabulary for channel, each in zip(channels, message.detectors, strict=True)}
     vocabularies = MappingProxyType({channel: digest for channel, digest in words.items() if digest})
-    return Hello(
-        envelope.robot, envelope.epoch, lasers, MappingProxyType(versions), message.floor, vocabularies
-    )  # fmt: skip
+    return Hello(envelope.robot, envelope.epoch, lasers, MappingProxyType(versions), message.floor, vocabularies)
 
 
 def _write_laser(laser: LaserModel) -> pb.Laser:
@@ -291,16 +289,25 @@ def _read_tag_sighting(message: pb.TagSighting, envelope: pb.Packet) -> TagSight
 def _write_fix(fix: KeyscanFix) -> pb.KeyscanFix:
     x, y = fix.antenna_xy
     return pb.KeyscanFix(
-        number=fix.id.number, latitude_deg=fix.latitude_deg, longitude_deg=fix.longitude_deg,
-        altitude_m=fix.altitude_m, sigma_m=fix.sigma_m, antenna_x_m=x, antenna_y_m=y,
-    )  # fmt: skip
+        number=fix.id.number,
+        latitude_deg=fix.latitude_deg,
+        longitude_deg=fix.longitude_deg,
+        altitude_m=fix.altitude_m,
+        sigma_m=fix.sigma_m,
+        antenna_x_m=x,
+        antenna_y_m=y,
+    )
 
 
 def _read_fix(message: pb.KeyscanFix, envelope: pb.Packet) -> KeyscanFix:
     return KeyscanFix(
-        KeyscanId(envelope.robot, message.number), message.latitude_deg, message.longitude_deg, message.altitude_m,
-        message.sigma_m, (message.antenna_x_m, message.antenna_y_m),
-    )  # fmt: skip
+        KeyscanId(envelope.robot, message.number),
+        message.latitude_deg,
+        message.longitude_deg,
+        message.altitude_m,
+        message.sigma_m,
+        (message.antenna_x_m, message.antenna_y_m),
+    )
 
 
 def _check_at_most(count: int, most: int, what: str) -> None:

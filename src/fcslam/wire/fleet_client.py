@@ -77,10 +77,16 @@ class FleetClient(HttpClient):
         try:
             reply = response.json()
             robots = tuple(
-                TeammatePose(str(one["robot"]), int(one["map"]), str(one["floor"]), _pose(one["pose"]),
-                             float(one["age_s"]), float(one["stamp"]))
+                TeammatePose(
+                    str(one["robot"]),
+                    int(one["map"]),
+                    str(one["floor"]),
+                    _pose(one["pose"]),
+                    float(one["age_s"]),
+                    float(one["stamp"]),
+                )
                 for one in reply["robots"]
-            )  # fmt: skip
+            )
             apart = tuple(
                 ((int(one["maps"][0]), int(one["maps"][1])), str(one["explanation"])) for one in reply["separations"]
             )
@@ -95,11 +101,16 @@ class FleetClient(HttpClient):
         self.received_bytes += len(response.content)
         try:
             return tuple(
-                FrontierReply(int(one["map"]), (float(each["point"][0]), float(each["point"][1])),
-                              float(each["length"]), float(each["gain"]), tuple(map(str, each["robots"])))
+                FrontierReply(
+                    int(one["map"]),
+                    (float(each["point"][0]), float(each["point"][1])),
+                    float(each["length"]),
+                    float(each["gain"]),
+                    tuple(map(str, each["robots"])),
+                )
                 for one in response.json()
                 for each in one["frontiers"]
-            )  # fmt: skip
+            )
         except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
             raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 
@@ -110,10 +121,17 @@ class FleetClient(HttpClient):
         self.received_bytes += len(response.content)
         try:
             return tuple(
-                QualityReply(int(one["map"]), str(one["verdict"]), float(one["bar"]), float(one["within"]),
-                             _number(one["error_95"]), _number(one["good_share"]), tuple(map(str, one["drives"])))
+                QualityReply(
+                    int(one["map"]),
+                    str(one["verdict"]),
+                    float(one["bar"]),
+                    float(one["within"]),
+                    _number(one["error_95"]),
+                    _number(one["good_share"]),
+                    tuple(map(str, one["drives"])),
+                )
                 for one in response.json()
-            )  # fmt: skip
+            )
         except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
             raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 

@@ -118,9 +118,13 @@ class HttpClient:
     """Connection to one cloud."""
 
     def __init__(
-        self, url: str, token: str | None = None, ca: Path | None = None, own: tuple[Path, Path] | None = None,
+        self,
+        url: str,
+        token: str | None = None,
+        ca: Path | None = None,
+        own: tuple[Path, Path] | None = None,
         headers: Mapping[str, str] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Open a client.
 
         Args:
@@ -151,9 +155,13 @@ class HttpClient:
         self._client.close()
 
     def _ask(
-        self, method: str, path: str, content: bytes | None = None, headers: Mapping[str, str] | None = None,
+        self,
+        method: str,
+        path: str,
+        content: bytes | None = None,
+        headers: Mapping[str, str] | None = None,
         accept: str = MEDIA_TYPE,
-    ) -> "httpx.Response":  # fmt: skip
+    ) -> "httpx.Response":
         with self._explained():
             return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
 
@@ -206,9 +214,14 @@ class HttpTransport(HttpClient):
     """Connection of one robot to one cloud; docs/howto/robot.md lists how it handles status codes."""
 
     def __init__(
-        self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,
+        self,
+        url: str,
+        robot: str,
+        agent: str,
+        token: str | None = None,
+        ca: Path | None = None,
         own: tuple[Path, Path] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Open a client; raises as ``HttpClient``.
 
         Args:

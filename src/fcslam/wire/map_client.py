@@ -26,10 +26,14 @@ class MapClient(HttpClient):
         self._require(response, 200)
         try:
             return [
-                ServedMap(int(one["map"]), str(one["floor"]), tuple(map(str, one["robots"])),
-                          tuple(map(float, one["extent"] or ())))
+                ServedMap(
+                    int(one["map"]),
+                    str(one["floor"]),
+                    tuple(map(str, one["robots"])),
+                    tuple(map(float, one["extent"] or ())),
+                )
                 for one in response.json()
-            ]  # fmt: skip
+            ]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 

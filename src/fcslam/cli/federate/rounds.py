@@ -20,8 +20,14 @@ def round_line(row: Mapping[str, str], rounds: int) -> str:
     released, returned, judged = row["released"] == "1", row["returned"] == "1", row["score"] != "nan"
     reason = row.get("reason", "")
     outcome = "back to the best" if returned else "not released" if judged or reason else "not judged"
-    shown = {"detector": "loss_detector", "contrastive": "loss_contrastive", "repeatability": "repeatability",
-             "MMA": "mma_3px", "revisits": "revisit_recall", "places": "places_found"}  # fmt: skip
+    shown = {
+        "detector": "loss_detector",
+        "contrastive": "loss_contrastive",
+        "repeatability": "repeatability",
+        "MMA": "mma_3px",
+        "revisits": "revisit_recall",
+        "places": "places_found",
+    }
     parts = [
         f"round {row['round']}/{rounds}",
         f"{len(row['robots'].split(' | '))} robots",

@@ -54,8 +54,11 @@ def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Gener
     write_file(place / "map.pgm", pgm_bytes(seen))
     write_file(place / "map.yaml", map_yaml(seen, "map.pgm"))
     if fleet.tags:
-        lines = [f"  {tag.number}: {{x: {x:.4f}, y: {y:.4f}, yaw: {yaw:.6f}}}" for tag in fleet.tags
-                 for x, y, yaw in (tag.T_building_tag,)]  # fmt: skip
+        lines = [
+            f"  {tag.number}: {{x: {x:.4f}, y: {y:.4f}, yaw: {yaw:.6f}}}"
+            for tag in fleet.tags
+            for x, y, yaw in (tag.T_building_tag,)
+        ]
         write_file(place / "tags.yaml", "\n".join((f"family: {FAMILY}", "tags:", *lines, "")).encode())
 
 

@@ -53,10 +53,15 @@ SCANNERS: Final = {
     Scanner.RPLIDAR_A1: LidarSettings(beams=1454, rate_hz=5.5, range_noise_m=0.02, dropout=0.03, spin=-1),
     Scanner.LD19: LidarSettings(beams=450, rate_hz=10.0, range_noise_m=0.015, dropout=0.02, spin=-1),
     Scanner.UTM_30LX: LidarSettings(
-        beams=1081, field_of_view_rad=1.5 * np.pi, max_range_m=30.0, range_noise_m=0.01, dropout=0.005, rate_hz=40.0,
+        beams=1081,
+        field_of_view_rad=1.5 * np.pi,
+        max_range_m=30.0,
+        range_noise_m=0.01,
+        dropout=0.005,
+        rate_hz=40.0,
         spin=1,
     ),
-}  # fmt: skip
+}
 """The settings of each scanner."""
 
 

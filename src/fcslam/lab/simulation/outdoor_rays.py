@@ -122,8 +122,10 @@ def _world(plan: FloorPlan, terrain: Terrain) -> _World:
     cells, members = [], []
     for number, (disc, *ends) in enumerate(surfaces[:, :5]):
         corners = _box(ends) if disc else np.array(ends).reshape(2, 2)
-        low, high = (np.clip(np.floor(f(corners, axis=0) / _CELL_M), 0, (columns - 1, rows - 1)).astype(int)
-                     for f in (np.min, np.max))  # fmt: skip
+        low, high = (
+            np.clip(np.floor(f(corners, axis=0) / _CELL_M), 0, (columns - 1, rows - 1)).astype(int)
+            for f in (np.min, np.max)
+        )
         block = np.add.outer(np.arange(low[1], high[1] + 1) * columns, np.arange(low[0], high[0] + 1)).ravel()
         cells.append(block)
         members.append(np.full(len(block), number))

@@ -50,9 +50,19 @@ class RayCaster:
                 )
         else:
             self._mujoco.mj_multiRay(
-                self._model, self._data, np.array([x, y, LASER_HEIGHT_M]), directions.ravel(), self._groups, True, -1,
-                hits, distances, None, count, far,
-            )  # fmt: skip
+                self._model,
+                self._data,
+                np.array([x, y, LASER_HEIGHT_M]),
+                directions.ravel(),
+                self._groups,
+                True,
+                -1,
+                hits,
+                distances,
+                None,
+                count,
+                far,
+            )
         return np.where(distances < 0.0, far, np.minimum(distances, far))
 
 

@@ -52,9 +52,13 @@ class RobotLink(HttpClient):
     """
 
     def __init__(
-        self, url: str, robot: str, token: str | None = None, ca: Path | None = None,
+        self,
+        url: str,
+        robot: str,
+        token: str | None = None,
+        ca: Path | None = None,
         own: tuple[Path, Path] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(url, token, ca, own)
         self._path = f"robots/{quote(robot, safe='')}/learning/"
         self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)

@@ -96,8 +96,15 @@ class LearningRobot:
 class _IdleLink(RobotLink):
     """Asks for requests only while the robot is idle and has something to learn from."""
 
-    def __init__(self, robot: LearningRobot, url: str, name: str, token: str | None, ca: Path | None,
-                 own: tuple[Path, Path] | None) -> None:  # fmt: skip
+    def __init__(
+        self,
+        robot: LearningRobot,
+        url: str,
+        name: str,
+        token: str | None,
+        ca: Path | None,
+        own: tuple[Path, Path] | None,
+    ) -> None:
         super().__init__(url, name, token, ca, own)
         self._robot = robot
 

@@ -51,9 +51,11 @@ class Service(FastAPI):
 
 
 def create_app(
-    state: ServiceState, more: Sequence[APIRouter] = (), local_names: bool = False,
+    state: ServiceState,
+    more: Sequence[APIRouter] = (),
+    local_names: bool = False,
     named: ContextVar[str | None] | None = None,
-) -> FastAPI:  # fmt: skip
+) -> FastAPI:
     """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end.
 
     With ``local_names``, it refuses requests that do not name the machine by an address or as localhost. With

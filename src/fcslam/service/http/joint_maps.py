@@ -111,9 +111,11 @@ def joint_map_router(state: ServiceState) -> APIRouter:
     joint = ServedJointMaps()
 
     @router.post(
-        "/robots/{robot}/fleet", dependencies=state.require(Role.ROBOT), responses=refusals(413),
+        "/robots/{robot}/fleet",
+        dependencies=state.require(Role.ROBOT),
+        responses=refusals(413),
         openapi_extra=json_body(OwnPose),
-    )  # fmt: skip
+    )
     async def exchange_poses(request: Request, robot: Name) -> FleetPoses:
         """Say where a robot is, and read where all robots are."""
         return await run_in_threadpool(exchange, robot, await read_json(request, OwnPose))
@@ -127,9 +129,15 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         for session in maps.sessions:
             pose, said_s = joint.pose(session)
             robots.append(
-                FleetRobot(robot=session.robot, map=session.map, floor=session.floor, pose=list(pose),
-                           age_s=max(0.0, now_s - said_s), stamp=session.stamp)
-            )  # fmt: skip
+                FleetRobot(
+                    robot=session.robot,
+                    map=session.map,
+                    floor=session.floor,
+                    pose=list(pose),
+                    age_s=max(0.0, now_s - said_s),
+                    stamp=session.stamp,
+                )
+            )
         return FleetPoses(robots=robots, separations=list(_apart(run_of(state.mission))))
 
     @router.get(
@@ -195,11 +203,16 @@ def _certified(folder: Path, _: tuple[int, int]) -> tuple[MapQuality, ...]:
     content = json.loads(read_text(folder / f"{QUALITY}.json", folder, MOST_LAYER_BYTES))
     return tuple(
         MapQuality(
-            map=int(k), verdict=one["verdict"], bar=one["bar"], within=one["within"], error_95=one["error_95"],
-            good_share=one["good_share"], drives=[drive["text"] for drive in one["drives"]],
+            map=int(k),
+            verdict=one["verdict"],
+            bar=one["bar"],
+            within=one["within"],
+            error_95=one["error_95"],
+            good_share=one["good_share"],
+            drives=[drive["text"] for drive in one["drives"]],
         )
         for k, one in content.items()
-    )  # fmt: skip
+    )
 
 
 def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierSummary]:

@@ -36,13 +36,16 @@ NETWORK = "application/octet-stream"
 """Media type of a detector's file."""
 _REFUSED = {
     REFUSED_HEADER: {
-        "schema": {"type": "integer", "minimum": 0}, "required": True, "description": "packets that count for nothing",
+        "schema": {"type": "integer", "minimum": 0},
+        "required": True,
+        "description": "packets that count for nothing",
     },
     REMOVED_HEADER: {
-        "schema": {"type": "integer", "minimum": 0, "maximum": 1}, "required": True,
+        "schema": {"type": "integer", "minimum": 0, "maximum": 1},
+        "required": True,
         "description": "whether an administrator removed the session",
     },
-}  # fmt: skip
+}
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
 

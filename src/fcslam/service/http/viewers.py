@@ -266,9 +266,10 @@ def map_router(state: ViewerState) -> APIRouter:
         "/trajectories/{session}.tum", response_class=Response, responses={**refusals(400, 404), 200: content(TEXT)}
     )
     def get_trajectory(
-        session: Name, after: Annotated[int, Query(ge=0, le=MOST)] = 0,
+        session: Name,
+        after: Annotated[int, Query(ge=0, le=MOST)] = 0,
         digest: Annotated[str, Query(pattern="^[0-9a-f]{64}$|^$")] = "",
-    ) -> Response:  # fmt: skip
+    ) -> Response:
         """Poses of a session's keyscans in its map.
 
         A client that has the first ``after`` bytes sends the digest that came with them. It gets only the rest if those

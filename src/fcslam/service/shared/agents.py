@@ -67,8 +67,9 @@ class SharedAgents(Agents):
             "INSERT INTO agents VALUES (?, ?, clock_timestamp()) ON CONFLICT (robot) DO UPDATE"
             " SET agent = excluded.agent, heard = clock_timestamp() WHERE agents.agent = excluded.agent"
             f" OR agents.heard < clock_timestamp() - interval '{LEASE_S} seconds' RETURNING 1",
-            (robot, agent), schema_of(self._mission),
-        )  # fmt: skip
+            (robot, agent),
+            schema_of(self._mission),
+        )
         if not taken:
             raise held_by_another(robot, LEASE_S)
         with self._lock:
@@ -81,7 +82,8 @@ class SharedAgents(Agents):
         rows = self._server.rows(
             "SELECT CAST(extract(epoch FROM clock_timestamp() - heard) AS DOUBLE PRECISION) FROM agents"
             " WHERE robot = ?",
-            (robot,), schema_of(self._mission),
-        )  # fmt: skip
+            (robot,),
+            schema_of(self._mission),
+        )
         known = [silent for silent in (here, *(float(silent) for (silent,) in rows)) if silent is not None]
         return min(known, default=None)

@@ -50,9 +50,16 @@ class Instance:
     """Holds leases and the workers that belong to them, on a thread of its own."""
 
     def __init__(
-        self, registry: Registry, name: str, most_missions: int, launch: Launch, listen: Listen,
-        on_taken: Callable[[], None], follow: Callable[[], None], clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self,
+        registry: Registry,
+        name: str,
+        most_missions: int,
+        launch: Launch,
+        listen: Listen,
+        on_taken: Callable[[], None],
+        follow: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Take the name.
 
         Args:

@@ -55,9 +55,15 @@ class SharedMission(OpenMission):
     """A mission whose worker may be on any instance."""
 
     def __init__(
-        self, number: int, folder: MissionFolder, server: Postgres, store: MissionStore, intake: Intake,
-        instance: Instance, wall_clock: Callable[[], float],
-    ) -> None:  # fmt: skip
+        self,
+        number: int,
+        folder: MissionFolder,
+        server: Postgres,
+        store: MissionStore,
+        intake: Intake,
+        instance: Instance,
+        wall_clock: Callable[[], float],
+    ) -> None:
         self._number, self._server, self._instance = number, server, instance
         self._fetching = threading.Lock()
         self._joint_at_s = -math.inf
@@ -128,10 +134,19 @@ class SharedMissions:
     """All missions of a store; ``Missions`` of files has the same methods."""
 
     def __init__(
-        self, root: Path, config: CloudConfig, server: Postgres, instance: str, process: str, admission: Admission,
-        clock: Callable[[], float], wall_clock: Callable[[], float], launch: Launch, listen: Listen,
+        self,
+        root: Path,
+        config: CloudConfig,
+        server: Postgres,
+        instance: str,
+        process: str,
+        admission: Admission,
+        clock: Callable[[], float],
+        wall_clock: Callable[[], float],
+        launch: Launch,
+        listen: Listen,
         on_taken: Callable[[], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take the instance's name, and create the first mission if there is none.
 
         Args:

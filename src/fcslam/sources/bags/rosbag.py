@@ -65,9 +65,13 @@ class RosBag:
     """A bag of one robot."""
 
     def __init__(
-        self, path: Path, name: str, options: BagOptions | None = None, notes: tuple[str, ...] = (),
+        self,
+        path: Path,
+        name: str,
+        options: BagOptions | None = None,
+        notes: tuple[str, ...] = (),
         robot: BagRobot | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``notes`` say what was chosen for this bag before; ``robot`` is one of several in it."""
         self.name = name
         self._notes = notes

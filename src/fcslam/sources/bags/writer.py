@@ -52,8 +52,11 @@ _IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
     "/ground_truth",
 )
 _TOPICS_OF_SOME = {
-    _IMAGE_TOPIC: COMPRESSED_IMAGE, _CAMERA_INFO_TOPIC: CAMERA_INFO, _GROUND_TRUTH_TOPIC: ODOMETRY, _FIX_TOPIC: FIX,
-}  # fmt: skip
+    _IMAGE_TOPIC: COMPRESSED_IMAGE,
+    _CAMERA_INFO_TOPIC: CAMERA_INFO,
+    _GROUND_TRUTH_TOPIC: ODOMETRY,
+    _FIX_TOPIC: FIX,
+}
 """Topics that are created only if there is a message."""
 _IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31

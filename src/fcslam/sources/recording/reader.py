@@ -82,9 +82,12 @@ class Recording:
             if frame.is_scan:
                 track.add(frame.stamp, frame.T_odom_base)
         return replace(
-            whole, scan_count=track.count, duration_s=track.duration_s, path_length_m=track.length_m,
+            whole,
+            scan_count=track.count,
+            duration_s=track.duration_s,
+            path_length_m=track.length_m,
             faults=audit.faults(),
-        )  # fmt: skip
+        )
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""

@@ -89,6 +89,10 @@ def _drive(
             offsets.append(image.T_keyscan_image)
     moved = np.array(offsets).reshape(-1, 3)
     return MappedDrive(
-        front.robot, tuple(keyframes), fleet.stamps[scans], se2.compose(own.T_local_base[scans], moved),
-        se2.compose(fleet.T_map_base[scans], moved), fleet.map_index,
-    )  # fmt: skip
+        front.robot,
+        tuple(keyframes),
+        fleet.stamps[scans],
+        se2.compose(own.T_local_base[scans], moved),
+        se2.compose(fleet.T_map_base[scans], moved),
+        fleet.map_index,
+    )

@@ -110,7 +110,9 @@ def _judge(run: Run, known: KnownPoses) -> _Judged:
     # The truth is known at the stamps of the closures, so the run's trajectory does not bridge any gap.
     reference = PoseReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
     return _Judged(
-        truth, pairs, closure_errors(pairs, T_i_j, truth, reference),
+        truth,
+        pairs,
+        closure_errors(pairs, T_i_j, truth, reference),
         np.array([closure.similarity for closure in run.closures]),
         {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in PLACE_CHANNELS},
-    )  # fmt: skip
+    )

@@ -179,9 +179,13 @@ def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows) -
     single = RelationReference(poses, BRIDGE_S, ends[usable], graph.relations.T_1_2[usable])
     by_graph = closure_errors(pairs, T_i_j, poses, placed)
     return _Evidence(
-        poses, pairs, by_graph, closure_errors(pairs, T_i_j, poses, single),
-        _chains(graph, node_rows, by_graph), ends[usable & _is_revisit(ends, graph.relations.stamps, poses)],
-    )  # fmt: skip
+        poses,
+        pairs,
+        by_graph,
+        closure_errors(pairs, T_i_j, poses, single),
+        _chains(graph, node_rows, by_graph),
+        ends[usable & _is_revisit(ends, graph.relations.stamps, poses)],
+    )
 
 
 def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable) -> PoseReference:

@@ -73,7 +73,12 @@ def build_relation_graph(relations: Relations) -> RelationGraph:
     residual = se2.between(useful.T_1_2, se2.between(solution.poses[first], solution.poses[second]))
     residual[components[first] != components[second]] = np.nan
     return RelationGraph(
-        frozen(stamps), solution.poses, frozen(components, np.int64), useful, frozen(ends, np.int64),
-        frozen(holds, np.bool_), frozen(np.hypot(residual[:, 0], residual[:, 1])),
+        frozen(stamps),
+        solution.poses,
+        frozen(components, np.int64),
+        useful,
+        frozen(ends, np.int64),
+        frozen(holds, np.bool_),
+        frozen(np.hypot(residual[:, 0], residual[:, 1])),
         frozen(np.degrees(np.abs(residual[:, 2]))),
-    )  # fmt: skip
+    )

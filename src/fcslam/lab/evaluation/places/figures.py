@@ -10,9 +10,27 @@ from fcslam.errors import OutputError
 from fcslam.lab.evaluation.places.report import SetResult
 
 COLOURS: Final = (
-    "#000000", "#7f7f7f", "#d95f02", "#7570b3", "#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#1f77b4", "#d62728",
-    "#17becf", "#e6ab02", "#8c564b", "#9edae5", "#ff9896", "#98df8a", "#c5b0d5", "#c49c94", "#f7b6d2", "#dbdb8d",
-)  # fmt: skip
+    "#000000",
+    "#7f7f7f",
+    "#d95f02",
+    "#7570b3",
+    "#1b9e77",
+    "#e7298a",
+    "#66a61e",
+    "#a6761d",
+    "#1f77b4",
+    "#d62728",
+    "#17becf",
+    "#e6ab02",
+    "#8c564b",
+    "#9edae5",
+    "#ff9896",
+    "#98df8a",
+    "#c5b0d5",
+    "#c49c94",
+    "#f7b6d2",
+    "#dbdb8d",
+)
 
 
 def curves_figure(results: Sequence[SetResult]) -> Any:

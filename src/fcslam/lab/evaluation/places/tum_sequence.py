@@ -90,8 +90,14 @@ def _read_depth(path: Path) -> FloatArray:
 
 
 def _calibration(folder: Path) -> FloatArray:
-    path = next((place / "calibration.txt" for place in (folder, folder.resolve().parent)
-                 if (place / "calibration.txt").is_file()), folder / "calibration.txt")  # fmt: skip
+    path = next(
+        (
+            place / "calibration.txt"
+            for place in (folder, folder.resolve().parent)
+            if (place / "calibration.txt").is_file()
+        ),
+        folder / "calibration.txt",
+    )
     name = folder.resolve().name.removeprefix("rgbd_dataset_")
     for line in _lines(path):
         camera, *numbers = line.split()
