@@ -91,7 +91,7 @@ def keep_memory_trimmed() -> None:
 
     glibc by default keeps a heap for each of many threads, and puts ever longer arrays into them. So a process that
     runs for days grows by the gaps, although what it uses does not. Other allocators stay as they are. Where long
-    arrays come and go all the time, this costs a third of the CPU: call ``trim_memory`` now and then there.
+    arrays come and go all the time, this costs much CPU: call ``trim_memory`` now and then there.
     """
     for option, value in _ALLOCATOR.items():
         _glibc("mallopt", option, value)
