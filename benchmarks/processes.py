@@ -76,13 +76,12 @@ class Process:
 
 
 @contextmanager
-def cloud(place: Path, *options: object) -> Iterator[tuple[Process, int]]:
-    """A server on a port of its own, with further options of `fcslam serve`."""
+def cloud(place: Path) -> Iterator[tuple[Process, int]]:
+    """A server on a port of its own."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = ("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port, *options)
-    server = Process(command, place / "server.log")
+    server = Process(("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port), place / "server.log")
     wait_for(port, server)
     try:
         yield server, port

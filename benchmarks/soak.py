@@ -1,7 +1,6 @@
 """Twelve hours of a service and five robots in fast motion: memory, files and database, hour by hour.
 
     python benchmarks/soak.py [--hours 12] [--robots 5] [--rate 5] [--minutes 60] [--patrol 15]
-        [--submaps N]
 
 Simulated robots (LiDAR, 180 beams) map one building with `fcslam serve`, each in a process of its own, up to 60 times
 as fast as in reality. In the first hour, each drives 40 m and four patrols: 5 m back and forth. In every further hour
@@ -15,9 +14,6 @@ of their own. A mission keeps all packets; the table shows what the database hol
 write-ahead log. The report is written anew after each hour.
 
 With `--patrol 0`, the robots stand from the second hour on: then nothing at all may grow, as no map does.
-
-The worker caches submaps of places, up to `fleet.submaps_kept` (1000 by default, which these hours do not reach). With
-`--submaps 100`, that cache is full after the first hour, and what grows from then on is all else.
 
 Passed: from the first hour to the last, no process grows by more than 5 %, none has more open files by more than
 three, and the database holds at most 500 bytes more for each further packet beside the packet itself.
@@ -103,15 +99,12 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=5.0, help="of the LiDARs, Hz")
     parser.add_argument("--minutes", type=int, default=60, help="of an hour, for a short try")
     parser.add_argument("--patrol", type=float, default=15.0, help="seconds that a robot drives there, and back")
-    parser.add_argument("--submaps", type=int, help="largest number of submaps in the cache of the worker")
     chosen = parser.parse_args()
     spawning = multiprocessing.get_context("spawn")
     began, rows, processes = time.perf_counter(), [], []
     minutes = spawning.Array("i", chosen.robots)
     hour = spawning.Barrier(chosen.robots + 1)
-    options = () if chosen.submaps is None else ("--config", f"fleet.submaps_kept={chosen.submaps}")
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        server, port = stack.enter_context(cloud(Path(folder), *options))
+    with tempfile.TemporaryDirectory() as folder, cloud(Path(folder)) as (server, port), ExitStack() as stack:
         links = [Link(port) for _ in range(chosen.robots)]
         robots = [
             spawning.Process(target=run_robot, args=(number, drive, chosen, link.port, folder, minutes, hour))
@@ -262,8 +255,7 @@ def stored(folder: Path) -> tuple[int, float, float, float]:
 
 def write(chosen: Any, rows: Sequence[tuple], processes: Sequence[Mapping[str, tuple[float, int]]]) -> bool:
     """The report of the hours so far, and whether they passed."""
-    name = "soak" if chosen.submaps is None else "soak_submaps"
-    report = common.Report(name if chosen.patrol else "soak_standing", __doc__, chosen)
+    report = common.Report("soak" if chosen.patrol else "soak_standing", __doc__, chosen)
     report.say(
         f"{len(rows)} of {chosen.hours} hours of {chosen.minutes} min, {chosen.robots} robots, "
         f"{chosen.rate:g} scans a second, patrols of {chosen.patrol:g} s."
