@@ -107,7 +107,7 @@ def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> Rays:
         return _rays(laser)
     origins, directions, _ = _rays(laser)
     first_s, last_s, velocity, acceleration = sweep
-    return Rays(*_swept(origins, directions, first_s, last_s, np.array(velocity), np.array(acceleration)))
+    return Rays(*_swept(origins, directions, first_s, last_s, velocity, acceleration))
 
 
 def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
