@@ -32,6 +32,7 @@ from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 RADIUS_M = 0.25
+FRESH_S = 5.0
 
 
 def main() -> None:
@@ -95,6 +96,10 @@ def main() -> None:
             for k, robot in enumerate(robots)
         ],
     )  # fmt: skip
+    everywhere = np.concatenate(ages)
+    report.say(
+        f"On all robots, {np.mean(everywhere <= FRESH_S):.1%} of {len(everywhere):,} cells come within {FRESH_S:g} s."
+    )
     report.say(f"{duration_s:.0f} s of driving; ghosts: {_ghosts(run, final)} occupied cells where a robot drove.")
     report.say(f"Events on the first robot: {'; '.join(news[0])}.")
     report.write()
