@@ -67,7 +67,8 @@ class RecurringTask:
 
     def begin(self, task: Callable[[], None]) -> None:
         """Begin a run."""
-        self._running, self._began_s = self._start(task), self._clock()
+        self._began_s = self._clock()
+        self._running = self._start(task)
 
     def end(self) -> int | None:
         """The exit code of a run that has ended since the last call; None: none has."""

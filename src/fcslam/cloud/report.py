@@ -56,6 +56,7 @@ def run_of(
     metrics: Sequence[Metric],
     config_yaml: str,
     grid: OccupancyConfig,
+    *,
     with_local_maps: bool = True,
     with_certificates: bool = True,
 ) -> Run:

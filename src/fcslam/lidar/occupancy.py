@@ -61,8 +61,8 @@ class OccupancyConfig(Settings):
         default=0.35,
         ge=0,
         le=5,
-        description="radius of a robot of the fleet: points on it, where other robots look through, are neither drawn "
-        "nor matched [m]; 0: all are",
+        description="radius of a robot of the fleet: points on it, where other robots look through, are not "
+        "drawn, and a live robot does not match its scans by them [m]; 0: all count",
     )
     maximum_cells: int = Field(
         default=64_000_000,

@@ -168,9 +168,11 @@ class FleetView:
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
         if self._clock() - self._frontiers_s >= FRONTIERS_S:
-            self.frontiers, self._frontiers_s = client.frontiers(self._robot), self._clock()
+            self._frontiers_s = self._clock()
+            self.frontiers = client.frontiers(self._robot)
         if self._clock() - self._quality_s >= (QUALITY_S if self.quality else FRONTIERS_S):
-            self.quality, self._quality_s = client.quality(self._robot), self._clock()
+            self._quality_s = self._clock()
+            self.quality = client.quality(self._robot)
 
     def _run(self) -> None:
         wait_s = 0.0

@@ -39,8 +39,16 @@ class _DrawnKeyscan(NamedTuple):
     sweep: Sweep | None
 
 
+_ScanKey = tuple[float, tuple[float, float, float], int]
+
+
+def _key(stamp: float, laser: LaserModel) -> _ScanKey:
+    """What distinguishes the scans of one robot: several lasers may scan at once."""
+    return stamp, laser.T_base_laser, laser.beam_count
+
+
 class JointMap:
-    """What a robot makes of the joint map of its fleet. Any thread may call."""
+    """What a robot makes of the joint map of its fleet. ``draw`` may be called from any thread, the others from one."""
 
     def __init__(self, robot: str, fleet: FleetView, config: OccupancyConfig) -> None:
         self._robot, self._fleet, self._config = robot, fleet, config
@@ -48,10 +56,10 @@ class JointMap:
         """Keyscans that the joint map of the cloud may not show yet."""
         self._lasers: tuple[LaserModel, ...] = ()
         """As the robot announced them last."""
-        self._T_odom_base: FloatArray | None = None
-        """Pose of the newest scan by odometry without its jumps, or by the prediction in its place."""
-        self._met: dict[float, NDArray[np.bool_]] = {}
-        """Beams of the newest scans that hit other robots, by the stamp of the scan."""
+        self._newest: tuple[int, FloatArray] | None = None
+        """Part of the newest scan, and its pose by odometry without its jumps, or by the prediction in its place."""
+        self._met: dict[_ScanKey, NDArray[np.bool_]] = {}
+        """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
 
     def add(self, packets: Iterable[Packet], tracks: Sequence[ScanTrack]) -> None:
@@ -63,7 +71,7 @@ class JointMap:
                 keyscan = packet.body
                 T_odom_base = tracks[packet.epoch].in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
                 laser = keyscan.laser_model(self._lasers)
-                on_teammates = self._met.pop(keyscan.stamp, np.zeros(1, np.bool_))
+                on_teammates = self._met.pop(_key(keyscan.stamp, laser), np.zeros(1, np.bool_))
                 ranges_m = np.where(on_teammates, np.float32(0.0), keyscan.ranges_m)
                 with self._lock:
                     self._drawn.append(
@@ -88,22 +96,28 @@ class JointMap:
             ]
         return padded(draw_over(joint, lately, self._config))
 
-    def mark_teammates(self, scan: LaserScan, newest: RobotPose | None) -> LaserScan:
-        """The next scan with the beams marked that hit other robots; ``newest`` is the pose of the one before."""
+    def mark_teammates(self, scan: LaserScan, part: int, newest: RobotPose | None) -> LaserScan:
+        """The next scan with the beams marked that hit other robots.
+
+        Args:
+            scan: the scan.
+            part: the part that it is of; ``odom`` is another frame in each.
+            newest: the pose of the scan before; None before the first one.
+        """
         joint, radius_m = self._fleet.joint_map, self._config.robot_radius_m
-        T_odom_before, self._T_odom_base = self._T_odom_base, scan.T_odom_base
-        if joint is None or newest is None or T_odom_before is None or radius_m <= 0.0:
+        before, self._newest = self._newest, (part, scan.T_odom_base)
+        if joint is None or newest is None or before is None or before[0] != part or radius_m <= 0.0:
             return scan
         known = self._fleet.robots()
         own = next((mate.map_index for mate in known if mate.robot == self._robot), None)
         if own is None or own != newest.map_index:  # the joint map is that of ``own``
             return scan
-        T_map_base = se2.compose(newest.T_map_base, se2.between(T_odom_before, scan.T_odom_base))
+        T_map_base = se2.compose(newest.T_map_base, se2.between(before[1], scan.T_odom_base))
         others = [mate for mate in known if mate.map_index == own and mate.robot != self._robot]
         on_teammates = beams_on_teammates(scan, T_map_base, others, joint, radius_m)
         if on_teammates is None:
             return scan
-        self._met[scan.stamp] = on_teammates
+        self._met[_key(scan.stamp, scan.laser)] = on_teammates
         while len(self._met) > MOST_MET:
             del self._met[next(iter(self._met))]
         return replace(scan, on_teammates=on_teammates)

@@ -481,7 +481,7 @@ class Robot(LiveTracker):
         return super()._processed(record)
 
     def _mark_teammates(self, scan: LaserScan) -> LaserScan:
-        return scan if self._joint is None else self._joint.mark_teammates(scan, self._pose)
+        return scan if self._joint is None else self._joint.mark_teammates(scan, self._part, self._pose)
 
     def _take(self, packets: list[Packet]) -> None:
         """Pass the next packets on."""

@@ -30,7 +30,8 @@ def beams_on_teammates(
     """Which beams hit another robot, shape (beam_count,); None if none does.
 
     A pose alone takes no point away, as it may be false. A point counts only if the joint map says that the floor is
-    free there, and no wall is near it: so nobody hides a wall, known or not.
+    free there, and no wall is near it. So nobody hides a wall of the map. What is new on that floor, such as a closed
+    door, does not count while a robot says that it is there.
 
     Args:
         scan: the scan.

@@ -244,7 +244,9 @@ class MissionCloud:
         result = self.fleet.estimate()
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = traffic_metrics(self._traffic.ledger(), tracks)
-        return run_of(result, tracks, metrics, dump(self.config), self.config.map, False, False)
+        return run_of(
+            result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False, with_certificates=False
+        )
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float, anchors: Anchors = NOTHING_KNOWN) -> Run:
         """The result of all packets so far.

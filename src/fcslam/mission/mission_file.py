@@ -144,10 +144,12 @@ def opened_copy(path: Path | None) -> Iterator[MissionStore]:
     with TemporaryDirectory() as place:  # opening the file for reading would leave files beside it
         copy = Path(place) / MISSION
         if path is not None:
-            with translate_errors(path), open_file(path, most=MOST_BYTES) as file:
-                check_mission(path)
-                with copy.open("wb") as copied:
-                    shutil.copyfileobj(file, copied, _COPIED_BYTES)
+            with translate_errors(path), open_file(path, most=MOST_BYTES) as file, copy.open("wb") as copied:
+                shutil.copyfileobj(file, copied, _COPIED_BYTES)
+            try:
+                check_mission(copy)  # what is read later, whatever becomes of the file
+            except StoreError as error:
+                raise StoreError(str(error).replace(str(copy), str(path))) from error
         with closing(MissionStore(copy, is_checked=path is not None)) as store:
             yield store
 

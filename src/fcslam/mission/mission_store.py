@@ -146,7 +146,7 @@ class MissionStore:
     def __init__(self, place: Path | RowStore, *, is_checked: bool = False) -> None:
         """Open a mission: that of a file, which is created if there is none, or that of a server.
 
-        ``is_checked``: the file is a copy of one that ``check_mission`` passed just now.
+        ``is_checked``: ``check_mission`` passed the file just now.
 
         Raises:
             StoreError: the file is not a mission of this version, or cannot be used.

@@ -42,7 +42,8 @@ class LiveMap:
         if now < self._look_at:
             return
         self._look_at = now + LIVE_LOOK_S
-        self._task.end()
+        if self._task.end():
+            _log.warning("the live map stays as it was: its writer failed")
         if self._task.is_due:
             self._task.begin(lambda: self._write(cloud))
 

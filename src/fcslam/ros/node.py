@@ -245,7 +245,8 @@ class RobotNode:
     def _publish_fleet(self) -> None:
         """Publish where the robots of the fleet are, at a fixed rate; frontiers, changes of the robot's map and how
         good it is once."""
-        news, frontiers, quality = 0, None, None
+        news, frontiers = 0, None
+        quality: tuple[object, ...] = ()
         while not self._stop.wait(_FLEET_PERIOD_S):
             fleet = self._robot.fleet
             if fleet is None:
@@ -255,7 +256,7 @@ class RobotNode:
             if fleet.frontiers is not frontiers:
                 frontiers = fleet.frontiers
                 self._publish_frontiers(now_ns, fleet)
-            if fleet.quality and fleet.quality != quality:
+            if fleet.quality != quality:
                 quality = fleet.quality
                 self._outputs.quality(now_ns, self._robot.name, quality)
             for line in fleet.news[news:]:

@@ -214,8 +214,8 @@ class Outputs:
         with self._lock:
             shown = self._grid_topic(topic)
             goes_whole = grid.values.size <= SMALL_MAP_CELLS and not only_changes
-            last = shown.whole if goes_whole else shown.newest
-            if last is not None and _is_same(last, grid):
+            known = (shown.whole, shown.newest) if goes_whole else (shown.newest,)
+            if all(last is not None and _is_same(last, grid) for last in known):
                 return False
             before, shown.newest = (shown.whole, shown.newest), grid
             of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)

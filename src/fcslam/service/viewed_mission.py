@@ -50,8 +50,9 @@ class ViewedMission(Protocol):
 
 _MOST_KEPT: Final = 4
 """Missions whose runs are kept in memory."""
-_lock = threading.Lock()
-"""Many robots and pages ask at once: one request reads the run, the others wait for it."""
+_keeping = threading.Lock()
+_reading: dict[Path, threading.Lock] = {}
+"""Many robots and pages ask at once: one request reads the run of a mission, the others wait for it."""
 _kept: dict[Path, tuple[object, Run]] = {}
 """The newest run of each mission, by the folder of its run folders. The one that was asked for last is the last."""
 
@@ -62,12 +63,17 @@ def viewed_run(folder: Path) -> Run:
     Raises:
         EvaluationError: it is broken, or not there any more.
     """
-    with _lock:
+    mission = folder.parent
+    with _keeping:
+        reading = _reading.setdefault(mission, threading.Lock())
+    with reading:
         key = folder, identity(folder) if folder.exists() else None
-        known, run = _kept.pop(folder.parent, (None, None))
+        with _keeping:
+            known, run = _kept.pop(mission, (None, None))
         if run is None or known != key:
             run = open_run(folder, maps=False)
-        _kept[folder.parent] = key, run
-        if len(_kept) > _MOST_KEPT:
-            del _kept[next(iter(_kept))]
+        with _keeping:
+            _kept[mission] = key, run
+            if len(_kept) > _MOST_KEPT:
+                del _kept[next(iter(_kept))]
         return run

@@ -125,7 +125,7 @@ def warm_up_fleet() -> None:
         cloud.receive(data)
     result = cloud.finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-    run_of(result, tracks, (), "", OccupancyConfig(), False, False)
+    run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False, with_certificates=False)
 
 
 WARM_UPS: Final = (

@@ -465,7 +465,15 @@ class Worker:
         words = [Metric(name, count, "1") for name, count in counts.items()]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
-        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps, with_certificates)
+        return run_of(
+            result,
+            tracks,
+            metrics,
+            dump(self._config),
+            self._config.map,
+            with_local_maps=with_local_maps,
+            with_certificates=with_certificates,
+        )
 
 
 @dataclass

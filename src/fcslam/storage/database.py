@@ -61,7 +61,7 @@ class Database:
             version: version of the schema.
             exclusive: no other process may open the file. A loss of power may then take the last transactions, but a
                 transaction costs no wait for the disk.
-            is_checked: the file is a copy of one that ``check_file`` passed just now.
+            is_checked: ``check_file`` passed the file just now.
 
         Raises:
             StoreError: the file is damaged, was made by something else, or cannot be used.

@@ -2,6 +2,7 @@
 
 import json
 from typing import NamedTuple
+from urllib.parse import quote
 
 from fcslam.errors import CloudError
 from fcslam.wire.http_transport import HttpClient
@@ -96,7 +97,7 @@ class FleetClient(HttpClient):
 
     def frontiers(self, robot: str) -> tuple[FrontierReply, ...]:
         """The frontiers of the map that a robot is in, that with the largest gain first."""
-        response = self._ask("GET", f"frontiers?robot={robot}", accept="application/json")
+        response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}", accept="application/json")
         self._require(response, 200)
         self.received_bytes += len(response.content)
         try:
@@ -116,7 +117,9 @@ class FleetClient(HttpClient):
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
-        response = self._ask("GET", f"quality?robot={robot}", accept="application/json")
+        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", accept="application/json")
+        if response.status_code == 404:  # a cloud of an older version
+            return ()
         self._require(response, 200)
         self.received_bytes += len(response.content)
         try:

@@ -13,6 +13,7 @@ from fastapi.responses import Response
 from pydantic import BeforeValidator, Field
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.config import Settings
 from fcslam.lidar.occupancy import FARTHEST_M
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
@@ -27,6 +28,7 @@ from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
 from fcslam.service.map_layers import MOST_LAYER_BYTES
 from fcslam.service.summaries import run_of
+from fcslam.service.viewed_mission import viewed_run
 from fcslam.untrusted import read_text
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
@@ -183,11 +185,19 @@ def joint_map_router(state: ServiceState) -> APIRouter:
     @router.get("/quality", dependencies=as_reader)
     def get_quality(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapQuality]:
         """How good each map is, about half a minute old; with ``robot``, only the map that this robot is in."""
-        maps, folder = joint.follow(state.mission.joint_maps), state.mission.run_folder
-        of_robot = {one.map for one in maps.sessions if robot in (None, one.robot)}
-        return [] if folder is None else [one for one in _qualities(folder) if one.map in of_robot]
+        folder = state.mission.run_folder
+        return [] if folder is None else [one for one in _qualities(folder) if one.map in _maps_of(folder, robot)]
 
     return router
+
+
+def _maps_of(folder: Path, robot: str | None) -> set[int]:
+    """Numbers of the maps of the run in a folder: of all, or of the newest session of a robot."""
+    sessions = viewed_run(folder).trajectories.values()
+    if robot is None:
+        return {session.map_index for session in sessions}
+    own = {epoch: one.map_index for one in sessions for name, epoch in [robot_and_epoch(one.robot)] if name == robot}
+    return {own[max(own)]} if own else set()
 
 
 def _qualities(folder: Path) -> tuple[MapQuality, ...]:
