@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from fcslam.live.fleet_view import Teammate
 from fcslam.live.joint_map import JointMap
 from fcslam.live.records import Wiring
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
-from fcslam.records import Correction, LaserModel, LaserScan, frozen
+from fcslam.records import Correction, Keyscan, KeyscanId, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.track import ScanTrack
 from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.wire.messages import Keyscan
+from fcslam.wire.messages import Hello, Packet
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 
@@ -168,3 +170,40 @@ def test_the_points_stay_in_the_scan_that_is_sent():
     (keyscan,) = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
     assert np.allclose(keyscan.ranges_m[hit], scan.ranges_m[hit], atol=1e-3)
     assert len(frontend.newest.tracked.scan) == np.count_nonzero(~hit)
+
+
+def place(T_map_base):
+    """Where the robot is in map 0, as far as the joint map asks."""
+    return SimpleNamespace(T_map_base=np.asarray(T_map_base), map_index=0)
+
+
+def test_beams_are_those_of_the_laser_that_hit_the_teammate(joint):
+    """Two lasers scan at once; the keyscan of one loses nothing by what the other saw."""
+    scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
+    other = LaserModel(180, -math.pi, math.radians(2.0), 8.0)
+    fleet = Fleet(joint)
+    fleet.mates = [mate(*HERE[:2], name="a"), mate(0.8, 0.2)]
+    shown = JointMap("a", fleet, OccupancyConfig())
+    shown.mark_teammates(scan, 0, None)
+    assert np.array_equal(shown.mark_teammates(scan, 0, place(HERE)).on_teammates, hit)
+    track = ScanTrack()
+    track.extend(np.zeros(3))
+    keyscans = [
+        Keyscan(KeyscanId("a", 0), 0.0, frozen(np.full(180, 2.0), np.float32), laser=1),
+        Keyscan(KeyscanId("a", 0), 0.0, scan.ranges_m, laser=0),
+    ]
+    packets = [Packet("a", 0, k, 0.0, body) for k, body in enumerate([Hello("a", 0, (LASER, other), {}), *keyscans])]
+    shown.add(packets, [track])
+    seen, marked = (one.ranges_m for one in shown._drawn)
+    assert (seen == 2.0).all()
+    assert np.array_equal(marked == 0.0, hit | (scan.ranges_m == 0.0))
+
+
+def test_the_first_scan_of_a_session_is_not_placed_by_the_odometry_of_the_one_before(joint):
+    scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
+    fleet = Fleet(joint)
+    fleet.mates = [mate(*HERE[:2], name="a"), mate(0.8, 0.2)]
+    shown = JointMap("a", fleet, OccupancyConfig())
+    shown.mark_teammates(replace(scan, T_odom_base=frozen([5.0, 5.0, 1.0])), 0, place(HERE))
+    assert shown.mark_teammates(scan, 1, place(HERE)).on_teammates is None
+    assert np.array_equal(shown.mark_teammates(scan, 1, place(HERE)).on_teammates, hit)

@@ -12,6 +12,7 @@ from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.anchored import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
+from fcslam.lidar import matching
 from fcslam.lidar.field import CELL_M
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.scan import PointScan, keyscan_points
@@ -123,7 +124,7 @@ def _priors(
         found = match_scan(scan, plan.submap.field, poses[variable], np.zeros((3, 3)), wide_scale_m=wide_scale_m)
         if found.explained < LEAST_EXPLAINED:
             continue
-        information = found.information * (0.03 / POINT_SIGMA_M) ** 2 + 1e-2 * np.eye(3)
+        information = found.information * (matching.POINT_SIGMA_M / POINT_SIGMA_M) ** 2 + 1e-2 * np.eye(3)
         covariance = np.linalg.inv(information) + np.diag((WEAK_M**2, WEAK_M**2, WEAK_RAD**2))
         information = np.linalg.inv(covariance)
         priors.append(PosePrior(variable, found.T_field_base, 0.5 * (information + information.T)))
