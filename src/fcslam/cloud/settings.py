@@ -32,7 +32,7 @@ class FleetConfig(Settings):
         description="number of new closures after which the joint graph is solved; 5 % of all closures if that is more",
     )
     submaps_kept: int = Field(
-        default=200,
+        default=100,
         gt=1,
         description="number of submaps in the cache, 0.2 MB each for the 100 used last and 0.08 MB for others; those "
         "beyond it are rebuilt from their keyscans",
