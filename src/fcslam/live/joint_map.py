@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
-from fcslam.live.fleet_view import FleetView
+from fcslam.live.fleet_view import FleetView, Teammate
 from fcslam.live.records import RobotPose
 from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
-from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, Ranges, Sweep
+from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, Ranges, Sweep, frozen
 from fcslam.robot.localization import Localizer
 from fcslam.robot.track import ScanTrack
 from fcslam.runs.map_files import OccupancyMap
@@ -38,6 +38,15 @@ class _DrawnKeyscan(NamedTuple):
     T_odom_base: FloatArray
     sweep: Sweep | None
 
+
+_MADE_UP = (
+    LaserScan(0.0, frozen(np.ones(4), np.float32), LaserModel(4, -np.pi, 0.5 * np.pi, 2.0), frozen(np.zeros(3))),
+    np.zeros(3),
+    (Teammate("", 0, "", np.zeros(3), 0.0),),
+    OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0)),
+    0.5,
+)
+"""A scan beside a robot, as ``beams_on_teammates`` takes it."""
 
 _ScanKey = tuple[float, tuple[float, float, float], int]
 
@@ -61,6 +70,7 @@ class JointMap:
         self._met: dict[_ScanKey, NDArray[np.bool_]] = {}
         """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
+        beams_on_teammates(*_MADE_UP)  # no scan waits for the compiler
 
     def add(self, packets: Iterable[Packet], tracks: Sequence[ScanTrack]) -> None:
         """Keep the next keyscans until the cloud has drawn them; ``tracks`` are the robot's, by part."""

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
+from fcslam.compiled import njit
 from fcslam.lidar.scan import rays_of
 from fcslam.live.fleet_view import Teammate
 from fcslam.records import FloatArray, LaserScan
@@ -22,6 +22,8 @@ SPEED_MPS: Final = 0.5
 """By how much the place of a robot grows with the age of its pose."""
 WALL_CELLS: Final = 2
 """A point so few cells from an occupied cell is of that wall."""
+FREE: Final = int(Occupancy.FREE)
+OCCUPIED: Final = int(Occupancy.OCCUPIED)
 
 
 def beams_on_teammates(
@@ -41,33 +43,56 @@ def beams_on_teammates(
         radius_m: of a robot.
     """
     reach_m = scan.laser.max_range_m
-    places = [
-        (mate.T_map_base[:2], limit_m)
+    near = [
+        (*mate.T_map_base[:2].tolist(), limit_m)
         for mate in mates
         if mate.age_s <= OLDEST_S
         and np.hypot(*(mate.T_map_base - T_map_base)[:2]) <= reach_m + (limit_m := radius_m + SPEED_MPS * mate.age_s)
     ]
-    if not places:
+    if not near:
         return None
-    is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < reach_m)
     rays = rays_of(scan.laser, scan.sweep)
-    returns = rays.origins[is_return] + scan.ranges_m[is_return, None] * rays.directions[is_return]
-    points = se2.transform(T_map_base, returns)
-    apart = np.array([np.hypot(*(points - place).T) <= limit_m for place, limit_m in places])
-    near = apart.any(axis=0)
-    found = np.zeros(scan.laser.beam_count, np.bool_)
-    found[np.flatnonzero(is_return)[near]] = _is_floor(points[near], joint)
+    found: NDArray[np.bool_] = _on_discs(
+        scan.ranges_m,
+        rays.origins,
+        rays.directions,
+        reach_m,
+        np.array(T_map_base),  # a writable copy: code is compiled once
+        np.array(near),
+        joint.cells,
+        np.array(joint.origin_xy),
+        joint.resolution_m,
+    )
     return found if found.any() else None
 
 
-def _is_floor(points: FloatArray, joint: OccupancyMap) -> NDArray[np.bool_]:
-    """Whether points (N, 2) lie in free cells without a wall beside them."""
-    size = np.array(joint.cells.shape[::-1])
-    cells = np.floor((points - joint.origin_xy) / joint.resolution_m).astype(np.int64)
-    inside = np.logical_and(cells >= 0, cells < size).all(axis=1)
-    reach = np.arange(-WALL_CELLS, WALL_CELLS + 1)
-    columns, rows = np.clip(cells.T[..., None] + reach, 0, size[:, None, None] - 1)  # (N, reach) each
-    around = joint.cells[rows[:, :, None], columns[:, None, :]]
-    is_free = around[:, WALL_CELLS, WALL_CELLS] == Occupancy.FREE
-    found: NDArray[np.bool_] = inside & is_free & ~(around == Occupancy.OCCUPIED).any(axis=(1, 2))
+@njit
+def _on_discs(ranges, origins, directions, reach, pose, discs, cells, corner, side):  # type: ignore[no-untyped-def]
+    """Whether each return lies on the free floor of a map, within one of the ``discs`` (x, y, radius)."""
+    found = np.zeros(len(ranges), np.bool_)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    for i in range(len(ranges)):
+        r = ranges[i]
+        if not 0.0 < r < reach:
+            continue
+        x, y = origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1]
+        x, y = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
+        for k in range(len(discs)):
+            if np.hypot(x - discs[k, 0], y - discs[k, 1]) <= discs[k, 2]:
+                found[i] = _is_floor(x - corner[0], y - corner[1], cells, side)
+                break
     return found
+
+
+@njit(allocates=False)
+def _is_floor(x, y, cells, side):  # type: ignore[no-untyped-def]
+    """Whether a point lies in a free cell without a wall beside it; x and y from the map's lower left corner."""
+    height, width = cells.shape
+    row, column = int(np.floor(y / side)), int(np.floor(x / side))
+    if not (0 <= row < height and 0 <= column < width) or cells[row, column] != FREE:
+        return False
+    for r in range(max(0, row - WALL_CELLS), min(height, row + WALL_CELLS + 1)):
+        for c in range(max(0, column - WALL_CELLS), min(width, column + WALL_CELLS + 1)):
+            if cells[r, c] == OCCUPIED:
+                return False
+    return True
