@@ -4,6 +4,7 @@ A robot that drives along with this one would look like a wall that stands still
 scan: whether the map shows them is decided where the scans of all robots are known (``fcslam.maps.teammates``).
 """
 
+import math
 from collections.abc import Iterable
 from typing import Final
 
@@ -43,11 +44,13 @@ def beams_on_teammates(
         radius_m: of a robot.
     """
     reach_m = scan.laser.max_range_m
+    own_x, own_y, _ = T_map_base.tolist()
     near = [
-        (*mate.T_map_base[:2].tolist(), limit_m)
+        (x, y, limit_m)
         for mate in mates
+        for x, y, _ in [mate.T_map_base.tolist()]
         if mate.age_s <= OLDEST_S
-        and np.hypot(*(mate.T_map_base - T_map_base)[:2]) <= reach_m + (limit_m := radius_m + SPEED_MPS * mate.age_s)
+        and math.hypot(x - own_x, y - own_y) <= reach_m + (limit_m := radius_m + SPEED_MPS * mate.age_s)
     ]
     if not near:
         return None
