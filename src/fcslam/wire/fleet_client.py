@@ -4,7 +4,6 @@ import json
 from typing import NamedTuple
 from urllib.parse import quote
 
-from fcslam.errors import CloudError
 from fcslam.wire.http_transport import HttpClient
 
 
@@ -75,7 +74,7 @@ class FleetClient(HttpClient):
         )
         self._require(response, 200)
         self.received_bytes += len(response.content)
-        try:
+        with self._reading():
             reply = response.json()
             robots = tuple(
                 TeammatePose(
@@ -91,8 +90,6 @@ class FleetClient(HttpClient):
             apart = tuple(
                 ((int(one["maps"][0]), int(one["maps"][1])), str(one["explanation"])) for one in reply["separations"]
             )
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
         return FleetReply(robots, apart)
 
     def frontiers(self, robot: str) -> tuple[FrontierReply, ...]:
@@ -100,7 +97,7 @@ class FleetClient(HttpClient):
         response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}", accept="application/json")
         self._require(response, 200)
         self.received_bytes += len(response.content)
-        try:
+        with self._reading():
             return tuple(
                 FrontierReply(
                     int(one["map"]),
@@ -112,8 +109,6 @@ class FleetClient(HttpClient):
                 for one in response.json()
                 for each in one["frontiers"]
             )
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
@@ -122,7 +117,7 @@ class FleetClient(HttpClient):
             return ()
         self._require(response, 200)
         self.received_bytes += len(response.content)
-        try:
+        with self._reading():
             return tuple(
                 QualityReply(
                     int(one["map"]),
@@ -135,8 +130,6 @@ class FleetClient(HttpClient):
                 )
                 for one in response.json()
             )
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 
     def tiles(self, robot: str, known: str, limit_bytes: int) -> tuple[bytes, str] | None:
         """The changed tiles of the map that a robot is in (``fcslam.maps.joint_tiles``) and their ETag.

@@ -154,6 +154,18 @@ class HttpClient:
         """Close the connection."""
         self._client.close()
 
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Read a reply in this block.
+
+        Raises:
+            CloudError: the reply is not what an fcslam cloud sends.
+        """
+        try:
+            yield
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
+
     def _ask(
         self,
         method: str,
@@ -236,12 +248,10 @@ class HttpTransport(HttpClient):
         """As in BatchTransport."""
         response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
         self._require(response, 200)
-        try:
+        with self._reading():
             state = response.json()
             expected = {int(epoch): int(sequence) for epoch, sequence in state["next"].items()}
             refused = {(int(one["epoch"]), int(one["sequence"])): str(one["reason"]) for one in state["refused"]}
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
         return CloudState(expected, refused)
 
     def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:

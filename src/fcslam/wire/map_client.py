@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-from fcslam.errors import CloudError
 from fcslam.wire.http_transport import HttpClient
 
 
@@ -24,7 +23,7 @@ class MapClient(HttpClient):
         """The maps of the cloud now."""
         response = self._ask("GET", "maps", accept="application/json")
         self._require(response, 200)
-        try:
+        with self._reading():
             return [
                 ServedMap(
                     int(one["map"]),
@@ -34,8 +33,6 @@ class MapClient(HttpClient):
                 )
                 for one in response.json()
             ]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
 
     def image(self, number: int) -> bytes:
         """The PGM file of a map."""
