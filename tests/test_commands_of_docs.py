@@ -45,9 +45,10 @@ SCANS, LONG_SCANS = 60, 120
 """Of a sample log that the commands get. The long one has relations over 20 s."""
 ANNA, BEN, CLEO, LONG = "anna.clf", "ben.clf", "cleo.clf", "long.clf"
 LOGS = {
-    "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "monday.clf.gz": ANNA, "building.clf.gz": LONG, "intel.clf.xz": LONG,
-    "robot2.log": BEN, "robot2.clf": BEN, "tuesday.clf.gz": BEN,
-    "robot3.log": CLEO, "today.clf.gz": CLEO,
+    "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "monday.clf.gz": ANNA, "monday.clf.xz": ANNA,
+    "building.clf.gz": LONG, "intel.clf.xz": LONG,
+    "robot2.log": BEN, "robot2.clf": BEN, "tuesday.clf.gz": BEN, "tuesday.clf.xz": BEN,
+    "robot3.log": CLEO, "today.clf.gz": CLEO, "today.clf.xz": CLEO,
 }  # fmt: skip
 """Names that the pages use, and the sample log that stands for each."""
 BAGS = {

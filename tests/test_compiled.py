@@ -9,8 +9,8 @@ import pytest
 
 WITHOUT_FOLDER = """
 import numpy as np
-from numba.core.caching import FunctionCache
-FunctionCache._impl_class._locator_classes = []  # as where nothing can be written
+from fcslam import compiled
+compiled._CachedCode._locator_classes = []  # as where nothing can be written
 from fcslam.cli.warm_up import tell_uncached
 from fcslam.cli.output import notices
 from fcslam.features.codes import hamming
@@ -65,6 +65,18 @@ def test_a_cache_folder_that_cannot_be_made_does_no_harm(tmp_path):
     script = "from fcslam.compiled import njit\nprint(njit(lambda x: x + 1)(1))"
     done = run(script, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
     assert (done.stdout, done.returncode) == ("2\n", 0), done.stderr
+
+
+def test_code_of_an_installed_package_is_in_the_cache_folder_of_the_user_so_pip_removes_all_of_the_package(tmp_path):
+    package = tmp_path / "site-packages"
+    package.mkdir()
+    (package / "module.py").write_text("from fcslam.compiled import njit\n@njit\ndef f(x):\n    return x + 1\n")
+    script = f"import sys; sys.path.insert(0, {str(package)!r})\nimport module\nprint(module.f(1))"
+    home = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": "", "PYTHONDONTWRITEBYTECODE": "1"}
+    done = run(script, **home)
+    assert (done.stdout, done.returncode) == ("2\n", 0), done.stderr
+    assert [path.name for path in package.rglob("*")] == ["module.py"]
+    assert any((tmp_path / "cache").rglob("*.nbi"))
 
 
 def test_a_cache_folder_that_fails_later_does_no_harm(tmp_path):

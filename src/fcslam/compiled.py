@@ -1,17 +1,21 @@
 """Compiled functions and the cache of their machine code, which works without a folder for it as well.
 
-Compiling takes half a minute, loading from the cache less than a second. The cache is beside the sources, else in the
-user's cache folder; ``NUMBA_CACHE_DIR`` names another one. If none of them can be written, every process compiles.
+Compiling takes half a minute, loading from the cache less than a second. The cache of an installed package is in the
+user's cache folder, that of a clone beside its sources; ``NUMBA_CACHE_DIR`` names another one. If no folder can be
+written, every process compiles.
 """
 
 import fcntl
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator, UserWideCacheLocator
+
+INSTALLED = frozenset({"site-packages", "dist-packages"})
+"""Folders of packages that pip manages."""
 
 _uncached: list[str] = []
 
@@ -43,8 +47,21 @@ def njit(function: Any = None, *, nogil: bool = False, allocates: bool = True) -
     return dispatcher
 
 
+class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
+    """Finds the folder for machine code: not in an installed package, as ``pip uninstall`` would leave it there."""
+
+    _locator_classes: Sequence[type] = CompileResultCacheImpl._locator_classes
+
+    def __init__(self, function: Any) -> None:
+        if INSTALLED & set(Path(function.__code__.co_filename).parts):
+            self._locator_classes = [UserProvidedCacheLocator, UserWideCacheLocator, *self._locator_classes]
+        super().__init__(function)
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """A cache that several processes may use at a time, and that may fail."""
+
+    _impl_class = _CachedCode
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with suppress(OSError), self._locked():

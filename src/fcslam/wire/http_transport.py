@@ -189,7 +189,8 @@ class HttpClient:
                 raise CloudError(
                     f"{self._url}: its certificate is not trusted ({error}); give its ca.pem in --credentials"
                 ) from error
-            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{self._hint(error)}") from error
+            reason = str(error).removesuffix(".") or type(error).__name__
+            raise UnavailableError(f"{self._url}: {reason}{self._hint(error)}") from error
 
     def _hint(self, error: "httpx.RequestError") -> str:
         """What may be wrong if a connection that was opened fails."""
