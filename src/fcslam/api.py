@@ -11,18 +11,9 @@ from fcslam.anchoring.anchors import Anchors
 from fcslam.config import load, parse
 from fcslam.errors import SourceError
 from fcslam.lidar.frontend import LidarConfig
-from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.driving import side_by_side
-from fcslam.mission.mission import (
-    NOTHING_KNOWN,
-    Live,
-    MissionConfig,
-    Watch,
-    check_robots,
-    continued_config,
-    run_mission,
-)
-from fcslam.mission.mission_file import SavedMission, read_mission
+from fcslam.mission.mission import Beginning, MissionConfig, Watch, check_robots, continued_config, run_mission
+from fcslam.mission.mission_file import EMPTY, SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
@@ -50,10 +41,8 @@ def map_recordings(
     force: bool = False,
     processes: int = 1,
     onto: StrPath | SavedMission | None = None,
-    live: Live | None = None,
     floors: str | Mapping[str, str] = "",
-    verify_pairs: VerifyPairs = verify_here,
-    anchors: Anchors = NOTHING_KNOWN,
+    anchors: Anchors = Anchors(),  # noqa: B008
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -77,11 +66,8 @@ def map_recordings(
         onto: mission file, or run folder with one, of an earlier mission that goes on. The run is that of all
             recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
             the cloud. Without recordings it is mapped again, with the edits that it has.
-        live: called with the mission's cloud after every packet; it must return at once and change nothing.
         floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
             floors are never compared, so each floor has maps of its own.
-        verify_pairs: where closures are verified, see ``fcslam.cluster.verifying.verifying``; it does not change
-            the run.
         anchors: what is known about the building, such as its floor plan.
 
     Raises:
@@ -90,17 +76,16 @@ def map_recordings(
     """
     if output is not None:
         prepare_output(Path(output), force)
-    earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto
+    earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto or EMPTY
     settings = settings_of(continued_config(earlier) if config is None else config)
-    opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=0 if earlier else 1)
+    opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
     check_robots(robots)
     sources.check_copies(robots)
-    drive = side_by_side(processes)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
-    watch, look = progress or (lambda _: None), live or (lambda _: None)
-    run = run_mission(robots, settings, watch, tuple(vetoes), drive, earlier, look, floors, verify_pairs, anchors)
+    beginning = Beginning(earlier, tuple(vetoes), floors, anchors)
+    run = run_mission(robots, settings, progress or (lambda _: None), beginning, side_by_side(processes))
     if output is not None:
         run.save(output, force)
     return run

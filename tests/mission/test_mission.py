@@ -8,7 +8,7 @@ import yaml
 
 from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import mission
-from fcslam.mission.mission import MissionConfig, run_mission
+from fcslam.mission.mission import Beginning, MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.sources import open_source, write_carmen
 from fcslam.sources.faults import Faults
@@ -42,7 +42,9 @@ def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
     settings = MissionConfig()
     robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
     seen = []
-    run = run_mission([Kidnapped()], settings.model_copy(update={"robot": robot}), seen.append, [Veto("r", "r+1")])
+    run = run_mission(
+        [Kidnapped()], settings.model_copy(update={"robot": robot}), seen.append, Beginning(vetoes=(Veto("r", "r+1"),))
+    )
     assert run.metrics["keyscans"].value == seen[-1].keyscans
     scans, moment = kidnapping()
     first, second = run.trajectories.values()

@@ -51,8 +51,8 @@ def resumed(monkeypatch):
     """Whether each mission went on from the state of the earlier one."""
     answers = []
 
-    def resume(cloud, onto, first, original=MissionCloud.resume):
-        answers.append(original(cloud, onto, first))
+    def resume(cloud, first, original=MissionCloud.resume):
+        answers.append(original(cloud, first))
         return answers[-1]
 
     monkeypatch.setattr(MissionCloud, "resume", resume)

@@ -49,7 +49,7 @@ def demo(
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
-    from fcslam.mission.mission import MissionConfig
+    from fcslam.mission.mission import Beginning, MissionConfig
     from fcslam.sources import open_source
 
     began = time.perf_counter()
@@ -77,7 +77,7 @@ def demo(
         config = _with_detector(config, learn_together(sources, config, output / LEARNING, console))
     stages.begin("map each robot, recognise places, fuse the maps")
     with live_page(output / RUN) if live else nullcontext() as page:
-        map_sources(sources, config, output / RUN, console, force=True, page=page)
+        map_sources(sources, config, Beginning(), output / RUN, console, force=True, page=page)
         stages.begin("evaluate: compare with the truth")
         _evaluate(output, console)
         stages.begin("draw")

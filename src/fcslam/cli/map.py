@@ -3,11 +3,10 @@
 import gc
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -35,8 +34,7 @@ if TYPE_CHECKING:
 
     from fcslam.anchoring.anchors import Anchors
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lidar.pair_verification import VerifyPairs
-    from fcslam.mission.mission import MissionConfig, Progress
+    from fcslam.mission.mission import Beginning, MissionConfig, Progress
     from fcslam.mission.mission_file import SavedMission
     from fcslam.page.live_map import LiveMap
     from fcslam.runs import Run
@@ -127,18 +125,18 @@ def map_recordings(
         from fcslam.cluster.verifying import verifying
         from fcslam.cluster.workers import Workers
         from fcslam.errors import InputError
-        from fcslam.mission.mission import continued_config
-        from fcslam.mission.mission_file import read_mission
+        from fcslam.mission.mission import Beginning, continued_config
+        from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
         from fcslam.runs import prepare_output
 
         output = output or new_folder(RUNS)
         prepare_output(output, force)
-        earlier = None if onto is None else read_mission(onto)
+        earlier = EMPTY if onto is None else read_mission(onto)
         settings = with_starts(mission_config(config, continued_config(earlier)), start, start_sigma)
         anchors = _anchors(plan, plan_scale, align, tags)
         options = bag_options(sensors)
-        if not logs and earlier is None:
+        if not logs and onto is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
@@ -146,7 +144,8 @@ def map_recordings(
         floors = floors_of(floor or [], [source.name for source in sources])
     chosen = Workers(workers)
     with verifying(chosen) as verify, live_page(output) if live else nullcontext() as page:
-        map_sources(sources, settings, output, notices(quiet), force, earlier, page, floors, verify, anchors)
+        beginning = Beginning(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
+        map_sources(sources, settings, beginning, output, notices(quiet), force, page)
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
@@ -168,24 +167,21 @@ def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, st
 def map_sources(
     sources: "Sequence[Source]",
     settings: "MissionConfig",
+    beginning: "Beginning",
     output: Path,
     console: "Console",
     force: bool = False,
-    earlier: "SavedMission | None" = None,
     page: "LiveMap | None" = None,
-    floors: "Mapping[str, str]" = MappingProxyType({}),
-    verify_pairs: "VerifyPairs | None" = None,
-    anchors: "Anchors | None" = None,
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
     A run that appeared at ``output`` meanwhile is replaced only with ``force``.
     """
     with _without_collection():
-        from fcslam import api
         from fcslam.cli.progress import ProgressDisplay
-        from fcslam.lidar.pair_verification import verify_here
-        from fcslam.mission.mission import NOTHING_KNOWN
+        from fcslam.mission.driving import side_by_side
+        from fcslam.mission.mission import check_robots, run_mission
+        from fcslam.sources import check_copies
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -194,25 +190,18 @@ def map_sources(
     began = time.perf_counter()
     with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
-        known = 0 if earlier is None else sum(len(track.stamps) for track in earlier.tracks.values())
+        known = sum(len(track.stamps) for track in beginning.onto.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
-        run = api.map_recordings(
-            sources,
-            config=settings,
-            progress=progress,
-            processes=cores(),
-            onto=earlier,
-            live=None if page is None else page.look,
-            floors=floors,
-            verify_pairs=verify_pairs or verify_here,
-            anchors=anchors or NOTHING_KNOWN,
-        )
+        check_robots(sources)
+        check_copies(sources)
+        look = (lambda _: None) if page is None else page.look
+        run = run_mission(sources, settings, progress, beginning, side_by_side(cores()), look)
         display.start("writing")
         run.save(output, force)
     if page is not None:
         page.finish(output)
     print_faults(console, faults)
-    _report(answers(), run, time.perf_counter() - began, output, settings, earlier)
+    _report(answers(), run, time.perf_counter() - began, output, settings, beginning.onto)
     return run
 
 
@@ -274,7 +263,7 @@ def _report(
     elapsed_s: float,
     output: Path,
     settings: "MissionConfig",
-    earlier: "SavedMission | None",
+    earlier: "SavedMission",
 ) -> None:
     from rich.table import Table
 
@@ -303,7 +292,7 @@ def _report(
     ends: dict[str, float] = {}
     for session in run.trajectories.values():
         robot, epoch = robot_and_epoch(session.robot)
-        if epoch > (0 if earlier is None else earlier.epochs(robot)):  # the first session of a recording began with it
+        if epoch > earlier.epochs(robot):  # the first session of a recording began with it
             begin_s = session.stamps[0]
             why = f"{robot} was lost; this session begins at {begin_s:.3f} s"
             if begin_s < ends.get(robot, begin_s):

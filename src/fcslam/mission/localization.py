@@ -18,7 +18,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.maps.drawing import map_png
-from fcslam.mission.mission import MissionConfig, continued_config, run_mission
+from fcslam.mission.mission import Beginning, MissionConfig, continued_config, run_mission
 from fcslam.mission.mission_file import read_mission
 from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.robot.frontend import RobotFrontend
@@ -265,7 +265,7 @@ def _place(robot: RobotFrontend, estimate: MapEstimate | None, drive: LocalizedD
 
 def _mission_map(path: Path, floor: str) -> OccupancyMap:
     saved = read_mission(path)
-    run = run_mission((), continued_config(saved), onto=saved)
+    run = run_mission((), continued_config(saved), beginning=Beginning(saved))
     floors = {trajectory.map_index: trajectory.floor for trajectory in run.trajectories.values()}
     number, floor = _map_on(floor, floors, path)
     files, stem = run.map_files, map_stem(number)

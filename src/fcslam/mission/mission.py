@@ -9,7 +9,6 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -45,8 +44,6 @@ from fcslam.wire.messages import Packet, PacketKind
 from fcslam.wire.packets import Label, SizedPacket, decode, measure
 
 _log = logging.getLogger(__name__)
-
-NOTHING_KNOWN = Anchors()
 
 AUTHOR = "fcslam map"
 """The author of vetoes that are given with the recordings."""
@@ -93,10 +90,25 @@ Live = Callable[["MissionCloud"], None]
 """Called after every packet; it may look at the cloud, and changes nothing."""
 
 
-def continued_config(earlier: SavedMission | None) -> MissionConfig:
-    """The default configuration, with the cloud's settings of an earlier mission if there is one."""
-    if earlier is None:
-        return MissionConfig()
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """What a mission knows before its recordings, and where it verifies closures."""
+
+    onto: SavedMission = EMPTY
+    """An earlier mission that goes on; its packets take effect again, and the result is that of all recordings at once.
+    A robot of it that has a recording again begins a new session."""
+    vetoes: tuple[Veto, ...] = ()
+    """Closures that must not count."""
+    floors: Mapping[str, str] = field(default_factory=dict)
+    """Floor of each recording that has one, by its robot's name; places of different floors are never compared."""
+    anchors: Anchors = Anchors()  # noqa: RUF009
+    """What is known about the building; it places the maps, and joins none."""
+    verify_pairs: VerifyPairs = verify_here
+    """Verifies pairs of submaps, here or elsewhere; the run is the same."""
+
+
+def continued_config(earlier: SavedMission) -> MissionConfig:
+    """The default configuration, with the cloud's settings of an earlier mission."""
     return MissionConfig(seed=earlier.config.seed, fleet=earlier.config.fleet, map=earlier.config.map)
 
 
@@ -104,13 +116,9 @@ def run_mission(
     sources: Sequence[Source],
     config: MissionConfig,
     watch: Watch = lambda _: None,
-    vetoes: Sequence[Veto] = (),
+    beginning: Beginning = Beginning(),
     drive: Drive = one_by_one,
-    onto: SavedMission | None = None,
     live: Live = lambda _: None,
-    floors: Mapping[str, str] = MappingProxyType({}),
-    verify_pairs: VerifyPairs = verify_here,
-    anchors: Anchors = NOTHING_KNOWN,
 ) -> Run:
     """Map recordings together, one robot each.
 
@@ -118,30 +126,24 @@ def run_mission(
         sources: the recordings.
         config: all settings.
         watch: called with the progress.
-        vetoes: closures that must not count.
+        beginning: what is known before the recordings.
         drive: runs the robots.
-        onto: an earlier mission that goes on; its packets take effect again, and the result is that of all recordings
-            at once. A robot of it that has a recording again begins a new session.
         live: called with the cloud after every packet.
-        floors: floor of each recording that has one, by its robot's name; places of different floors are never
-            compared.
-        verify_pairs: verifies pairs of submaps, here or elsewhere; the run is the same.
-        anchors: what is known about the building; it places the maps, and joins none.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
         ConfigError: a veto, a floor or a start names a robot that is not there, or a floor is not valid.
         OutputError: a robot's name cannot be a file name.
     """
-    onto = onto or EMPTY
+    onto, floors = beginning.onto, beginning.floors
     check_robots(sources)
     recordings = [source.name for source in sources]
     known = [*onto.robots, *recordings]
-    _check_known("a veto", (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)), known)
+    _check_known("a veto", (name for veto in beginning.vetoes for name in (veto.robot_i, veto.robot_j)), known)
     _check_known("a start", config.fleet.starts, known)
     _check_known("a floor", floors, recordings)
     _check_floors(floors)
-    cloud = MissionCloud(config, onto, vetoes, verify_pairs)
+    cloud = MissionCloud(config, beginning)
     meter = _Meter(watch, cloud, known)
     with drive(sources, config.robot) as robots:
         new = [
@@ -150,7 +152,7 @@ def run_mission(
         ]
         streams = [_packets(legs, meter) for legs in new]
         first, streams = _first(streams)
-        if cloud.resume(onto, first):
+        if cloud.resume(first):
             meter.take_over(onto)
         else:
             streams += [_packets(legs, meter) for legs in onto.legs()]
@@ -158,28 +160,21 @@ def run_mission(
             cloud.apply(sent)
             live(cloud)
     meter.report(fusing=True)
-    return cloud.run(meter.tracks, meter.scans, meter.recorded_s, anchors)
+    return cloud.run(meter.tracks, meter.scans, meter.recorded_s)
 
 
 class MissionCloud:
     """The cloud of a mission within one process; it counts what is sent."""
 
-    def __init__(
-        self,
-        config: MissionConfig,
-        onto: SavedMission = EMPTY,
-        vetoes: Sequence[Veto] = (),
-        verify_pairs: VerifyPairs = verify_here,
-    ) -> None:
+    def __init__(self, config: MissionConfig, beginning: Beginning = Beginning()) -> None:
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
-        self.config = config
-        self._verify_pairs = verify_pairs
-        self._cloud = Cloud(config.fleet, config.seed, verify_pairs)
+        self.config, self._beginning, onto = config, beginning, beginning.onto
+        self._cloud = Cloud(config.fleet, config.seed, beginning.verify_pairs)
         self._traffic = Counter()
         self._packets: list[StoredPacket] = []
         self._refused = onto.refused
         numbers = itertools.count(len(onto.edits) + 1)
-        self._edits = (*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in vetoes))
+        self._edits = (*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in beginning.vetoes))
         self._cloud.fleet.edit(in_force(self._edits))
         for packet in onto.refused:
             self._cloud.refuse(packet.robot, packet.epoch, packet.sequence)
@@ -189,16 +184,16 @@ class MissionCloud:
         """The fleet, for vetoes and counts."""
         return self._cloud.fleet
 
-    def resume(self, onto: SavedMission, first: SizedPacket | None) -> bool:
-        """Take over the state after all packets of an earlier mission, so that they need not be applied again.
+    def resume(self, first: SizedPacket | None) -> bool:
+        """Take over the state after all packets of the earlier mission, so that they need not be applied again.
 
         Args:
-            onto: the mission that this cloud began with.
             first: the first packet of the new ones; None: there are none.
 
         Returns:
             Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
         """
+        onto = self._beginning.onto
         packets = sorted(onto.stored, key=lambda packet: packet.order)
         is_later = not packets or first is None or first.packet.order > packets[-1].order
         if onto.state is None or not is_later or self._edits != onto.edits or self._settings != onto.config:
@@ -212,7 +207,7 @@ class MissionCloud:
                 state,
                 {number: packet.time for number, packet in numbered.items()},
                 lambda number: decode(numbered[number].data),
-                self._verify_pairs,
+                self._beginning.verify_pairs,
             )
             traffic = {
                 Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
@@ -248,14 +243,13 @@ class MissionCloud:
             result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False, with_certificates=False
         )
 
-    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float, anchors: Anchors = NOTHING_KNOWN) -> Run:
+    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
         """The result of all packets so far.
 
         Args:
             tracks: the scans of the sessions, in their order. Other sessions come first, with their keyscans alone.
             scans: number of scans.
             recorded_s: length of the recordings together, seconds.
-            anchors: what is known about the building.
         """
         result = self._cloud.finalize()
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
@@ -264,14 +258,14 @@ class MissionCloud:
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
         mission = mission_bytes(self._settings, self._edits, self._packets, self._refused, tracks)
-        placing = self._placed(result, anchors)
+        placing = self._placed(result)
         run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
         run = replace(run, map_files={**run.map_files, **placing.files})
         return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
 
-    def _placed(self, result: FleetResult, anchors: Anchors) -> Anchored:
-        is_fixed = any(robot.fixes for robot in result.robots)
-        if anchors == NOTHING_KNOWN and not is_fixed and not result.sightings:
+    def _placed(self, result: FleetResult) -> Anchored:
+        anchors, is_fixed = self._beginning.anchors, any(robot.fixes for robot in result.robots)
+        if anchors == Anchors() and not is_fixed and not result.sightings:
             return Anchored(result)
         by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
