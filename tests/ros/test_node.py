@@ -23,7 +23,7 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap, parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
-from fcslam.wire.fleet_client import FrontierReply, QualityReply
+from fcslam.wire.fleet_replies import FrontierReply, MapFrontiers, QualityReply
 from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
@@ -364,15 +364,18 @@ def test_messages_that_come_too_fast_are_counted(network, robot, scans, monkeypa
     assert said == ["messages come faster than this computer can map; some are lost"]
 
 
+def frontier(x, y, *robots):
+    return FrontierReply(point=(x, y), length=1.0, gain=8.0, distances={}, robots=robots)
+
+
 class FollowedFleet:
     """A fleet as the service tells of it, without the service."""
 
     def __init__(self):
         self.map_index, self.news = 0, ["map 0 holds robot1, r-2; joined: r-2"]
         self.frontiers = (
-            FrontierReply(0, (3.0, 4.0), 2.0, 9.0, ("robot1",)),
-            FrontierReply(0, (5.0, 6.0), 1.0, 8.0, ()),
-            FrontierReply(1, (7.0, 8.0), 1.0, 7.0, ()),
+            MapFrontiers(map=0, frontiers=(frontier(3.0, 4.0, "robot1"), frontier(5.0, 6.0))),
+            MapFrontiers(map=1, frontiers=(frontier(7.0, 8.0),)),
         )
         self.quality = ()
 
@@ -449,8 +452,10 @@ def test_poses_and_state_of_the_fleet_are_published_and_each_change_once(network
 def test_how_good_the_map_is_is_published_when_it_changes(network, robot):
     followed = FleetRobot(robot, None)
     node = start(network, followed)
-    good = QualityReply(0, "9 of 9 m2 are good to 0.05 m within 10 m", 0.05, 10.0, 0.021, 1.0, ())
-    bad = good._replace(error_95_m=None, drives=("drive from (0.0, 1.0) to (2.0, 1.0) again",))
+    good = QualityReply(
+        map=0, verdict="9 of 9 m2 are good", bar=0.05, within=10.0, error_95=0.021, good_share=1.0, drives=()
+    )
+    bad = good.model_copy(update={"error_95_m": None, "drives": ("drive from (0.0, 1.0) to (2.0, 1.0) again",)})
     with running(node):
         wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 2)
         assert not network.sent["/robot1/fleet/quality"]
@@ -471,7 +476,7 @@ def test_the_frontiers_of_the_own_map_and_the_own_goal_are_published_when_they_c
     node = start(network, followed)
     with running(node):
         wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 3)
-        followed.fleet.frontiers = followed.fleet.frontiers[:1]
+        followed.fleet.frontiers = (MapFrontiers(map=0, frontiers=followed.fleet.frontiers[0].frontiers[:1]),)
         wait_for(lambda: len(network.sent["/robot1/fleet/frontiers"]) == 2)
     free, taken = network.sent["/robot1/fleet/frontiers"][0].markers
     assert [(point.x, point.y) for point in free.points] == [(5.0, 6.0)]

@@ -18,7 +18,8 @@ from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
 from fcslam.runs.map_files import OccupancyMap
-from fcslam.wire.fleet_client import FleetClient, FleetReply, FrontierReply, QualityReply
+from fcslam.wire.fleet_client import FleetClient
+from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
 
 POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
@@ -82,7 +83,7 @@ class FleetView:
         """What changed in the robot's map, one line each, the oldest first."""
         self.version = 0
         """Grows with every change of the joint map."""
-        self.frontiers: tuple[FrontierReply, ...] = ()
+        self.frontiers: tuple[MapFrontiers, ...] = ()
         """Where the robot's map can be explored further, and who shall go where."""
         self.quality: tuple[QualityReply, ...] = ()
         """How good the robot's map is; empty before the cloud has computed its certificate."""
@@ -135,7 +136,8 @@ class FleetView:
 
     def separations(self) -> tuple[tuple[tuple[int, int], str], ...]:
         """For every two maps that are apart: their indices and the reason."""
-        return () if self._reply is None else self._reply[0].separations
+        apart = () if self._reply is None else self._reply[0].separations
+        return tuple((one.maps, one.explanation) for one in apart)
 
     def step(self) -> None:
         """Ask once.

@@ -264,7 +264,7 @@ class RobotNode:
                 self._outputs.event(now_ns, self._robot.name, line)
 
     def _publish_frontiers(self, now_ns: int, fleet: "FleetView") -> None:
-        found = [one for one in fleet.frontiers if one.map_index == fleet.map_index]
+        found = [one for its in fleet.frontiers if its.map_index == fleet.map_index for one in its.frontiers]
         free, taken = (
             np.array([one.point for one in found if bool(one.robots) is has_robot]).reshape(-1, 2)
             for has_robot in (False, True)

@@ -21,7 +21,7 @@ from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
     from fcslam.live.fleet_view import Teammate
-    from fcslam.wire.fleet_client import QualityReply
+    from fcslam.wire.fleet_replies import QualityReply
 
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"

@@ -1,63 +1,14 @@
 """HTTP client of a robot that follows its fleet: the joint map in tiles, and where all robots are."""
 
 import json
-from typing import NamedTuple
 from urllib.parse import quote
 
+from pydantic import TypeAdapter
+
+from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
 from fcslam.wire.http_transport import HttpClient
 
-
-class TeammatePose(NamedTuple):
-    """A robot of the fleet, as the cloud knows it."""
-
-    robot: str
-    map_index: int
-    floor: str
-    """Empty: none."""
-    T_map_base: tuple[float, float, float]
-    age_s: float
-    """Time since it was there, when the cloud replied."""
-    stamp: float
-    """Of its newest keyscan in the joint map, seconds."""
-
-
-class FleetReply(NamedTuple):
-    """Where all robots are, and why maps are apart."""
-
-    robots: tuple[TeammatePose, ...]
-    separations: tuple[tuple[tuple[int, int], str], ...]
-    """Two maps and the reason."""
-
-
-class FrontierReply(NamedTuple):
-    """A boundary between free and unknown cells of a map."""
-
-    map_index: int
-    point: tuple[float, float]
-    """Metres in its map."""
-    length_m: float
-    gain_m2: float
-    """Unknown area around it."""
-    robots: tuple[str, ...]
-    """Those that shall explore it."""
-
-
-class QualityReply(NamedTuple):
-    """How good a map is, by its certificate."""
-
-    map_index: int
-    verdict: str
-    """How much of it is good."""
-    bar_m: float
-    """A cell is good if its error stays below this in 95 % of cells."""
-    within_m: float
-    """Distance within which errors count."""
-    error_95_m: float | None
-    """Error that 95 % of cells stay below; None: no cell is known."""
-    good_share: float | None
-    """Share of good cells."""
-    drives: tuple[str, ...]
-    """What to drive again, that with the largest gain first."""
+_FRONTIERS, _QUALITY = TypeAdapter(tuple[MapFrontiers, ...]), TypeAdapter(tuple[QualityReply, ...])
 
 
 class FleetClient(HttpClient):
@@ -75,40 +26,15 @@ class FleetClient(HttpClient):
         self._require(response, 200)
         self.received_bytes += len(response.content)
         with self._reading():
-            reply = response.json()
-            robots = tuple(
-                TeammatePose(
-                    str(one["robot"]),
-                    int(one["map"]),
-                    str(one["floor"]),
-                    _pose(one["pose"]),
-                    float(one["age_s"]),
-                    float(one["stamp"]),
-                )
-                for one in reply["robots"]
-            )
-            apart = tuple(
-                ((int(one["maps"][0]), int(one["maps"][1])), str(one["explanation"])) for one in reply["separations"]
-            )
-        return FleetReply(robots, apart)
+            return FleetReply.model_validate_json(response.content)
 
-    def frontiers(self, robot: str) -> tuple[FrontierReply, ...]:
-        """The frontiers of the map that a robot is in, that with the largest gain first."""
+    def frontiers(self, robot: str) -> tuple[MapFrontiers, ...]:
+        """The frontiers of the map that a robot is in; none if it is in no map."""
         response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}", accept="application/json")
         self._require(response, 200)
         self.received_bytes += len(response.content)
         with self._reading():
-            return tuple(
-                FrontierReply(
-                    int(one["map"]),
-                    (float(each["point"][0]), float(each["point"][1])),
-                    float(each["length"]),
-                    float(each["gain"]),
-                    tuple(map(str, each["robots"])),
-                )
-                for one in response.json()
-                for each in one["frontiers"]
-            )
+            return _FRONTIERS.validate_json(response.content)
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
@@ -118,18 +44,7 @@ class FleetClient(HttpClient):
         self._require(response, 200)
         self.received_bytes += len(response.content)
         with self._reading():
-            return tuple(
-                QualityReply(
-                    int(one["map"]),
-                    str(one["verdict"]),
-                    float(one["bar"]),
-                    float(one["within"]),
-                    _number(one["error_95"]),
-                    _number(one["good_share"]),
-                    tuple(map(str, one["drives"])),
-                )
-                for one in response.json()
-            )
+            return _QUALITY.validate_json(response.content)
 
     def tiles(self, robot: str, known: str, limit_bytes: int) -> tuple[bytes, str] | None:
         """The changed tiles of the map that a robot is in (``fcslam.maps.joint_tiles``) and their ETag.
@@ -143,12 +58,3 @@ class FleetClient(HttpClient):
         self._require(response, 200)
         self.received_bytes += len(response.content)
         return response.content, response.headers.get("ETag", "")
-
-
-def _number(value: object) -> float | None:
-    return None if value is None else float(value)  # type: ignore[arg-type]
-
-
-def _pose(values: object) -> tuple[float, float, float]:
-    x, y, theta = map(float, values)  # type: ignore[call-overload]
-    return x, y, theta

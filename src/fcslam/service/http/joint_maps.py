@@ -22,7 +22,7 @@ from fcslam.runs import QUALITY, Run, separations
 from fcslam.runs.folder import identity
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
-from fcslam.service.http.responses import Pose, content, refusals
+from fcslam.service.http.responses import content, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
@@ -30,6 +30,7 @@ from fcslam.service.map_layers import MOST_LAYER_BYTES
 from fcslam.service.summaries import run_of
 from fcslam.service.viewed_mission import viewed_run
 from fcslam.untrusted import read_text
+from fcslam.wire.fleet_replies import Apart, FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
 
@@ -52,60 +53,6 @@ class OwnPose(Settings):
     )
 
 
-class FleetRobot(Settings):
-    """A robot of the fleet."""
-
-    robot: str
-    map: int
-    floor: str = Field(description="empty: none")
-    pose: Pose
-    age_s: float = Field(description="time since the robot was there")
-    stamp: float = Field(description="of its newest keyscan in the map, seconds")
-
-
-class Apart(Settings):
-    """Two maps that no closure joins."""
-
-    maps: tuple[int, int]
-    explanation: str
-
-
-class FleetPoses(Settings):
-    """Who is where, and why maps are apart."""
-
-    robots: list[FleetRobot]
-    separations: list[Apart]
-
-
-class FrontierSummary(Settings):
-    """A boundary between free and unknown cells."""
-
-    point: tuple[float, float] = Field(description="a place on it that a robot can reach, metres")
-    length: float = Field(description="metres")
-    gain: float = Field(description="unknown area around it, square metres")
-    distances: dict[str, float] = Field(description="length of each robot's path to it, metres; none: no path")
-    robots: list[str] = Field(description="who shall explore it")
-
-
-class MapFrontiers(Settings):
-    """The frontiers of a map, that with the largest gain first."""
-
-    map: int = Field(description="number of the map")
-    frontiers: list[FrontierSummary]
-
-
-class MapQuality(Settings):
-    """How good a map is, by its certificate."""
-
-    map: int = Field(description="number of the map")
-    verdict: str = Field(description="how much of it is good")
-    bar: float = Field(description="a cell is good if its error stays below this in 95 % of cells, metres")
-    within: float = Field(description="distance within which errors count, metres")
-    error_95: float | None = Field(description="error that 95 % of cells stay below, metres")
-    good_share: float | None = Field(description="share of good cells")
-    drives: list[str] = Field(description="what to drive again, that with the largest gain first")
-
-
 def joint_map_router(state: ServiceState) -> APIRouter:
     """The joint map that a robot belongs to, and the other robots."""
     router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
@@ -118,11 +65,11 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         responses=refusals(413),
         openapi_extra=json_body(OwnPose),
     )
-    async def exchange_poses(request: Request, robot: Name) -> FleetPoses:
+    async def exchange_poses(request: Request, robot: Name) -> FleetReply:
         """Say where a robot is, and read where all robots are."""
         return await run_in_threadpool(exchange, robot, await read_json(request, OwnPose))
 
-    def exchange(robot: str, own: OwnPose) -> FleetPoses:
+    def exchange(robot: str, own: OwnPose) -> FleetReply:
         now_s = time.time()
         maps = joint.follow(state.mission.joint_maps)
         if own.map is not None and own.pose is not None:
@@ -131,16 +78,16 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         for session in maps.sessions:
             pose, said_s = joint.pose(session)
             robots.append(
-                FleetRobot(
+                TeammatePose(
                     robot=session.robot,
                     map=session.map,
                     floor=session.floor,
-                    pose=list(pose),
+                    pose=pose,
                     age_s=max(0.0, now_s - said_s),
                     stamp=session.stamp,
                 )
             )
-        return FleetPoses(robots=robots, separations=list(_apart(run_of(state.mission))))
+        return FleetReply(robots=tuple(robots), separations=_apart(run_of(state.mission)))
 
     @router.get(
         "/robots/{robot}/map",
@@ -178,15 +125,15 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         explored = joint.explorations(maps, time.time())
         of_robot = {one.map for one in maps.sessions if robot in (None, one.robot)}
         return [
-            MapFrontiers(map=number, frontiers=list(_summaries(explored[number], robot)))
+            MapFrontiers(map=number, frontiers=tuple(_summaries(explored[number], robot)))
             for number in sorted(of_robot & explored.keys())
         ]
 
     @router.get("/quality", dependencies=as_reader)
-    def get_quality(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapQuality]:
+    def get_quality(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[QualityReply]:
         """How good each map is, about half a minute old; with ``robot``, only the map that this robot is in."""
         folder = state.mission.run_folder
-        return [] if folder is None else [one for one in _qualities(folder) if one.map in _maps_of(folder, robot)]
+        return [] if folder is None else [one for one in _qualities(folder) if one.map_index in _maps_of(folder, robot)]
 
     return router
 
@@ -200,7 +147,7 @@ def _maps_of(folder: Path, robot: str | None) -> set[int]:
     return {own[max(own)]} if own else set()
 
 
-def _qualities(folder: Path) -> tuple[MapQuality, ...]:
+def _qualities(folder: Path) -> tuple[QualityReply, ...]:
     """The certificates of the run in a folder; none before there are some, and while it is replaced."""
     try:
         return _certified(folder, identity(folder))
@@ -209,26 +156,26 @@ def _qualities(folder: Path) -> tuple[MapQuality, ...]:
 
 
 @lru_cache(maxsize=2)
-def _certified(folder: Path, _: tuple[int, int]) -> tuple[MapQuality, ...]:
+def _certified(folder: Path, _: tuple[int, int]) -> tuple[QualityReply, ...]:
     content = json.loads(read_text(folder / f"{QUALITY}.json", folder, MOST_LAYER_BYTES))
     return tuple(
-        MapQuality(
+        QualityReply(
             map=int(k),
             verdict=one["verdict"],
             bar=one["bar"],
             within=one["within"],
             error_95=one["error_95"],
             good_share=one["good_share"],
-            drives=[drive["text"] for drive in one["drives"]],
+            drives=tuple(drive["text"] for drive in one["drives"]),
         )
         for k, one in content.items()
     )
 
 
-def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierSummary]:
+def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierReply]:
     for one in explored.frontiers:
         lengths = zip(explored.robots, one.distances_m, strict=True)
-        yield FrontierSummary(
+        yield FrontierReply(
             point=(round(one.point[0], 3), round(one.point[1], 3)),
             length=round(one.length_m, 2),
             gain=round(one.gain_m2, 1),
@@ -237,7 +184,7 @@ def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierSum
                 for name, length_m in lengths
                 if robot in (None, name) and math.isfinite(length_m)
             },
-            robots=sorted(name for name, goal in explored.goals.items() if goal is one),
+            robots=tuple(sorted(name for name, goal in explored.goals.items() if goal is one)),
         )
 
 
