@@ -5,7 +5,7 @@ import io
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import click
@@ -68,159 +68,92 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command(
-    "map",
-    rich_help_panel=MAPS,
-    epilog=examples(
-        "fcslam map robot1.clf.gz robot2.clf.gz",
-        "fcslam map anna=run1.bag ben=run2.mcap -o runs/building",
-        "fcslam map building.clf.gz --split 3 --quiet",
-        "fcslam map robot1.bag robot2.bag --live",
-        "fcslam map today.bag --onto runs/building -o runs/building-2",
-        "fcslam map --onto runs/building -o runs/building-edited",
-    ),
-)(mapping.map_recordings)
-app.command(
-    "info",
-    rich_help_panel=MAPS,
-    epilog=examples(
-        "fcslam info robot1.bag",
-        "fcslam info robot1.mcap --json",
-    ),
-)(info.info)
-app.command(
-    "show",
-    rich_help_panel=MAPS,
-    epilog=examples(
-        "fcslam show runs/building",
-        "fcslam show runs/building --html report.html",
-        "fcslam show runs/building/mission.fcslam --port 8350 --no-open",
-    ),
-)(show.show)
-app.add_typer(edit.app, name="edit", rich_help_panel=MAPS)
-app.command(
-    "robot",
-    rich_help_panel=ROBOTS,
-    epilog=examples(
-        "fcslam robot ros2:/robot1 -o runs/robot1",
-        "fcslam robot ros2:/robot1 --server https://hub --state s --credentials c",
-        "fcslam robot anna=ros1:/robot1 --sensors scan-topic=/front/scan",
-        "fcslam robot --explain-traffic",
-    ),
-)(robots.robot)
-app.command(
-    "play",
-    rich_help_panel=ROBOTS,
-    epilog=examples(
-        "fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state",
-        "fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c",
-    ),
-)(playback.play)
-app.command(
-    "localize",
-    rich_help_panel=ROBOTS,
-    epilog=examples(
-        "fcslam localize today.bag --map runs/building",
-        "fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57",
-        "fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy",
-    ),
-)(localization.localize)
-app.command(
-    "record",
-    rich_help_panel=ROBOTS,
-    epilog=examples(
-        "fcslam record ros2:/robot1 -o day.mcap",
-        "fcslam record ros1:/ -o day.bag --duration 600",
-        "fcslam record robot1.clf.gz -o robot1.bag",
-        "fcslam record robot2.mcap -o robot2.clf.gz --sensors scan-topic=/front/scan",
-    ),
-)(record.record)
-app.command(
-    "serve",
-    rich_help_panel=ROBOTS,
-    epilog=examples(
-        "fcslam serve --data cloud",
-        "fcslam serve --data cloud --host 0.0.0.0 --credentials credentials",
-    ),
-)(serve.serve)
-app.command(
-    "demo",
-    rich_help_panel=STUDY,
-    epilog=examples(
-        "fcslam demo --live",
-        "fcslam demo --robots 4 --no-camera -o demo4",
-    ),
-)(demo.demo)
-app.add_typer(evaluate.app, name="evaluate", rich_help_panel=STUDY)
 tools = typer.Typer(
     no_args_is_help=True,
     help="Simulate recordings, compare dates, train the cameras' detector, and set up a fleet.",
     epilog=examples("fcslam tools simulate --building office", "fcslam tools config > mission.yaml"),
 )
-tools.command(
-    "simulate",
-    rich_help_panel=RECORDINGS,
-    epilog=examples(
-        "fcslam tools simulate --building office --no-camera",
-        "fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3",
-        "fcslam tools simulate --robots 20 --building office -o office",
-    ),
-)(simulate.simulate)
-tools.command(
-    "changes",
-    rich_help_panel=RECORDINGS,
-    epilog=examples(
-        "fcslam tools changes runs/building",
-        "fcslam tools changes runs/building --since 2026-11-20 -o changes/week",
-    ),
-)(changed.changes)
-tools.command(
-    "config",
-    rich_help_panel=SETUP,
-    epilog=examples(
-        "fcslam tools config > mission.yaml",
-        "fcslam map robot1.bag robot2.bag --config mission.yaml",
-        "fcslam tools config paper > paper.yaml",
-    ),
-)(config.config)
-tools.command(
-    "certificates",
-    rich_help_panel=SETUP,
-    epilog=examples(
-        "fcslam tools certificates --host cloud.local --robot robot1 --admin boss",
-    ),
-)(certificates.certificates)
-tools.command(
-    "warm-up",
-    rich_help_panel=SETUP,
-    epilog=examples(
-        "fcslam tools warm-up",
-    ),
-)(warming.warm_up)
-tools.command(
-    "train",
-    rich_help_panel=LEARNING,
-    epilog=examples(
-        "fcslam tools train photos -o detector",
-        "fcslam tools train photos --quick",
-    ),
-)(train.train)
-tools.add_typer(federate.app, name="federate", rich_help_panel=LEARNING)
-tools.command(
-    "extract",
-    rich_help_panel=LEARNING,
-    epilog=examples(
-        "fcslam tools extract photos -o features --keypoints 1000",
-    ),
-)(extract.extract)
-tools.command(
-    "vocabulary",
-    rich_help_panel=LEARNING,
-    epilog=examples(
-        "fcslam tools vocabulary runs/building -o building.words",
-    ),
-)(vocabulary.vocabulary)
-app.add_typer(tools, name="tools", rich_help_panel=STUDY)
+COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
+    "map": (MAPS, mapping.map_recordings),
+    "info": (MAPS, info.info),
+    "show": (MAPS, show.show),
+    "edit": (MAPS, edit.app),
+    "robot": (ROBOTS, robots.robot),
+    "play": (ROBOTS, playback.play),
+    "localize": (ROBOTS, localization.localize),
+    "record": (ROBOTS, record.record),
+    "serve": (ROBOTS, serve.serve),
+    "demo": (STUDY, demo.demo),
+    "evaluate": (STUDY, evaluate.app),
+    "tools": (STUDY, tools),
+    "tools simulate": (RECORDINGS, simulate.simulate),
+    "tools changes": (RECORDINGS, changed.changes),
+    "tools config": (SETUP, config.config),
+    "tools certificates": (SETUP, certificates.certificates),
+    "tools warm-up": (SETUP, warming.warm_up),
+    "tools train": (LEARNING, train.train),
+    "tools federate": (LEARNING, federate.app),
+    "tools extract": (LEARNING, extract.extract),
+    "tools vocabulary": (LEARNING, vocabulary.vocabulary),
+}
+"""Group in the help, and function, of each command. A typer has commands and examples of its own."""
+EXAMPLES = """\
+fcslam map robot1.clf.gz robot2.clf.gz
+fcslam map anna=run1.bag ben=run2.mcap -o runs/building
+fcslam map building.clf.gz --split 3 --quiet
+fcslam map robot1.bag robot2.bag --live
+fcslam map today.bag --onto runs/building -o runs/building-2
+fcslam map --onto runs/building -o runs/building-edited
+fcslam info robot1.bag
+fcslam info robot1.mcap --json
+fcslam show runs/building
+fcslam show runs/building --html report.html
+fcslam show runs/building/mission.fcslam --port 8350 --no-open
+fcslam robot ros2:/robot1 -o runs/robot1
+fcslam robot ros2:/robot1 --server https://hub --state s --credentials c
+fcslam robot anna=ros1:/robot1 --sensors scan-topic=/front/scan
+fcslam robot --explain-traffic
+fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state
+fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c
+fcslam localize today.bag --map runs/building
+fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57
+fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy
+fcslam record ros2:/robot1 -o day.mcap
+fcslam record ros1:/ -o day.bag --duration 600
+fcslam record robot1.clf.gz -o robot1.bag
+fcslam record robot2.mcap -o robot2.clf.gz --sensors scan-topic=/front/scan
+fcslam serve --data cloud
+fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
+fcslam demo --live
+fcslam demo --robots 4 --no-camera -o demo4
+fcslam tools simulate --building office --no-camera
+fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3
+fcslam tools simulate --robots 20 --building office -o office
+fcslam tools changes runs/building
+fcslam tools changes runs/building --since 2026-11-20 -o changes/week
+fcslam tools config > mission.yaml
+fcslam tools config paper > paper.yaml
+fcslam tools certificates --host cloud.local --robot robot1 --admin boss
+fcslam tools warm-up
+fcslam tools train photos -o detector
+fcslam tools train photos --quick
+fcslam tools extract photos -o features --keypoints 1000
+fcslam tools vocabulary runs/building -o building.words
+"""
+"""Of the help of each command: the lines that begin with it."""
+
+
+def _register() -> None:
+    for path, (panel, command) in COMMANDS.items():
+        group, name = (tools if path.startswith("tools ") else app), path.removeprefix("tools ")
+        if isinstance(command, typer.Typer):
+            group.add_typer(command, name=name, rich_help_panel=panel)
+            continue
+        shown = [line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"fcslam {path} ")]
+        group.command(name, rich_help_panel=panel, epilog=examples(*shown))(command)
+
+
+_register()
 
 
 def _finite(text: str) -> float:
