@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.records import (
+    CODE_BYTES,
     Beams,
     Channel,
-    Codes,
     Constraint,
     ConstraintKind,
     Correction,
@@ -34,11 +34,21 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import (
+    BYTES_PER_AXIS,
+    BYTES_PER_RANGE,
+    BYTES_PER_TILE,
+    BYTES_PER_WORD,
+    FIX_VERSION,
+    FLOOR_VERSION,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASERS,
+    PROTOCOL_VERSION,
     SWEEP_NUMBERS,
+    SWEEP_VERSION,
+    TAG_VERSION,
+    WORDS_VERSION,
 )
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind
 from fcslam.wire.quantisation import (
@@ -175,85 +185,65 @@ def _round_information(body: Measurement) -> Measurement:
 
 
 def _write_place(place: Place) -> pb.Place:
-    codes, descriptors = _in_order(place)
-    return pb.Place(
-        number=place.id.number,
-        channel=_CHANNELS[place.channel],
-        detector_version=place.detector_version,
-        first=place.first,
-        last=place.last,
-        count=len(codes),
-        keypoints=pack_keypoints(codes),
-        descriptors=pack_descriptors(descriptors, codes, place.channel),
-    )
-
-
-def _in_order(place: Place) -> tuple[KeypointCodes, Codes]:
-    """Keypoints in ascending order, as they are sent, and their descriptors."""
-    codes = quantise_keypoints(place.keypoints)
-    order = ascending(codes)
-    return codes[order], place.descriptors[order]
-
-
-def _round_place(place: Place) -> Place:
-    codes, descriptors = _in_order(place)
-    return replace(place, keypoints=dequantise_keypoints(codes), descriptors=frozen(descriptors, np.uint8))
-
-
-def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
-    _check_at_most(message.count, MAXIMUM_KEYPOINTS, "place: keypoints")
-    channel = read_channel(message.channel)
-    codes = unpack_keypoints(message.keypoints, message.count, KEYPOINT_AXES[channel])
-    return Place(
-        KeyscanId(envelope.robot, message.number),
-        channel,
-        message.detector_version,
-        message.first,
-        message.last,
-        dequantise_keypoints(codes),
-        frozen(unpack_descriptors(message.descriptors, codes, channel), np.uint8),
-    )
+    codes, order = _in_order(place)
+    descriptors = pack_descriptors(place.descriptors[order], codes, place.channel)
+    return pb.Place(**_described(place, codes), descriptors=descriptors)
 
 
 def _write_word_place(place: WordPlace) -> pb.WordPlace:
-    codes, words = _words_in_order(place)
-    return pb.WordPlace(
-        number=place.id.number,
-        channel=_CHANNELS[place.channel],
-        detector_version=place.detector_version,
-        first=place.first,
-        last=place.last,
-        count=len(codes),
-        keypoints=pack_keypoints(codes),
-        words=pack_words(words),
-    )
+    codes, order = _in_order(place)
+    return pb.WordPlace(**_described(place, codes), words=pack_words(place.words[order]))
 
 
-def _words_in_order(place: WordPlace) -> tuple[KeypointCodes, NDArray[np.uint16]]:
-    """Keypoints in ascending order, as they are sent, and their words."""
+def _in_order(place: Place | WordPlace) -> tuple[KeypointCodes, NDArray[np.intp]]:
+    """Keypoints in ascending order, as they are sent, and the order."""
     codes = quantise_keypoints(place.keypoints)
     order = ascending(codes)
-    return codes[order], place.words[order]
+    return codes[order], order
+
+
+def _described(place: Place | WordPlace, codes: KeypointCodes) -> dict[str, Any]:
+    """The fields that both kinds of places have."""
+    return {
+        "number": place.id.number,
+        "channel": _CHANNELS[place.channel],
+        "detector_version": place.detector_version,
+        "first": place.first,
+        "last": place.last,
+        "count": len(codes),
+        "keypoints": pack_keypoints(codes),
+    }
+
+
+def _round_place(place: Place) -> Place:
+    codes, order = _in_order(place)
+    return replace(place, keypoints=dequantise_keypoints(codes), descriptors=frozen(place.descriptors[order], np.uint8))
 
 
 def _round_word_place(place: WordPlace) -> WordPlace:
-    codes, words = _words_in_order(place)
-    return replace(place, keypoints=dequantise_keypoints(codes), words=frozen(words, np.uint16))
+    codes, order = _in_order(place)
+    return replace(place, keypoints=dequantise_keypoints(codes), words=frozen(place.words[order], np.uint16))
+
+
+def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
+    described, channel, codes = _read_described(message, envelope, "place")
+    return Place(*described, frozen(unpack_descriptors(message.descriptors, codes, channel), np.uint8))
 
 
 def _read_word_place(message: pb.WordPlace, envelope: pb.Packet) -> WordPlace:
-    _check_at_most(message.count, MAXIMUM_KEYPOINTS, "word place: keypoints")
+    described, _, _ = _read_described(message, envelope, "word place")
+    return WordPlace(*described, frozen(unpack_words(message.words, message.count), np.uint16))
+
+
+def _read_described(
+    message: pb.Place | pb.WordPlace, envelope: pb.Packet, what: str
+) -> tuple[tuple[KeyscanId, Channel, str, int, int, NDArray[np.float32]], Channel, KeypointCodes]:
+    """The fields that both kinds of places have, the channel, and the keypoints as they are sent."""
+    _check_at_most(message.count, MAXIMUM_KEYPOINTS, f"{what}: keypoints")
     channel = read_channel(message.channel)
     codes = unpack_keypoints(message.keypoints, message.count, KEYPOINT_AXES[channel])
-    return WordPlace(
-        KeyscanId(envelope.robot, message.number),
-        channel,
-        message.detector_version,
-        message.first,
-        message.last,
-        dequantise_keypoints(codes),
-        frozen(unpack_words(message.words, message.count), np.uint16),
-    )
+    number, keypoints = KeyscanId(envelope.robot, message.number), dequantise_keypoints(codes)
+    return (number, channel, message.detector_version, message.first, message.last, keypoints), channel, codes
 
 
 def _write_map_tile(tile: MapTile) -> pb.MapTile:
@@ -376,27 +366,71 @@ def read_channel(code: int) -> Channel:
     return channel
 
 
+def _same(body: Any) -> Any:
+    return body
+
+
+_MOST_AXES = max(KEYPOINT_AXES.values())
+
+
+def _hello_version(hello: Hello) -> int:
+    return WORDS_VERSION if hello.vocabularies else FLOOR_VERSION if hello.floor else PROTOCOL_VERSION
+
+
+def _keyscan_version(keyscan: Keyscan) -> int:
+    if not len(keyscan.ranges_m):
+        return WORDS_VERSION
+    return PROTOCOL_VERSION if keyscan.sweep is None else SWEEP_VERSION
+
+
+def _keyscan_bytes(message: pb.Keyscan) -> int:
+    return BYTES_PER_RANGE * min(message.count, MAXIMUM_BEAMS)
+
+
+def _place_bytes(message: pb.Place) -> int:
+    return (BYTES_PER_AXIS * _MOST_AXES + CODE_BYTES) * min(message.count, MAXIMUM_KEYPOINTS)
+
+
+def _word_place_bytes(message: pb.WordPlace) -> int:
+    return (BYTES_PER_AXIS * _MOST_AXES + BYTES_PER_WORD) * min(message.count, MAXIMUM_KEYPOINTS)
+
+
 class Codec(NamedTuple):
-    """Writer and reader of one kind of record; the reader takes robot and epoch from the envelope."""
+    """One kind of record. Its reader takes robot and epoch from the envelope."""
 
     type: type
     write: Callable[[Any], Message]
     read: Callable[[Any, pb.Packet], Any]
-    round: Callable[[Any], Any] = lambda body: body
+    round: Callable[[Any], Any] = _same
     """Return a record as it is after writing and reading, without doing either; most kinds keep every number."""
+    version: int | Callable[[Any], int] = PROTOCOL_VERSION
+    """Version of the packet, perhaps by the record."""
+    unpacked_bytes: Callable[[Any], int] = lambda _: 0
+    """Bytes of the streams of a message, unpacked, by its counts."""
+
+    def version_of(self, body: Any) -> int:
+        """Version of the packet of a record."""
+        return self.version if isinstance(self.version, int) else self.version(body)
 
 
 CODECS = {
-    PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
-    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
+    PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello, version=_hello_version),
+    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _keyscan_bytes),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place),
-    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place),
-    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile),
-    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information),
-    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, PROTOCOL_VERSION, _place_bytes),
+    PacketKind.WORD_PLACE: Codec(
+        WordPlace, _write_word_place, _read_word_place, _round_word_place, WORDS_VERSION, _word_place_bytes
+    ),
+    PacketKind.MAP_TILE: Codec(
+        MapTile, _write_map_tile, _read_map_tile, _same, WORDS_VERSION, lambda _: BYTES_PER_TILE
+    ),
+    PacketKind.TAG_SIGHTING: Codec(
+        TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, TAG_VERSION
+    ),
+    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix, version=FIX_VERSION),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),
 }
+"""All that depends on the kind of a packet, but for its checks (``fcslam.wire.checks``)."""
 CODEC_OF_TYPE = {codec.type: (kind, codec) for kind, codec in CODECS.items()}

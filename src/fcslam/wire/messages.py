@@ -35,18 +35,7 @@ class PacketKind(StrEnum):
     DETECTOR_UPDATE = "detector_update"
 
 
-UPLINK = frozenset(
-    {
-        PacketKind.HELLO,
-        PacketKind.KEYSCAN,
-        PacketKind.CONSTRAINT,
-        PacketKind.PLACE,
-        PacketKind.WORD_PLACE,
-        PacketKind.MAP_TILE,
-        PacketKind.TAG_SIGHTING,
-        PacketKind.KEYSCAN_FIX,
-    }
-)
+UPLINK = frozenset(PacketKind) - {PacketKind.CORRECTION, PacketKind.ACKNOWLEDGEMENT, PacketKind.DETECTOR_UPDATE}
 """Kinds that robots send; the cloud sends the others."""
 
 

@@ -6,21 +6,14 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Channel, Keyscan, KeyscanFix, MapTile, Place, TagSighting, WordPlace
+from fcslam.records import Channel, Place, WordPlace
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
 from fcslam.wire.limits import (
-    BYTES_PER_AXIS,
-    BYTES_PER_RANGE,
-    BYTES_PER_TILE,
-    BYTES_PER_WORD,
     FIX_VERSION,
     FLOOR_VERSION,
-    KEYPOINT_AXES,
-    MAXIMUM_BEAMS,
     MAXIMUM_EPOCH,
-    MAXIMUM_KEYPOINTS,
     MAXIMUM_PACKET_BYTES,
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
@@ -28,14 +21,8 @@ from fcslam.wire.limits import (
     TAG_VERSION,
     WORDS_VERSION,
 )
-from fcslam.wire.messages import Body, Hello, Packet, PacketKind
+from fcslam.wire.messages import Packet, PacketKind
 
-_VERSION_OF: dict[type, int] = {
-    WordPlace: WORDS_VERSION,
-    MapTile: WORDS_VERSION,
-    TagSighting: TAG_VERSION,
-    KeyscanFix: FIX_VERSION,
-}
 _VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION)
 
 
@@ -58,7 +45,7 @@ def encode(packet: Packet) -> bytes:
     kind, codec = CODEC_OF_TYPE[type(packet.body)]
     body: dict[str, Any] = {kind: codec.write(packet.body)}
     message = pb.Packet(
-        version=_version(packet.body),
+        version=codec.version_of(packet.body),
         robot=packet.robot,
         epoch=packet.epoch,
         sequence=packet.sequence,
@@ -105,11 +92,12 @@ def decode(data: bytes) -> Packet:
         PacketError: ``data`` is not a valid packet of a known version; the message says why.
     """
     message, kind = _parse(data)
-    body = CODECS[kind].read(getattr(message, kind), message)
+    codec = CODECS[kind]
+    body = codec.read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
     check(packet)
-    if message.version != _version(body):
-        raise PacketError(f"version {message.version} of a packet of version {_version(body)}")
+    if message.version != (version := codec.version_of(body)):
+        raise PacketError(f"version {message.version} of a packet of version {version}")
     return packet
 
 
@@ -146,17 +134,7 @@ def unpacked_size(data: bytes) -> int:
         message, kind = _parse(data)
     except PacketError:
         return len(data)
-    if kind is PacketKind.KEYSCAN:
-        return len(data) + BYTES_PER_RANGE * min(message.keyscan.count, MAXIMUM_BEAMS)
-    if kind is PacketKind.PLACE:
-        axes = max(KEYPOINT_AXES.values())
-        return len(data) + (BYTES_PER_AXIS * axes + CODE_BYTES) * min(message.place.count, MAXIMUM_KEYPOINTS)
-    if kind is PacketKind.WORD_PLACE:
-        axes = max(KEYPOINT_AXES.values())
-        return len(data) + (BYTES_PER_AXIS * axes + BYTES_PER_WORD) * min(message.word_place.count, MAXIMUM_KEYPOINTS)
-    if kind is PacketKind.MAP_TILE:
-        return len(data) + BYTES_PER_TILE
-    return len(data)
+    return len(data) + CODECS[kind].unpacked_bytes(getattr(message, kind))
 
 
 def read_number(data: bytes) -> tuple[str, int, int] | None:
@@ -170,18 +148,6 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
     numbered = message.epoch <= MAXIMUM_EPOCH and message.sequence <= MAXIMUM_SEQUENCE
     known = message.version in _VERSIONS and numbered
     return (message.robot, message.epoch, message.sequence) if known else None
-
-
-def _version(body: Body) -> int:
-    match body:
-        case Keyscan(ranges_m=ranges_m, sweep=sweep):
-            return WORDS_VERSION if not len(ranges_m) else PROTOCOL_VERSION if sweep is None else SWEEP_VERSION
-        case Hello(vocabularies=vocabularies) if vocabularies:
-            return WORDS_VERSION
-        case Hello(floor=floor) if floor:
-            return FLOOR_VERSION
-        case _:
-            return _VERSION_OF.get(type(body), PROTOCOL_VERSION)
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
