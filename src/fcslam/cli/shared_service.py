@@ -1,7 +1,6 @@
 """The state of an instance of the service that shares its store with others."""
 
 import os
-import secrets
 import signal
 import socket
 import time
@@ -18,6 +17,7 @@ from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.state import ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.audit_table import AuditTable
+from fcslam.service.shared.instance import Hooks
 from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.missions import Admission, SharedMissions
 from fcslam.service.shared.registry import KnownMission
@@ -66,19 +66,8 @@ def shared_state(
 
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)
-        missions = SharedMissions(
-            data,
-            config,
-            server,
-            name,
-            secrets.token_hex(8),
-            admission,
-            time.monotonic,
-            time.time,
-            launch,
-            events.publish,
-            lambda: os.kill(os.getpid(), signal.SIGTERM),
-        )
+        hooks = Hooks(launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        missions = SharedMissions(data, config, server, name, admission, hooks)
         log = AuditLog(audit, time.time)
         missions.closing = opened.pop_all().close
         return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log)

@@ -4,7 +4,7 @@ import threading
 
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.service.shared.detectors import SharedDetectors
-from fcslam.service.shared.instance import Instance
+from fcslam.service.shared.instance import Hooks, Instance
 
 
 def test_other_instances_announce_a_detector_and_have_its_file(postgres, tmp_path):
@@ -19,7 +19,7 @@ def test_other_instances_announce_a_detector_and_have_its_file(postgres, tmp_pat
 def test_an_instance_follows_the_store_at_each_step(registry, tmp_path):
     followed = threading.Semaphore(0)
     nothing = lambda *_: None  # noqa: E731
-    instance = Instance(registry, "one", 0, nothing, nothing, nothing, followed.release)
+    instance = Instance(registry, "one", 0, Hooks(nothing, nothing, nothing, followed.release))
     instance.start()
     try:
         assert all(followed.acquire(timeout=120.0) for _ in range(2))

@@ -13,7 +13,7 @@ from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import BusyError, LeaseError
 from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
 from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import GRACE_S, REST_LOOK_S, REST_S, Instance, fair_part
+from fcslam.service.shared.instance import GRACE_S, REST_LOOK_S, REST_S, Hooks, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.registry import Registry
 from tests.mission.test_mission_store import packet
@@ -48,7 +48,7 @@ def instance(postgres, name, room=10, clock=time.monotonic):
         return workers[-1]
 
     registry = Registry(postgres, name, f"process of {name}")
-    return Instance(registry, name, room, launch, lambda *_: None, lambda: None, lambda: None, clock), workers
+    return Instance(registry, name, room, Hooks(launch, lambda *_: None, lambda: None), clock), workers
 
 
 EXPIRY = "fcslam.service.shared.registry._EXPIRY"
@@ -150,9 +150,9 @@ def test_two_instances_of_one_name_are_refused(registry, postgres, monkeypatch):
     one.start()
     again = Registry(postgres, "same", "another process")
     with pytest.raises(ServiceError, match="is called 'same'; stop it, or give this one another --port"):
-        Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None)
+        Instance(again, "same", 1, Hooks(Started, lambda *_: None, lambda: None))
     one.close()
-    Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
+    Instance(again, "same", 1, Hooks(Started, lambda *_: None, lambda: None)).close()
 
 
 def test_the_name_of_a_killed_instance_is_free_again(registry, postgres, monkeypatch):
@@ -160,7 +160,7 @@ def test_the_name_of_a_killed_instance_is_free_again(registry, postgres, monkeyp
         patched.setattr(EXPIRY, "clock_timestamp() + interval '0.3 seconds'")
         assert Registry(postgres, "killed", "before").register(1)
     after = Registry(postgres, "killed", "after")
-    Instance(after, "killed", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
+    Instance(after, "killed", 1, Hooks(Started, lambda *_: None, lambda: None)).close()
 
 
 @pytest.mark.slow

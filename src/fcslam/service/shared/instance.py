@@ -31,6 +31,18 @@ Listen = Callable[[str, str, int], None]
 """Receives the name of a mission, an event and its number."""
 
 
+class Hooks(NamedTuple):
+    """What an instance calls."""
+
+    launch: Launch
+    listen: Listen
+    """Receives what happened to missions, whoever has their worker."""
+    on_taken: Callable[[], None]
+    """Called when another process has taken the name, after this one was gone for a while."""
+    follow: Callable[[], None] = lambda: None
+    """Called at each step, to take over what other instances put into the store."""
+
+
 class Elsewhere(NamedTuple):
     """The worker of a mission on another instance, as this one sees it."""
 
@@ -54,10 +66,7 @@ class Instance:
         registry: Registry,
         name: str,
         most_missions: int,
-        launch: Launch,
-        listen: Listen,
-        on_taken: Callable[[], None],
-        follow: Callable[[], None],
+        hooks: Hooks,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take the name.
@@ -66,18 +75,14 @@ class Instance:
             registry: of all instances.
             name: of this one.
             most_missions: how many workers it runs.
-            launch: starts a worker.
-            listen: receives what happened to missions, whoever has their worker.
-            on_taken: called when another process has taken the name, after this one was gone for a while.
-            follow: called at each step, to take over what other instances put into the store.
+            hooks: what it calls.
             clock: seconds.
 
         Raises:
             ServiceError: another instance has this name.
             StoreError: the server cannot be used.
         """
-        self._registry, self._name, self._most, self._launch = registry, name, most_missions, launch
-        self._listen, self._on_taken, self._follow, self._clock = listen, on_taken, follow, clock
+        self._registry, self._name, self._most, self._hooks, self._clock = registry, name, most_missions, hooks, clock
         self._closing = threading.Event()
         self._take_name()
         self._held: dict[Lease, RunningWorker] = {}
@@ -124,9 +129,9 @@ class Instance:
         for name, mission in self._known.items():
             old = before.get(name)
             if old is not None and mission.live > old.live:
-                self._listen(name, "live", mission.live)
+                self._hooks.listen(name, "live", mission.live)
             if old is not None and mission.finalized > old.finalized:
-                self._listen(name, "finalized", mission.finalized)
+                self._hooks.listen(name, "finalized", mission.finalized)
 
     def _take_name(self) -> None:
         for _ in range(round(NAME_S / LOOK_S)):
@@ -152,7 +157,7 @@ class Instance:
     def _step(self) -> None:
         if not self._registry.register(self._most):
             _log.error("another instance took the name '%s'; this one stops", self._name)
-            self._on_taken()
+            self._hooks.on_taken()
             self._closing.set()
             return
         ending = [(lease, False) for lease in list(self._ending)]
@@ -161,7 +166,7 @@ class Instance:
             _log.warning("mission %d has a worker on another instance now", lease.mission)
             threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
         self.look()
-        self._follow()
+        self._hooks.follow()
         self._let_rest()
         self._spread()
 
@@ -191,7 +196,7 @@ class Instance:
         if is_any_free and may_claim and len(self._held) < part:
             for lease in self._registry.claim(part - len(self._held)):
                 mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
-                self._held[lease] = self._launch(mission, lease)
+                self._held[lease] = self._hooks.launch(mission, lease)
         elif not is_any_free and not self._ending and len(self._held) > part:
             self._end(next(reversed(self._held)))
 

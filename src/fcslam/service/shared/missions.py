@@ -2,6 +2,7 @@
 
 import logging
 import math
+import secrets
 import shutil
 import threading
 import time
@@ -20,7 +21,7 @@ from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, che
 from fcslam.service.shared.agents import RobotLimit, SharedAgents
 from fcslam.service.shared.detectors import SharedDetectors
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, fetch_folder, fetched
-from fcslam.service.shared.instance import Elsewhere, Instance, Launch, Listen
+from fcslam.service.shared.instance import Elsewhere, Hooks, Instance
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import RunningWorker
@@ -62,12 +63,11 @@ class SharedMission(OpenMission):
         store: MissionStore,
         intake: Intake,
         instance: Instance,
-        wall_clock: Callable[[], float],
     ) -> None:
         self._number, self._server, self._instance = number, server, instance
         self._fetching = threading.Lock()
         self._joint_at_s = -math.inf
-        super().__init__(folder, store, intake, self._find_worker, wall_clock)
+        super().__init__(folder, store, intake, self._find_worker, time.time)
 
     def _find_worker(self) -> RunningWorker:
         here = self._instance.worker(self._number)
@@ -138,14 +138,9 @@ class SharedMissions:
         root: Path,
         config: CloudConfig,
         server: Postgres,
-        instance: str,
-        process: str,
+        name: str,
         admission: Admission,
-        clock: Callable[[], float],
-        wall_clock: Callable[[], float],
-        launch: Launch,
-        listen: Listen,
-        on_taken: Callable[[], None],
+        hooks: Hooks,
     ) -> None:
         """Take the instance's name, and create the first mission if there is none.
 
@@ -153,10 +148,9 @@ class SharedMissions:
             root: folder of this instance's own files, which can be made again from the store.
             config: of new missions.
             server: the store.
-            instance, process, on_taken: see ``Instance`` and ``Registry``.
+            name: of the instance.
             admission: how much the instance takes.
-            clock, wall_clock: seconds; since 1970.
-            launch, listen: see ``Instance``.
+            hooks: what it calls.
 
         Raises:
             ServiceError: the folder cannot be used, or another instance has the name.
@@ -165,21 +159,20 @@ class SharedMissions:
         self.root = root
         self.closing: Callable[[], object] = lambda: None
         """Called after the last mission is given up."""
-        self._config, self._server, self._clock, self._wall_clock = config, server, clock, wall_clock
+        self._config, self._server = config, server
         self._lock = locked(root)
         try:
             sweep(root)
             for seen in root.glob(f"missions/*/{_SEEN}"):
                 shutil.rmtree(seen, ignore_errors=True)
             self.detectors = SharedDetectors(root / "detectors", server)
-            self._robots = RobotLimit(admission.robots, clock)
-            self._registry = Registry(server, instance, process)
+            self._robots = RobotLimit(admission.robots, time.monotonic)
+            self._registry = Registry(server, name, secrets.token_hex(8))
             self._opening = threading.Lock()
             self._opened: dict[str, SharedMission] = {}
             self.detectors.follow()
-            self._instance = Instance(
-                self._registry, instance, admission.missions, launch, listen, on_taken, self.detectors.follow
-            )
+            hooks = hooks._replace(follow=self.detectors.follow)
+            self._instance = Instance(self._registry, name, admission.missions, hooks)
             if not any(known.is_open for known in self._instance.known.values()):
                 self._open_first()
             self._instance.start()
@@ -290,9 +283,7 @@ class SharedMissions:
                 store = MissionStore(MissionTables(self._server, known.number))
                 settings = store.configure(self._config).fleet
                 check_words(name, settings)
-                agents = SharedAgents(self._server, known.number, self._robots, self._clock)
-                intake = Intake(store, self._clock, self._wall_clock, self.detectors.announced, settings.claims, agents)
-                self._opened[name] = SharedMission(
-                    known.number, folder, self._server, store, intake, self._instance, self._wall_clock
-                )
+                agents = SharedAgents(self._server, known.number, self._robots, time.monotonic)
+                intake = Intake(store, time.monotonic, time.time, self.detectors.announced, settings.claims, agents)
+                self._opened[name] = SharedMission(known.number, folder, self._server, store, intake, self._instance)
             return self._opened[name]
