@@ -20,6 +20,7 @@ _INFORMATION_RATIO = 1e4
 _WEIGHT_EXPONENT = -0.9
 """Exponent of chi-square in the weight of a closure."""
 
+_MOST_REWEIGHTINGS = 20
 _WEIGHT_TOLERANCE = 1e-3
 """Largest change of a weight at which reweighting ends."""
 
@@ -59,7 +60,7 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
     return poses
 
 
-def initialize_robust(graph: PoseGraph, rounds: int = 20) -> FloatArray:
+def initialize_robust(graph: PoseGraph) -> FloatArray:
     """Compute poses as ``initialize``, with closures reweighted until false ones hardly count.
 
     Iteratively reweighted least squares with weight ``d^-1.8`` at a residual of d > 1 standard deviations. After large
@@ -69,7 +70,6 @@ def initialize_robust(graph: PoseGraph, rounds: int = 20) -> FloatArray:
 
     Args:
         graph: N variables.
-        rounds: largest number of reweightings.
 
     Returns:
         Poses, shape (N, 3), metres and radians.
@@ -77,7 +77,7 @@ def initialize_robust(graph: PoseGraph, rounds: int = 20) -> FloatArray:
     robust = graph.arrays().robust
     weights = np.ones(len(robust))
     poses = initialize(graph, weights)
-    for _ in range(rounds):
+    for _ in range(_MOST_REWEIGHTINGS):
         reweighted = np.where(robust, np.maximum(graph.chi2(poses), 1.0) ** _WEIGHT_EXPONENT, 1.0)
         if np.abs(reweighted - weights).max(initial=0.0) < _WEIGHT_TOLERANCE:
             break

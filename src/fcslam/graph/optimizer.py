@@ -160,7 +160,6 @@ def refine_inliers(
     initial: ArrayLike | None,
     weights: ArrayLike,
     *,
-    settings: GncSettings | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
     """Alternate solving and deciding every closure by its residual, until no decision changes.
@@ -172,7 +171,6 @@ def refine_inliers(
         graph: N variables and E edges.
         initial: poses to start from, shape (N, 3); None: the graph's own.
         weights: weights of the edges, shape (E,); closures above one half are trusted at the start.
-        settings: threshold of the decision.
         factors: as in ``optimize``.
 
     Returns:
@@ -181,7 +179,7 @@ def refine_inliers(
     Raises:
         ValueError: ``weights`` do not fit the graph, or as ``optimize``.
     """
-    chosen = settings or GncSettings()
+    limit = GncSettings().limit
     start, cache = _start(graph, initial), _cache(graph, factors)
     trusted = np.asarray(weights, dtype=np.float64)
     if trusted.shape != (len(graph.edges),):
@@ -190,8 +188,8 @@ def refine_inliers(
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     robust = graph.arrays().robust
     steps = _Steps(cache, start)
-    decided = _alternate(steps, chosen.limit, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
-    return _with_truncated_cost(graph, start, steps, decided, chosen.limit)
+    decided = _alternate(steps, limit, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
+    return _with_truncated_cost(graph, start, steps, decided, limit)
 
 
 class _Steps:

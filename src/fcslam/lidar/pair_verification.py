@@ -87,9 +87,9 @@ class VerificationPool:
     A submap takes longer to send than to compare. Each process keeps those that it got, by a hash of their content.
     """
 
-    def __init__(self, processes: Processes, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(self, processes: Processes) -> None:
         """Start with no submap sent; the caller shuts the executors down."""
-        self._processes, self._clock = processes, clock
+        self._processes = processes
         self._peers: dict[Executor, _Peer] = {}
         self._hashes: dict[int, tuple[bytes, Submap]] = {}
         """By identity; the reference keeps the identity from being used again. Newest last."""
@@ -105,7 +105,7 @@ class VerificationPool:
         return [judge(found, config, pair.noise) for found, pair in zip(aligned, pairs, strict=True)]
 
     def _present(self) -> "list[_Peer]":
-        executors, now = self._processes(), self._clock()
+        executors, now = self._processes(), time.perf_counter()
         self._peers = {executor: self._peers.get(executor) or _Peer(executor) for executor in executors}
         return [peer for peer in self._peers.values() if peer.rests_until <= now]
 
@@ -115,9 +115,9 @@ class VerificationPool:
             self._hand_out(call, peers)
             if call.todo:
                 batch = call.todo.pop()
-                began = self._clock()
+                began = time.perf_counter()
                 call.done[batch] = [align(p.a, p.b, p.T_a_b_guess, p.prior) for p in pairs[_slice(batch)]]
-                self._measured((self._clock() - began) / len(batch))
+                self._measured((time.perf_counter() - began) / len(batch))
             else:
                 wait(call.running, self._until_late_s(call), FIRST_COMPLETED)
             self._collect(call)
@@ -127,7 +127,7 @@ class VerificationPool:
         """Give batches to all processes that have room for them; the last one is done here."""
         for _ in range(AHEAD):
             for peer in peers:
-                if len(call.todo) <= 1 or peer.rests_until > self._clock() or not peer.has_room():
+                if len(call.todo) <= 1 or peer.rests_until > time.perf_counter() or not peer.has_room():
                     continue
                 batch = call.todo.popleft()
                 try:
@@ -136,15 +136,15 @@ class VerificationPool:
                     self._failed(peer, error)
                     call.todo.append(batch)
                 else:
-                    late_s = self._clock() + PATIENCE_S + PATIENCE_FACTOR * AHEAD * len(batch) * self._pair_s
+                    late_s = time.perf_counter() + PATIENCE_S + PATIENCE_FACTOR * AHEAD * len(batch) * self._pair_s
                     call.running[future] = _Running(peer, batch, late_s)
 
     def _until_late_s(self, call: "_Call") -> float:
-        return max(0.0, min(running.late_s for running in call.running.values()) - self._clock())
+        return max(0.0, min(running.late_s for running in call.running.values()) - time.perf_counter())
 
     def _collect(self, call: "_Call") -> None:
         for future, (peer, batch, late_s) in list(call.running.items()):
-            if not future.done() and self._clock() < late_s:
+            if not future.done() and time.perf_counter() < late_s:
                 continue
             del call.running[future]
             found = self._result(peer, future, len(batch))
@@ -174,7 +174,7 @@ class VerificationPool:
         _log.log(level, "another process verifies the closures of one that failed: %s: %s", type(error).__name__, error)
         peer.warned = True
         peer.sent.clear()
-        peer.rests_until = math.inf if local else self._clock() + REST_S
+        peer.rests_until = math.inf if local else time.perf_counter() + REST_S
 
     def _measured(self, pair_s: float) -> None:
         shortest, longest = _LENGTH_S

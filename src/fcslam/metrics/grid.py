@@ -68,9 +68,7 @@ class GridAgreement:
         return 2.0 * self.precision * self.recall / (self.precision + self.recall)
 
 
-def grid_agreement(
-    grid: LabelledGrid, truth: LabelledGrid, T_truth_map: FloatArray, tolerance_m: float = TOLERANCE_M
-) -> GridAgreement:
+def grid_agreement(grid: LabelledGrid, truth: LabelledGrid, T_truth_map: FloatArray) -> GridAgreement:
     """Compare ``grid`` with ``truth``.
 
     Grids are not resampled: cell centres are transformed, and free space is looked up at them.
@@ -79,27 +77,26 @@ def grid_agreement(
         grid: the map, in its frame ``map``.
         truth: the true map, in its own frame.
         T_truth_map: pose of ``map`` in the frame of the truth, shape (3,); NaN if unknown.
-        tolerance_m: largest distance of matching surfaces.
     """
     if not np.isfinite(T_truth_map).all():
         return GridAgreement(np.nan, np.nan, np.nan)
     surfaces = se2.transform(T_truth_map, grid.centres(grid.occupied))
     true_surfaces = truth.centres(truth.occupied)
     return GridAgreement(
-        _share_near(surfaces, true_surfaces, tolerance_m),
-        _share_near(true_surfaces, surfaces, tolerance_m),
+        _share_near(surfaces, true_surfaces),
+        _share_near(true_surfaces, surfaces),
         _free_iou(grid, truth, T_truth_map),
     )
 
 
-def _share_near(points: FloatArray, others: FloatArray, tolerance_m: float) -> float:
+def _share_near(points: FloatArray, others: FloatArray) -> float:
     """Share of ``points`` (N, 2) with one of ``others`` (M, 2) within the tolerance; NaN without points."""
     if not len(points):
         return np.nan
     if not len(others):
         return 0.0
-    distance, _ = cKDTree(others).query(points, distance_upper_bound=tolerance_m + 2.0 * _ROUNDING_M)
-    return float(np.mean(distance <= tolerance_m + _ROUNDING_M))
+    distance, _ = cKDTree(others).query(points, distance_upper_bound=TOLERANCE_M + 2.0 * _ROUNDING_M)
+    return float(np.mean(distance <= TOLERANCE_M + _ROUNDING_M))
 
 
 def _free_iou(grid: LabelledGrid, truth: LabelledGrid, T_truth_map: FloatArray) -> float:

@@ -1,7 +1,6 @@
 """The clock of a robot on a ROS network: the computer's, or that of a simulator or of a bag that is played."""
 
 import time
-from collections.abc import Callable
 
 from fcslam.sources.bags.codec import MessageCodec
 
@@ -11,9 +10,8 @@ CLOCK_TOPIC, CLOCK = "/clock", "rosgraph_msgs/Clock"
 class RosClock:
     """Time in nanoseconds. With ``simulated`` it is what the last message on /clock says."""
 
-    def __init__(self, simulated: bool, wall_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, simulated: bool) -> None:
         self.simulated = simulated
-        self._wall_ns = wall_ns
         self._ticked_ns: int | None = None
 
     @property
@@ -31,4 +29,4 @@ class RosClock:
 
     def now_ns(self) -> int:
         """The time; 0 before the first message on /clock."""
-        return (self._ticked_ns or 0) if self.simulated else self._wall_ns()
+        return (self._ticked_ns or 0) if self.simulated else time.time_ns()

@@ -19,6 +19,7 @@ RESOLUTION_M = 0.05
 
 _STEP_M, _TURN_RAD = 0.2, 0.2
 """Distance and turn between the scans that are drawn; closer scans add almost nothing to the map."""
+_REACH_M = 5.0
 _INTO_M = 1e-3
 """A beam is extended by this, so that its end falls into the cell of the wall, not of the free space before it."""
 _MARGIN = 2
@@ -62,14 +63,12 @@ def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Gener
         write_file(place / "tags.yaml", "\n".join((f"family: {FAMILY}", "tags:", *lines, "")).encode())
 
 
-def true_relations(
-    robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0
-) -> Relations:
-    """Draw up to ``count`` true relations between scans of any robots, within ``reach_m`` and more than 20 s apart."""
+def true_relations(robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000) -> Relations:
+    """Draw up to ``count`` true relations between scans of any robots, within 5 m and more than 20 s apart."""
     stamps = np.concatenate([robot.stamps for robot in robots])
     poses = np.concatenate([robot.T_building_base for robot in robots])
     first, second = rng.integers(0, len(stamps), (2, 50 * count))
-    near = np.hypot(*(poses[first, :2] - poses[second, :2]).T) < reach_m
+    near = np.hypot(*(poses[first, :2] - poses[second, :2]).T) < _REACH_M
     apart = np.abs(stamps[first] - stamps[second]) > ACROSS_ROBOTS_GAP_S
     chosen = np.flatnonzero(near & apart)[:count]
     first, second = first[chosen], second[chosen]

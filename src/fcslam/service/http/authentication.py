@@ -2,7 +2,7 @@
 
 import hashlib
 import hmac
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -57,12 +57,9 @@ class TokensFile(Settings):
 class Authenticator:
     """Tells who has a token."""
 
-    def __init__(
-        self, tokens: Sequence[TokenEntry] | None, clock: Callable[[], datetime] = lambda: datetime.now(UTC)
-    ) -> None:
+    def __init__(self, tokens: Sequence[TokenEntry] | None) -> None:
         """None: no authentication; every client may do everything."""
         self._tokens = tokens
-        self._clock = clock
 
     def replace(self, tokens: Sequence[TokenEntry]) -> list[str]:
         """Use these tokens from the next request on; returns the names whose token is new, gone or another one."""
@@ -89,7 +86,7 @@ class Authenticator:
         found = None
         for entry in self._tokens or ():
             if hmac.compare_digest(entry.sha256, digest) and scheme.lower() == "bearer":
-                is_valid = entry.expires is None or self._clock() < entry.expires
+                is_valid = entry.expires is None or datetime.now(UTC) < entry.expires
                 found = Identity(entry.name, entry.role) if is_valid else None
         return found
 

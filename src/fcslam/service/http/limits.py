@@ -26,11 +26,9 @@ _Model = TypeVar("_Model", bound=BaseModel)
 class RateLimit:
     """Bytes of each robot's requests. Any thread may call."""
 
-    def __init__(
-        self, clock: Callable[[], float], bytes_per_s: float = BYTES_PER_S, burst: float = BURST_BYTES
-    ) -> None:
+    def __init__(self, clock: Callable[[], float], burst: float = BURST_BYTES) -> None:
         self._burst = burst
-        self._buckets = TokenBuckets(clock, bytes_per_s, burst)
+        self._buckets = TokenBuckets(clock, BYTES_PER_S, burst)
 
     @property
     def largest(self) -> int:

@@ -16,10 +16,10 @@ KEPT: Final = 2
 class Spares:
     """Starts workers: a spare one if there is one, and a new spare one in its place. Any thread may call."""
 
-    def __init__(self, kept: int = KEPT) -> None:
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._is_closed = False
-        self._waiting = [self._new() for _ in range(kept)]
+        self._waiting = [self._new() for _ in range(KEPT)]
 
     def start(self, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
         """Let a worker begin with these arguments."""

@@ -66,10 +66,10 @@ def matching_descriptors(a: Codes, b: Codes) -> float:
 class PretrainedVocabulary:
     """Bags of words as in DBoW2: a tree and idf weights trained offline on other images, which never change."""
 
-    def __init__(self, training: Sequence[Codes], seed: int, shape: TreeShape = FOREIGN_SHAPE) -> None:
+    def __init__(self, training: Sequence[Codes], seed: int) -> None:
         """Train the tree on the descriptors (N, 32) of each training image."""
         images = [code_words(codes) for codes in training]
-        self._tree: Tree = grow_tree(np.concatenate(images), shape, np.uint64(seed))
+        self._tree: Tree = grow_tree(np.concatenate(images), FOREIGN_SHAPE, np.uint64(seed))
         documents = np.zeros(len(self._tree.centres))
         for codes in images:
             documents[np.unique(find_leaves(self._tree, codes))] += 1.0
