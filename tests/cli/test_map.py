@@ -348,8 +348,8 @@ def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
         (("--start", "robot"), "--start robot= '' is not a pose"),
         (("--start", "robot=0,0,0", "--start", "robot=1,0,0"), "two starts"),
         (("--start", "nobody=0,0,0"), "a start names 'nobody', but the robots are"),
-        (("--start-sigma", "0.3"), "fleet.start_sigma.1: Field required"),
-        (("--start-sigma", "0.3,-1"), "fleet.start_sigma.1: Input should be greater than 0"),
+        (("-c", "fleet.start_sigma=[0.3]"), "fleet.start_sigma.1: Field required"),
+        (("-c", "fleet.start_sigma=[0.3,-1]"), "fleet.start_sigma.1: Input should be greater than 0"),
     ],
 )
 def test_a_start_that_cannot_be_is_refused(tmp_path, log, capsys, options, reason):

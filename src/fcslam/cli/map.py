@@ -102,15 +102,7 @@ def map_recordings(
         typer.Option(
             metavar="NAME=X,Y,THETA",
             help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
-            "forces nothing. Can be repeated.",
-        ),
-    ] = None,
-    start_sigma: Annotated[
-        str | None,
-        typer.Option(
-            metavar="M,RAD",
-            help="Standard deviations of the starts: of x and y, and of the heading.",
-            show_default="that of the configuration",
+            "forces nothing; `-c fleet.start_sigma=[M,RAD]` says how exactly you know it. Can be repeated.",
         ),
     ] = None,
     sensors: Sensors = None,
@@ -133,7 +125,7 @@ def map_recordings(
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = EMPTY if onto is None else read_mission(onto)
-        settings = with_starts(mission_config(config, continued_config(earlier)), start, start_sigma)
+        settings = with_starts(mission_config(config, continued_config(earlier)), start)
         anchors = _anchors(plan, plan_scale, align, tags)
         options = bag_options(sensors)
         if not logs and onto is None:

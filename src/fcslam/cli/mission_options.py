@@ -81,8 +81,8 @@ def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None"
     return chosen_settings(base, chosen, {preset.value: preset.file for preset in Preset})
 
 
-def with_starts(config: "MissionConfig", starts: Sequence[str] | None, sigma: str | None) -> "MissionConfig":
-    """The configuration with the starts of ``--start NAME=X,Y,THETA`` and their standard deviations.
+def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "MissionConfig":
+    """The configuration with the starts of ``--start NAME=X,Y,THETA``.
 
     Raises:
         ConfigError: a robot is given two starts, or a name or a number cannot be used.
@@ -95,9 +95,5 @@ def with_starts(config: "MissionConfig", starts: Sequence[str] | None, sigma: st
     named = [start.partition("=")[::2] for start in starts or ()]
     if len(dict(named)) < len(named):
         raise ConfigError("--start: a robot is given two starts; give one for each")
-    fleet: dict[str, object] = {}
-    if named:
-        fleet["starts"] = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
-    if sigma is not None:
-        fleet["start_sigma"] = sigma.split(",")
-    return changed(config, {"fleet": fleet}, "the command line") if fleet else config
+    poses = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+    return changed(config, {"fleet": {"starts": poses}}, "the command line") if poses else config

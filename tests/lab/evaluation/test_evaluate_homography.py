@@ -212,7 +212,7 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
     arguments = ["evaluate", "homography", str(scenes), "--detector", "orb", "--detector", "fast"]
     assert main([*arguments, "--csv", str(tmp_path / "t.csv")]) == 0
     out = capsys.readouterr().out
-    for title in ("I. Repeatability", "II. Homography estimation", "orb less the others", "3 pairs, corrected"):
+    for title in ("I. Repeatability", "II. Homography estimation", "orb less the others", "3 pairs. In brackets"):
         assert title in out
     with (tmp_path / "t.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -104,14 +104,14 @@ def test_extracted_features_are_those_of_the_detector(folders, tmp_path):
 @pytest.mark.slow
 def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    arguments = [*map(str, folders), "--train-on", str(folders[1]), "--strategy", "incremental", "--verify"]
+    arguments = [*map(str, folders), "--train-on", str(folders[1]), "--verify"]
     assert main(["evaluate", "places", *arguments, "-o", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "generic, matches: 5 queries" in shown
     assert "tour, loops: 20 queries" in shown
     with (tmp_path / "places.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert {row["scorer"] for row in rows} == {"brute force", "foreign tree", "incremental"}
+    assert {row["scorer"] for row in rows} == {"brute force", "foreign tree", "static", "windowed", "incremental"}
     recalls = {row["scorer"]: row["value"] for row in rows if (row["set"], row["measure"]) == ("tour", "recall_at_1")}
     assert recalls["brute force"] == "1"
     matrices = [np.load(tmp_path / "generic" / "incremental" / f"{name}.npy") for name in ("similarity", "verified")]
@@ -129,7 +129,6 @@ def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsy
         (["{generic}", "{generic}"], "another set generic"),
         (["{generic}", "--features", "surf"], "no such features"),
         (["{generic}", "--features", "{nowhere}"], "cannot read the features"),
-        (["{generic}", "--strategy", "magic"], "not one of static"),
         (["{generic}", "--label", "floor1"], "no labels"),
         (["{generic}", "--train-on", "{nowhere}"], "no file there"),
         (["{generic}/matches.csv"], "matches.csv"),

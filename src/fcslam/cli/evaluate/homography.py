@@ -9,7 +9,6 @@ import typer
 from fcslam.cli.evaluate.arguments import SEED
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
-from fcslam.metrics.framing import HomographyGroundTruth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,12 +35,6 @@ def homography(
             show_default="all",
         ),
     ] = None,
-    ground_truth: Annotated[
-        HomographyGroundTruth,
-        typer.Option(
-            help="True homography: corrected, or legacy, which ignores crops and scales as published tables do."
-        ),
-    ] = HomographyGroundTruth.CORRECTED,
     csv: Annotated[Path | None, typer.Option(help="Write all measures of all pairs to this CSV file.")] = None,
 ) -> None:
     """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
@@ -50,6 +43,7 @@ def homography(
     from fcslam.lab.evaluation.detectors.homography import evaluate_homography
     from fcslam.lab.evaluation.detectors.measures import write_pairs
     from fcslam.lab.evaluation.detectors.scenes import find_scenes
+    from fcslam.metrics.framing import HomographyGroundTruth
 
     found = find_scenes(scenes)
     kinds = [EvaluatedDetectorKind(one) for one in detector or () if one in list(EvaluatedDetectorKind)]
@@ -60,13 +54,13 @@ def homography(
     detectors = choose_detectors(kinds, weights, [place for place in places if place.suffix != ".onnx"])
     with ProgressDisplay(notices()) as display:
         evaluated = display.start("evaluating", len(found) * len(detectors))
-        report = evaluate_homography(found, detectors, ground_truth, evaluated)
+        report = evaluate_homography(found, detectors, HomographyGroundTruth.CORRECTED, evaluated)
     if csv is not None:
         write_pairs(report, csv)
-    _show(answers(), report, ground_truth)
+    _show(answers(), report)
 
 
-def _show(console: "Console", report: "HomographyReport", truth: HomographyGroundTruth) -> None:
+def _show(console: "Console", report: "HomographyReport") -> None:
     described = [name for name in report.detectors if report.of(name)[0].matching]
     console.print(_repeatability_table(report))
     if described:
@@ -76,8 +70,7 @@ def _show(console: "Console", report: "HomographyReport", truth: HomographyGroun
     if len(report.detectors) > 1:
         console.print(_difference_table(report))
     for line in (
-        f"{len(report.of(report.detectors[0]))} pairs, {truth} ground truth. In brackets: 95 % intervals by bootstrap "
-        "over pairs.",
+        f"{len(report.of(report.detectors[0]))} pairs. In brackets: 95 % intervals by bootstrap over pairs.",
         "Repeatability at 320 x 240, NMS 4, of the 300 strongest keypoints in common view; correct to 3 px.",
         "Homography at 640 x 480 by mutual nearest neighbours among the 1000 strongest in common view, RANSAC at 3 px: "
         "share of pairs whose corners are right to e px on average.",

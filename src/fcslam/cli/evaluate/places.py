@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.places.report import SetResult
     from fcslam.metrics.bootstrap import Interval
-    from fcslam.places.vocabulary import Strategy
 
 
 def places(
@@ -29,13 +28,6 @@ def places(
         Path | None, output_option("Folder for the table, the curves and the similarity matrices.", EVALUATIONS)
     ] = None,
     features: Features = "orb",
-    strategy: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Strategy of the vocabulary: static, rebuild, windowed or incremental. Can be repeated.",
-            show_default="all but rebuild",
-        ),
-    ] = None,
     train_on: TrainOn = None,
     label: Label = None,
     verify: Annotated[
@@ -47,10 +39,9 @@ def places(
     from fcslam.lab.evaluation.places.figures import curves_figure, save
     from fcslam.lab.evaluation.places.report import write_results
 
-    strategies = _strategies(strategy or ("static", "windowed", "incremental"))
     output = output or new_folder(EVALUATIONS)
     with ProgressDisplay(notices()) as display:
-        results = _evaluate(sets, features, label or (), train_on or (), strategies, display, verify=verify)
+        results = _evaluate(sets, features, label or (), train_on or (), display, verify=verify)
     write_results(output, results)
     save(curves_figure(results), output / "precision_recall.png")
     _show(answers(), results, output)
@@ -61,7 +52,6 @@ def _evaluate(
     features: str,
     labels: "Sequence[str]",
     train_on: "Sequence[Path]",
-    strategies: "Sequence[Strategy]",
     display: "ProgressDisplay",
     *,
     verify: bool,
@@ -70,27 +60,18 @@ def _evaluate(
     from fcslam.lab.evaluation.places.report import evaluate_set
     from fcslam.lab.evaluation.places.scoring import choose_scorers
     from fcslam.lab.evaluation.places.verification import PairVerifier
-    from fcslam.places.vocabulary import VocabularyConfig
+    from fcslam.places.vocabulary import Strategy, VocabularyConfig
 
     chosen = choose_features(features)
     described_one = display.start("describing")
     training = describe_training(train_on, chosen, described_one)
     described = describe_sets(sets, labels, chosen, described_one)
+    strategies = Strategy.STATIC, Strategy.WINDOWED, Strategy.INCREMENTAL
     scorers = choose_scorers(strategies, VocabularyConfig(), training, SEED)
     compared_one = display.start("comparing", len(scorers) * len(described))
     return [
         evaluate_set(each, scorers, PairVerifier(each) if verify else None, SEED, compared_one) for each in described
     ]
-
-
-def _strategies(names: "Sequence[str]") -> "list[Strategy]":
-    from fcslam.places.vocabulary import Strategy
-
-    known = [strategy.value for strategy in Strategy]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise typer.BadParameter(f"'{unknown[0]}' is not one of {', '.join(known)}", param_hint="--strategy")
-    return [Strategy(name) for name in dict.fromkeys(names)]
 
 
 def _show(console: "Console", results: "Sequence[SetResult]", output: Path) -> None:
