@@ -140,20 +140,21 @@ def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, cap
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_path, number):
+def test_a_robot_that_is_stopped_twice_says_what_is_left_and_goes_on_later(log, cloud, tmp_path):
     # A process in the background of a shell ignores SIGINT.
     heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     command = [sys.executable, "-c", f"{heeds}; import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"]
-    nowhere = ["play", str(log), "--state", str(tmp_path), "--speed", "2", "--server"]
-    with subprocess.Popen([*command, *nowhere, "http://127.0.0.1:9"], stderr=subprocess.PIPE, text=True) as robot:
-        assert "127.0.0.1:9" in robot.stderr.readline()
-        robot.send_signal(number)
-        err = robot.stderr.read()
-    assert robot.returncode == 130
-    assert re.search(r"\d+ packets \(\d+ kB\) wait in .*; to continue, give --resume", err.replace("\n", " "))
-    assert "Traceback" not in err
-    assert main([*nowhere[:-3], "--server", cloud.url, "--resume"]) == 0
+    play = ["play", str(log), "--state", str(tmp_path)]
+    nowhere = ["--speed", "2", "--server", "http://127.0.0.1:9"]
+    for number, options in ((signal.SIGINT, nowhere), (signal.SIGTERM, [*nowhere, "--resume"])):
+        with subprocess.Popen([*command, *play, *options], stderr=subprocess.PIPE, text=True) as robot:
+            assert "127.0.0.1:9" in robot.stderr.readline()
+            robot.send_signal(number)
+            err = robot.stderr.read()
+        assert robot.returncode == 130
+        assert re.search(r"\d+ packets \(\d+ kB\) wait in .*; to continue, give --resume", err.replace("\n", " "))
+        assert "Traceback" not in err
+    assert main([*play, "--server", cloud.url, "--resume"]) == 0
     assert list(cloud.cloud.stored) == [(0, k) for k in range(len(cloud.cloud.stored))]
 
 
