@@ -15,7 +15,7 @@ from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import transport_covariance
 from fcslam.lidar.closing import AnchoredSubmap, LocalClosure, LoopCloser, PlaceRecognizer
-from fcslam.lidar.frontend import LidarConfig, MappedKeyscan
+from fcslam.lidar.frontend import SUBMAP_REACH_M, LidarConfig, MappedKeyscan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import Constraint, ConstraintKind, FloatArray, frozen
 
@@ -97,12 +97,12 @@ class LidarBackend:
         gate, window = self._gate, self._window
         travel = [keyscan.travel_m for keyscan in window]
         middle = bisect_left(travel, self._next_anchor_m)
-        if middle == len(window) or (not at_end and travel[-1] < travel[middle] + gate.submap_reach_m):
+        if middle == len(window) or (not at_end and travel[-1] < travel[middle] + SUBMAP_REACH_M):
             return None
         anchor = window[middle]
         self._next_anchor_m = anchor.travel_m + gate.submap_every_m
-        first = bisect_left(travel, anchor.travel_m - gate.submap_reach_m)
-        last = bisect_right(travel, anchor.travel_m + gate.submap_reach_m) - 1
+        first = bisect_left(travel, anchor.travel_m - SUBMAP_REACH_M)
+        last = bisect_right(travel, anchor.travel_m + SUBMAP_REACH_M) - 1
         submap = build_submap(
             [(k.points, se2.between(anchor.T_local_base, k.T_local_base)) for k in window[first : last + 1]]
         )

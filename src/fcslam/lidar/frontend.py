@@ -34,6 +34,8 @@ from fcslam.records import (
 TURN_AS_TRAVEL_M = 0.1
 """Travel that one radian of turning counts as, metres: a robot that only turns completes submaps, too."""
 
+SUBMAP_REACH_M = 5.0
+"""Travel before and after its anchor that a submap covers."""
 POINT_INFORMATION_SHARE = 0.1
 """Share of the points' information that counts: errors of neighbouring points are correlated, ten count as one."""
 ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_PER_TRAVEL = 0.01, 0.1
@@ -59,9 +61,6 @@ class KeyscanConfig(Settings):
         default=0.25, gt=0, description="turn since the last keyscan after which a scan becomes a keyscan [rad]"
     )
     submap_every_m: float = Field(default=2.0, gt=0, description="travel between the anchors of two submaps [m]")
-    submap_reach_m: float = Field(
-        default=5.0, gt=0, description="travel before and after its anchor that a submap covers [m]"
-    )
 
 
 class LidarConfig(Settings):
@@ -139,7 +138,7 @@ class LidarFrontend:
         self._begun_m = 0.0
         """Path length at which the local map began."""
         self._recent: deque[MappedKeyscan] = deque()
-        """The keyscans of the last ``submap_reach_m`` of travel."""
+        """The keyscans of the last ``SUBMAP_REACH_M`` of travel."""
 
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; nothing changes before ``process``."""
@@ -191,7 +190,7 @@ class LidarFrontend:
         self._begun_m = self.travel_m
 
     def recent_submap(self) -> tuple[Submap, FloatArray]:
-        """The submap of the last ``submap_reach_m`` of travel.
+        """The submap of the last ``SUBMAP_REACH_M`` of travel.
 
         Returns:
             The submap, in the base of the newest keyscan, and ``T_local_base`` of this keyscan, shape (3,).
@@ -234,7 +233,7 @@ class LidarFrontend:
         self._newest = newest
         self._count += 1
         self._recent.append(newest)
-        while self._recent[0].travel_m < travel_m - self.config.keyscans.submap_reach_m:
+        while self._recent[0].travel_m < travel_m - SUBMAP_REACH_M:
             self._recent.popleft()
         return newest
 
