@@ -4,7 +4,7 @@ import fcntl
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.cloud.shared_words import SharedWords
@@ -132,46 +132,8 @@ def _check_file(folder: MissionFolder) -> None:
         )
 
 
-class ServedMissions(Protocol):
-    """All missions of a service: ``Missions``, or those that several instances share."""
-
-    @property
-    def root(self) -> Path:
-        """Folder of the service's own files."""
-
-    @property
-    def detectors(self) -> DetectorStore:
-        """Detectors that robots may download."""
-
-    @property
-    def names(self) -> list[str]:
-        """All missions."""
-
-    @property
-    def open_mission(self) -> OpenMission:
-        """The mission that a request is about."""
-
-    def create(self, name: str) -> None:
-        """Create a mission and open it."""
-
-    def open(self, name: str) -> None:
-        """Open a mission."""
-
-    def result(self, name: str, number: int) -> Path | None:
-        """The run folder of a result of a mission; None if there is none."""
-
-    def export(self, name: str, path: Path) -> None:
-        """Write a mission as one new file."""
-
-    def import_mission(self, name: str, path: Path) -> None:
-        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""
-
-    def close(self) -> None:
-        """Close all missions."""
-
-
 class Missions:
-    """All missions below one folder, which this service locks."""
+    """All missions below one folder, which this service locks; ``SharedMissions`` has the same methods."""
 
     def __init__(
         self,

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from fcslam.cloud.stage_times import StageTotal
 
@@ -50,20 +50,15 @@ class RunningWorker(Protocol):
     def applied(self) -> int:
         """How many packets the present worker has applied, those of its snapshot included."""
 
+    @property
+    def stages(self) -> Mapping[str, StageTotal]:
+        """Totals of the present worker's stages, by name."""
+
     def notify(self) -> None:
         """Notify the worker of new packets or requests."""
 
     def stop(self) -> None:
         """Stop the worker after its current step, and wait."""
-
-
-@runtime_checkable
-class MeasuredWorker(Protocol):
-    """A worker that says what its stages cost."""
-
-    @property
-    def stages(self) -> Mapping[str, StageTotal]:
-        """Totals of the present worker's stages, by name."""
 
 
 WORKER = (sys.executable, "-m", "fcslam.service.worker")

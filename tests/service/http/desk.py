@@ -11,6 +11,7 @@ import httpx
 import uvicorn
 
 from fcslam.cloud.settings import CloudConfig
+from fcslam.cloud.stage_times import StageTotal
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel
 from fcslam.service.audit_log import AuditFile, AuditLog
@@ -53,6 +54,7 @@ class InlineWorker:
 
     def __init__(self, folder: MissionFolder) -> None:
         self._now = 0.0
+        self.stages: dict[str, StageTotal] = {}
         self._store = MissionStore(folder.store)
         self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None, InlineTask)
 

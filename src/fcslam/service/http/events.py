@@ -4,7 +4,6 @@ import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 WAITING = 100
 """Largest backlog of a slow subscriber, in events; it loses the oldest ones beyond."""
@@ -16,13 +15,6 @@ class Event:
 
     kind: str
     number: int
-
-
-class Watched(Protocol):
-    """Events that subscribers may follow."""
-
-    def watch(self) -> AsyncIterator[Event]:
-        """Yield the newest event of each kind, then each new event."""
 
 
 class EventStream:

@@ -67,8 +67,6 @@ def mission_router(state: ServiceState) -> APIRouter:
     @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
     async def open_mission(name: Name) -> MissionList:
         """Open a mission; robots' packets go to it from now on."""
-        if name not in state.missions.names:
-            raise HTTPException(404, f"there is no mission '{name}'")
         async with state.changing:
             await run_in_threadpool(state.missions.open, name)
         return _missions(state)
@@ -106,8 +104,6 @@ def file_router(state: ServiceState) -> APIRouter:
     )
     async def export_mission(name: Name) -> StreamingResponse:
         """A mission as one file."""
-        if name not in state.missions.names:
-            raise HTTPException(404, f"there is no mission '{name}'")
         return await _download(state, f"{name}.sqlite", FILE, lambda path: state.missions.export(name, path))
 
     @router.get(

@@ -11,7 +11,6 @@ from prometheus_client.registry import Collector
 
 from fcslam.cloud.stage_times import StageTotal
 from fcslam.service.missions import OpenMission
-from fcslam.service.supervisor import MeasuredWorker
 from fcslam.wire.batches import read_batch
 from fcslam.wire.ledger import Traffic
 from fcslam.wire.packets import read_label
@@ -119,8 +118,7 @@ class _Stages(Collector):
 
     def follow(self, mission: OpenMission) -> None:
         """Take over the totals of the mission's worker."""
-        worker = mission.worker
-        self._totals = worker.stages if isinstance(worker, MeasuredWorker) else {}
+        self._totals = mission.worker.stages
 
     def collect(self) -> Iterator[CounterMetricFamily]:
         """For the registry."""

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from fastapi import Depends, HTTPException, Request, Security
 from fastapi.params import Depends as Dependency
@@ -15,11 +15,14 @@ from starlette.types import Scope
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Identity, Role
-from fcslam.service.http.events import Watched
+from fcslam.service.http.events import EventStream, EventStreams
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
-from fcslam.service.missions import OpenMission, ServedMissions
+from fcslam.service.missions import Missions, OpenMission
 from fcslam.service.viewed_mission import ViewedMission
+
+if TYPE_CHECKING:
+    from fcslam.service.shared.missions import SharedMissions
 
 ANYBODY = "anybody"
 """The author of what is done without authentication."""
@@ -36,7 +39,7 @@ class ViewerState(Protocol):
         """The mission that viewers see."""
 
     @property
-    def events(self) -> Watched:
+    def events(self) -> EventStream | EventStreams:
         """Changes of it."""
 
     @property
@@ -58,10 +61,10 @@ class ViewerState(Protocol):
 class ServiceState:
     """Passed to every router."""
 
-    missions: ServedMissions
+    missions: "Missions | SharedMissions"
     authenticator: Authenticator
     rate: RateLimit
-    events: Watched
+    events: EventStream | EventStreams
     audit: AuditLog
     learning: Path | None = None
     """Output folder of a federated training, for viewers."""

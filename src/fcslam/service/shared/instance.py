@@ -4,8 +4,10 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
+from fcslam.cloud.stage_times import StageTotal
 from fcslam.errors import ServiceError, StoreError
 from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.registry import LEASE_S, KnownMission, Registry
@@ -50,6 +52,7 @@ class Elsewhere(NamedTuple):
     applied: int
     pid: int | None = None
     starts: int = 0
+    stages: Mapping[str, StageTotal] = MappingProxyType({})
 
     def notify(self) -> None:
         """It looks for itself."""
