@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,13 +20,15 @@ from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import EditError, PacketConflictError, StoreError
-from fcslam.records import Change, Channel, Correction, Edit, ManualClosure, Removal, Undo, frozen
+from fcslam.records import Change, Channel, Constraint, Correction, Edit, Keyscan, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction
 from fcslam.untrusted import check_unpacked, open_database, unpack
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
 from fcslam.wire.packets import Label, decode
+
+_Body = TypeVar("_Body", Hello, Keyscan, Constraint)
 
 APPLIED = "applied"
 """A fact: how many packets took effect."""
@@ -229,31 +231,29 @@ class MissionStore:
             self._database.value("SELECT count(*) FROM packets WHERE robot = ? AND refusal IS NOT NULL", (robot,))
         )
 
-    def newest_hello(self, robot: str, epoch: int) -> bytes | None:
-        """The session's newest hello, encoded."""
+    def newest_hello(self, robot: str, epoch: int) -> Hello | None:
+        """The session's newest hello."""
         where = "robot = ? AND epoch = ? AND kind = 'hello' AND refusal IS NULL"
-        statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence DESC LIMIT 1"
-        hello: bytes | None = self._database.value(statement, (robot, epoch))
-        return hello
+        return _first(self._bodies(Hello, f"{where} ORDER BY sequence DESC LIMIT 1", robot, epoch))
 
-    def keyscans_near(self, robot: str, epoch: int, time: float, limit: int) -> list[bytes]:
-        """At most ``limit`` keyscans of a session that it sent nearest to a time, encoded."""
-        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL"
-        statement = f"SELECT data FROM packets WHERE {where} ORDER BY abs(time - ?) LIMIT ?"
-        return [data for (data,) in self._database.rows(statement, (robot, epoch, PacketKind.KEYSCAN, time, limit))]
+    def newest_keyscan(self, robot: str, epoch: int) -> Keyscan | None:
+        """The session's newest keyscan."""
+        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL ORDER BY sequence DESC LIMIT 1"
+        return _first(self._bodies(Keyscan, where, robot, epoch, PacketKind.KEYSCAN))
 
-    def newest_keyscan(self, robot: str, epoch: int) -> bytes | None:
-        """The session's newest keyscan, encoded."""
-        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL"
-        statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence DESC LIMIT 1"
-        keyscan: bytes | None = self._database.value(statement, (robot, epoch, PacketKind.KEYSCAN))
-        return keyscan
+    def keyscans_near(self, robot: str, epoch: int, time: float, limit: int) -> list[Keyscan]:
+        """At most ``limit`` keyscans of a session that it sent nearest to a time."""
+        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL ORDER BY abs(time - ?) LIMIT ?"
+        return self._bodies(Keyscan, where, robot, epoch, PacketKind.KEYSCAN, time, limit)
 
-    def constraints_since(self, robot: str, epoch: int, time: float) -> list[bytes]:
-        """Constraints of a session that it sent at this time or later, in their order, encoded."""
-        where = "robot = ? AND epoch = ? AND kind = ? AND time >= ? AND refusal IS NULL"
-        statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence"
-        return [data for (data,) in self._database.rows(statement, (robot, epoch, PacketKind.CONSTRAINT, time))]
+    def constraints_since(self, robot: str, epoch: int, time: float) -> list[Constraint]:
+        """Constraints of a session that it sent at this time or later, in their order."""
+        where = "robot = ? AND epoch = ? AND kind = ? AND time >= ? AND refusal IS NULL ORDER BY sequence"
+        return self._bodies(Constraint, where, robot, epoch, PacketKind.CONSTRAINT, time)
+
+    def _bodies(self, kind: type[_Body], where: str, *values: Any) -> list[_Body]:
+        rows = self._database.rows(f"SELECT data FROM packets WHERE {where}", values)
+        return [body for (data,) in rows if isinstance(body := decode(data).body, kind)]
 
     def progress(self, applied: int, corrections: Sequence[SessionCorrection]) -> None:
         """Note how many packets took effect; corrections that are news get a new version."""
@@ -317,12 +317,8 @@ class MissionStore:
 
     def _floor(self, session: str) -> str:
         """Floor that a session names; empty if none."""
-        statement = (
-            "SELECT data FROM packets WHERE robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL ORDER BY sequence"
-        )
-        rows = self._database.rows(f"{statement} LIMIT 1", (*robot_and_epoch(session), PacketKind.HELLO))
-        hellos = (decode(data).body for (data,) in rows)
-        return next((hello.floor for hello in hellos if isinstance(hello, Hello)), "")
+        hello = self.newest_hello(*robot_and_epoch(session))
+        return "" if hello is None else hello.floor
 
     def edits(self, after: int = 0) -> list[Edit]:
         """The edits after number ``after``, in their order."""
@@ -552,6 +548,10 @@ def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
     if len(track.keyscans) and (track.keyscans.min() < 0):
         raise ValueError("a keyscan has a negative number")
     return track
+
+
+def _first(bodies: list[_Body]) -> _Body | None:
+    return bodies[0] if bodies else None
 
 
 def _packet(

@@ -10,10 +10,8 @@ from fcslam.lidar.submap import SPACING_M
 from fcslam.maps.closure_picture import closure_png
 from fcslam.maps.palette import ROBOTS, robot_colors
 from fcslam.mission.mission_store import MissionStore
-from fcslam.records import FloatArray, Keyscan
+from fcslam.records import FloatArray
 from fcslam.runs import ClosureRow, Run
-from fcslam.wire.messages import Hello
-from fcslam.wire.packets import decode
 
 KEYSCANS = 31
 """Number of keyscans in a picture, for each end: about 4 m of path before it and after it."""
@@ -42,15 +40,11 @@ def _submap(store: MissionStore, run: Run, session: str, stamp: float) -> FloatA
     hello, trajectory = store.newest_hello(robot, epoch), run.trajectories.get(session)
     if hello is None or trajectory is None:
         raise EvaluationError(f"the mission holds no keyscans of {session}")
-    announced = decode(hello).body
-    assert isinstance(announced, Hello)
     scans = []
-    for data in store.keyscans_near(robot, epoch, stamp, KEYSCANS):
-        keyscan = decode(data).body
-        assert isinstance(keyscan, Keyscan)
+    for keyscan in store.keyscans_near(robot, epoch, stamp, KEYSCANS):
         nearest = int(np.argmin(np.abs(trajectory.stamps - keyscan.stamp)))
         if abs(trajectory.stamps[nearest] - keyscan.stamp) < SAME_S:
-            points = keyscan_points(keyscan, announced.lasers).thinned(SPACING_M).points
+            points = keyscan_points(keyscan, hello.lasers).thinned(SPACING_M).points
             scans.append((keyscan.stamp, trajectory.T_map_base[nearest], points))
     if not scans or min(abs(at - stamp) for at, _, _ in scans) > SAME_S:
         raise EvaluationError(f"the mission holds no keyscan of {session} at {stamp:.3f} s")

@@ -16,7 +16,7 @@ from fcslam.records import Channel, DetectorFile, Place, WordPlace
 from fcslam.service.token_buckets import TokenBuckets
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
-from fcslam.wire.messages import UPLINK, Hello, PacketKind
+from fcslam.wire.messages import UPLINK, PacketKind
 from fcslam.wire.packets import decode, encode, read_label, read_number
 
 LEASE_S = 30.0
@@ -243,9 +243,8 @@ class Intake:
         return write_batch(encode(reply) for reply in replies(robot, state, known_correction, announced))
 
     def _detector_versions(self, robot: str, epoch: int) -> Mapping[Channel, str] | None:
-        data = self._store.newest_hello(robot, epoch)
-        hello = decode(data).body if data else None
-        return hello.detector_versions if isinstance(hello, Hello) else None
+        hello = self._store.newest_hello(robot, epoch)
+        return None if hello is None else hello.detector_versions
 
 
 def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:

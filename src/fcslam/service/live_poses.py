@@ -5,10 +5,8 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.lidar.scan import keyscan_points
 from fcslam.mission.mission_store import MissionStore
-from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan
+from fcslam.records import ConstraintKind, FloatArray
 from fcslam.runs import RobotTrajectory
-from fcslam.wire.messages import Hello
-from fcslam.wire.packets import decode
 
 SCAN_POINTS = 1000
 """Largest number of points of a scan that viewers get."""
@@ -23,13 +21,10 @@ def live_pose(store: MissionStore, robot: str, epoch: int, drawn: RobotTrajector
     anchors = store.keyscans_near(robot, epoch, float(drawn.stamps[-1]), 1)
     if not anchors:
         return last
-    anchor = decode(anchors[0]).body
-    assert isinstance(anchor, Keyscan)
+    anchor = anchors[0]
     pose = drawn.T_map_base[int(np.argmin(np.abs(drawn.stamps - anchor.stamp)))]
     number = moved = anchor.id.number
-    for data in store.constraints_since(robot, epoch, anchor.stamp):
-        step = decode(data).body
-        assert isinstance(step, Constraint)
+    for step in store.constraints_since(robot, epoch, anchor.stamp):
         if step.kind is ConstraintKind.ODOMETRY and (step.i, step.j) == (moved, moved + 1):
             pose, moved = se2.compose(pose, step.T_i_j), step.j
     return last if moved == number else pose
@@ -37,11 +32,8 @@ def live_pose(store: MissionStore, robot: str, epoch: int, drawn: RobotTrajector
 
 def live_scan(store: MissionStore, robot: str, epoch: int) -> FloatArray:
     """Points of the session's newest scan in the robot's base frame, shape (N, 2), metres; none before the first."""
-    hello, newest = store.newest_hello(robot, epoch), store.newest_keyscan(robot, epoch)
-    if hello is None or newest is None:
+    hello, keyscan = store.newest_hello(robot, epoch), store.newest_keyscan(robot, epoch)
+    if hello is None or keyscan is None:
         return np.empty((0, 2))
-    announced, keyscan = decode(hello).body, decode(newest).body
-    assert isinstance(announced, Hello)
-    assert isinstance(keyscan, Keyscan)
-    points: FloatArray = keyscan_points(keyscan, announced.lasers).points
+    points: FloatArray = keyscan_points(keyscan, hello.lasers).points
     return points[:: -(-len(points) // SCAN_POINTS) or 1]

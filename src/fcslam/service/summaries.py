@@ -33,8 +33,6 @@ from fcslam.service.live_poses import live_pose
 from fcslam.service.map_layers import layers_of
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes
-from fcslam.wire.messages import Hello
-from fcslam.wire.packets import decode
 
 
 def fleet_summary(mission: ViewedMission, read_only: bool, may_edit: bool) -> FleetSummary:
@@ -103,8 +101,7 @@ def sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
 
 def _detectors(store: MissionStore, robot: str, epoch: int) -> dict[Channel, str]:
     hello = store.newest_hello(robot, epoch)
-    body = None if hello is None else decode(hello).body
-    return dict(body.detector_versions) if isinstance(body, Hello) else {}
+    return {} if hello is None else dict(hello.detector_versions)
 
 
 @lru_cache(maxsize=8)  # many pages ask for the same
