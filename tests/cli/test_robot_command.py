@@ -51,9 +51,12 @@ def cloud():
 
 
 @pytest.mark.slow
-def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
+def test_all_of_a_recording_arrives_and_the_token_goes_with_every_request(log, cloud, tmp_path, capsys):
     state = tmp_path / "state"
-    assert main(["play", str(log), "--server", cloud.url, "--state", str(state)]) == 0
+    (tmp_path / "token").write_text("s3cret\n")
+    arguments = ["--server", cloud.url, "--state", str(state), "--credentials", str(tmp_path)]
+    assert main(["play", str(log), *arguments]) == 0
+    assert {headers["Authorization"] for _, _, headers, _ in cloud.requests} == {"Bearer s3cret"}
     out, err = capsys.readouterr()
     stored = [decode(data) for data in cloud.cloud.stored.values()]
     assert {packet.robot for packet in stored} == {"alice"}
@@ -66,14 +69,6 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert len(cloud.cloud.stored) == len(stored), "nothing twice"
     assert main(["play", f"bob={log}", "--server", cloud.url, "--state", str(state)]) == 2
     assert "belongs to robot 'alice'" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_token_goes_with_every_request(log, cloud, tmp_path):
-    (tmp_path / "token").write_text("s3cret\n")
-    arguments = ["--server", cloud.url, "--state", str(tmp_path), "--credentials", str(tmp_path)]
-    assert main(["play", str(log), *arguments]) == 0
-    assert {headers["Authorization"] for _, _, headers, _ in cloud.requests} == {"Bearer s3cret"}
 
 
 @pytest.mark.parametrize(

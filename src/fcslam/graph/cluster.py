@@ -10,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
-from fcslam.graph.evidence import ClusterEvidence, Uniqueness, amount, amount_shortfall, cluster_shortfall
+from fcslam.graph.evidence import ClusterEvidence, Uniqueness, shortfall
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
 
@@ -177,26 +177,31 @@ def dominant_cluster(
     others = np.setdiff1d(others, members)
     second = maximum_clique(consistent[np.ix_(others, others)])
     runner_up = others[list(second.members)]
-    evidence = ClusterEvidence(
-        closures=len(members),
-        informative=int(np.count_nonzero(informs[members])),
-        separate_places=count_separate_places(xy[members], settings.separation_m),
+    rows = np.array(members, dtype=np.int64)
+    evidence = replace(
+        evidence_of(xy[members], informs[members], shared_tags(rows), settings.separation_m),
         rival_closures=len(runner_up),
         rival_places=count_separate_places(xy[runner_up], settings.separation_m),
-        tags=shared_tags(np.array(members, dtype=np.int64)),
     )
-    shortfall = cluster_shortfall(evidence, settings)
-    has_no_lead = shortfall is not None and shortfall.code in (ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES)
-    if shortfall is None and amount(evidence, settings) < settings.minimum_evidence:
-        evidence = replace(evidence, uniqueness=examine(np.array(members, dtype=np.int64)))
+    reason = shortfall(evidence, settings)
+    if reason is not None and reason.code is ReasonCode.FEW_PLACES:
+        evidence = replace(evidence, uniqueness=examine(rows))
+        reason = shortfall(evidence, settings)
+    has_no_lead = reason is not None and reason.code in (ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES)
     return ClusterDecision(
         members=largest.members,
         runner_up=tuple(runner_up.tolist()),
         evidence=evidence,
         exact=largest.exact and second.exact,
         contested=has_no_lead and evidence.rival_places >= settings.minimum_evidence,
-        shortfall=shortfall or amount_shortfall(evidence, settings),
+        shortfall=reason,
     )
+
+
+def evidence_of(places: FloatArray, informative: NDArray[np.bool_], tags: int, separation_m: float) -> ClusterEvidence:
+    """The evidence of K closures that agree, without rivals: ``places`` (K, S, 2) in metres, ``informative`` (K,)."""
+    places_apart = count_separate_places(places, separation_m)
+    return ClusterEvidence(len(places), int(np.count_nonzero(informative)), places_apart, tags=tags)
 
 
 def count_separate_places(places: FloatArray, separation_m: float) -> int:

@@ -61,30 +61,20 @@ class ClusterEvidence:
     informative: int
     """Closures that fix the pose in every direction."""
     separate_places: int
-    rival_closures: int
+    rival_closures: int = 0
     """Closures of the largest cluster that contradicts this one."""
-    rival_places: int
+    rival_places: int = 0
     tags: int = 0
     """Tags that both robots saw from several keyscans."""
     uniqueness: Uniqueness | None = None
     """None if the maps were not aligned exhaustively."""
 
 
-def amount(evidence: ClusterEvidence, settings: EvidenceSettings) -> float:
-    """The evidence for a cluster, in separate places."""
-    unique = evidence.uniqueness
-    if unique is None or unique.violation > settings.violation:
-        return float(evidence.separate_places)
-    return evidence.separate_places + max(0.0, unique.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0)
-
-
 def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    """Why the evidence is not enough to join two maps; None if it is. The reason names one of the settings."""
-    return cluster_shortfall(evidence, settings) or amount_shortfall(evidence, settings)
+    """Why the evidence is not enough to join two maps; None if it is. The reason names one of the settings.
 
-
-def cluster_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    """Return the condition that the cluster itself fails, however well the maps fit."""
+    ``FEW_PLACES``: only the amount is too small, and an exhaustive alignment of the maps may add to it.
+    """
     if evidence.closures < settings.minimum_closures:
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
     if not evidence.informative:
@@ -93,16 +83,17 @@ def cluster_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> 
         return Reason(ReasonCode.NO_LEAD, evidence.closures / evidence.rival_closures, settings.lead, "lead")
     if evidence.separate_places < evidence.rival_places:
         return Reason(ReasonCode.RIVAL_PLACES, evidence.separate_places, evidence.rival_places)
-    return None
+    return _amount_shortfall(evidence, settings)
 
 
-def amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    """Return the reason why the amount of evidence is below the least one."""
-    if amount(evidence, settings) >= settings.minimum_evidence:
+def _amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+    places, unique, least = evidence.separate_places, evidence.uniqueness, settings.minimum_evidence
+    if places >= least:
         return None
-    places, unique = evidence.separate_places, evidence.uniqueness
     if unique is None:
-        return Reason(ReasonCode.FEW_PLACES, places, settings.minimum_evidence, "minimum_evidence")
+        return Reason(ReasonCode.FEW_PLACES, places, least, "minimum_evidence")
     if unique.violation > settings.violation:
         return Reason(ReasonCode.MAPS_CONTRADICT, unique.violation, settings.violation, "violation")
-    return Reason(ReasonCode.NOT_UNIQUE, unique.ratio, 1.0 + settings.minimum_evidence - places, "minimum_evidence")
+    if places + max(0.0, unique.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0) >= least:
+        return None
+    return Reason(ReasonCode.NOT_UNIQUE, unique.ratio, 1.0 + least - places, "minimum_evidence")

@@ -19,8 +19,8 @@ from fcslam.graph.chains import find_chains
 from fcslam.graph.cluster import (
     ClusterDecision,
     closure_positions,
-    count_separate_places,
     decide_cluster,
+    evidence_of,
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
@@ -397,16 +397,10 @@ def _is_confirmed(
     """Whether over two thirds of the link's cluster are inliers, and these are enough to join two maps."""
     kept = np.flatnonzero(solution.weights[link.members] > INLIER_WEIGHT)
     members = np.array(link.decision.members, dtype=np.int64)[kept]
-    positions = closure_positions(own[link.a], own[link.b], link.closures.select(members))
-    remaining = replace(
-        link.decision.evidence,
-        closures=len(members),
-        informative=int(np.count_nonzero(informative[link.edges[members]])),
-        separate_places=count_separate_places(positions, settings.separation_m),
-        rival_closures=0,
-        rival_places=0,
-        tags=link.closures.select(members).shared_tags(),
-    )
+    closures = link.closures.select(members)
+    positions = closure_positions(own[link.a], own[link.b], closures)
+    found = evidence_of(positions, informative[link.edges[members]], closures.shared_tags(), settings.separation_m)
+    remaining = replace(found, uniqueness=link.decision.evidence.uniqueness)
     return 3 * len(members) > 2 * len(link.members) and shortfall(remaining, settings) is None
 
 
