@@ -134,6 +134,7 @@ MADE = {
     "building.relations.gz": make_relations("in-one"),
     "intel.relations.gz": make_relations("intel"),
     "wednesday.clf.gz": make_another_day,
+    "wednesday.clf.xz": make_another_day,
     "office.yaml": make_map_of_another_program,
     "fleet.bag": lambda path: fleet_bag(path.parent, name="fleet.bag"),
 }

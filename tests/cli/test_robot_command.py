@@ -51,7 +51,7 @@ def cloud():
 
 
 @pytest.mark.slow
-def test_all_of_a_recording_arrives_and_the_token_goes_with_every_request(log, cloud, tmp_path, capsys):
+def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     state = tmp_path / "state"
     (tmp_path / "token").write_text("s3cret\n")
     arguments = ["--server", cloud.url, "--state", str(state), "--credentials", str(tmp_path)]
