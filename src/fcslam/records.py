@@ -168,9 +168,12 @@ class LaserScan:
     @property
     def matched_ranges_m(self) -> Ranges:
         """The ranges by which scans are matched, shape (beam_count,): those on other robots are 0."""
-        return (
-            self.ranges_m if self.on_teammates is None else np.where(self.on_teammates, np.float32(0.0), self.ranges_m)
-        )
+        return without(self.ranges_m, self.on_teammates)
+
+
+def without(ranges_m: Ranges, beams: NDArray[np.bool_] | None) -> Ranges:
+    """The ranges, shape (beam_count,), with 0, no return, for ``beams``, shape (beam_count,); None: for no beam."""
+    return ranges_m if beams is None else np.where(beams, np.float32(0.0), ranges_m)
 
 
 class Transform(NamedTuple):

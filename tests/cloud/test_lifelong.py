@@ -1,6 +1,5 @@
 """A robot that comes back again and again: what is forgotten, what never is, and that the map does not suffer."""
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.lab.simulation.ground_truth import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.lidar.submap import PackedSubmap, Submap
 from fcslam.lidar.submap_bytes import submap_bytes
 from fcslam.maps.fusion import fuse
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
@@ -112,13 +110,9 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
     assert map_of(fleet.conclude())["a"] == 1, "without the earlier comparison it is separate"
 
 
-def test_packed_submaps_change_nothing_and_few_are_not_packed(forgetful, packets, monkeypatch):
-    monkeypatch.setattr(submaps, "READY", 1)
-    cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
-    cache = cloud.fleet._recognition._submaps
-    kinds = Counter(type(entry.submap) for entry in cache._entries.values())
-    assert kinds[Submap] == len(cache._ready) == 1
-    assert kinds[PackedSubmap] > 2
+def test_submaps_that_are_dropped_and_built_again_change_nothing(forgetful, packets):
+    cloud = feed(Cloud(ONE_A_SQUARE.model_copy(update={"submaps_kept": 2}), 0), packets)
+    assert len(cloud.fleet._recognition._submaps._entries) <= 2
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 
 

@@ -13,17 +13,28 @@ from tests.wire.examples import HELLO
 class Instant:
     """Runs nothing, and is done at once."""
 
-    def submit(self, *_):
+    def __init__(self):
+        self.blocks = []
+
+    def submit(self, _, __, *arguments):
+        self.blocks.append(arguments[0])
         done = Future()
         done.set_result([(0, Correction("anna", 1, 0, np.zeros(3)))])
         return done
 
 
 def test_packets_that_were_applied_are_forgotten():
-    corrected = []
-    own = OwnMap("anna", None, Instant(), lambda epoch, _: corrected.append(epoch))
-    for ordinal in range(50):
-        own.put([said(ordinal, HELLO, float(ordinal))])
-    assert len(corrected) == 50
+    corrected, worker = [], Instant()
+    own = OwnMap("anna", None, worker, lambda part, _: corrected.append(part), 0)
+    packets = [said(ordinal, HELLO, float(ordinal)) for ordinal in range(50)]
+    for packet in packets:
+        own.put([packet])
+        own.hand_over(packet.time - 3.5)
+    _, *blocks = worker.blocks
+    assert len(blocks) == len(corrected) == 10, "five packets at once"
+    own.put(packets[:1])
+    own.poses("anna")  # an answer is of all packets so far
+    _, *blocks = worker.blocks[:-1]
+    assert [packet for block in blocks for packet in block] == [*packets, packets[0]]
     assert len(own._applying) <= 1
     assert own.backlog == 0

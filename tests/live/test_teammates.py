@@ -9,13 +9,12 @@ import pytest
 
 import fcslam
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, classify
-from fcslam.live.fleet_view import Teammate
+from fcslam.live.fleet_view import Mates
 from fcslam.live.joint_map import JointMap
 from fcslam.live.records import Wiring
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
 from fcslam.records import Correction, Keyscan, KeyscanId, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.track import ScanTrack
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.wire.messages import Hello, Packet
 from tests.lidar import worlds
@@ -23,11 +22,11 @@ from tests.live.same_thread import SameThread
 
 LASER = LaserModel(360, -math.pi, math.radians(1.0), 8.0)
 RADIUS_M = 0.3
-HERE = np.array((-1.0, 0.5, 0.4))
+HERE = frozen((-1.0, 0.5, 0.4))
 
 
-def mate(x, y, age_s=0.2, name="b", map_index=0):
-    return Teammate(name, map_index, "", np.array((x, y, 0.0)), age_s)
+def mate(x, y, age_s=0.2):
+    return float(x), float(y), age_s
 
 
 def with_disc(ranges, pose, centre):
@@ -57,14 +56,14 @@ def joint():
 
 
 def on(scan, joint, *mates, pose=HERE):
-    found = beams_on_teammates(scan, pose, mates, joint, 0.35)
+    found = beams_on_teammates(scan, pose, scan.T_odom_base, np.array(mates), 0.0, joint, 0.35)
     return np.zeros(360, bool) if found is None else found
 
 
 def test_the_beams_on_a_teammate_are_found_and_no_others(joint):
     scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
     assert hit.sum() > 10
-    assert np.array_equal(on(scan, joint, mate(0.8, 0.2), mate(-3.0, 1.0, name="c")), hit)
+    assert np.array_equal(on(scan, joint, mate(0.8, 0.2), mate(-3.0, 1.0)), hit)
     moved_on = mate(0.8 - 0.4, 0.2, age_s=1.0)
     assert np.array_equal(on(scan, joint, moved_on), hit), "where it may be grows with the age of its pose"
     assert not on(scan, joint, mate(0.8, 0.2, age_s=OLDEST_S + 0.1)).any()
@@ -77,9 +76,7 @@ def test_a_robot_that_says_it_is_elsewhere_does_not_hide_where_it_stands(joint):
 
 def test_poses_at_the_walls_hide_none_of_them_however_many_there_are(joint):
     scan, _ = scan_at(HERE, worlds.room())
-    everywhere = [
-        mate(x, y, age_s=1.9, name=f"{x} {y}") for x in np.arange(-4, 4.1, 0.4) for y in np.arange(-3, 4, 0.4)
-    ]
+    everywhere = [mate(x, y, age_s=1.9) for x in np.arange(-4, 4.1, 0.4) for y in np.arange(-3, 4, 0.4)]
     assert not on(scan, joint, *everywhere).any()
 
 
@@ -97,10 +94,13 @@ class Fleet:
 
     def __init__(self, joint):
         self.joint_map, self.news, self.map_index, self.drawn_s = joint, [], 0, -np.inf
-        self.mates = []
+        self.mates = None
 
-    def robots(self):
-        return self.mates
+    def clock(self):
+        return 0.0
+
+    def hear(self, *mates):
+        self.mates = Mates(0, frozenset("b"), np.array(mates), 0.0)
 
 
 def corridor_map():
@@ -118,7 +118,7 @@ def convoy(robot, fleet):
     poses = []
     for k, (pose, empty) in enumerate(zip(truth, measured, strict=True)):
         ahead = pose + np.array((1.0, 0.0, 0.0))
-        fleet.mates = [mate(*pose[:2], name="a"), mate(*ahead[:2])]
+        fleet.hear(mate(*ahead[:2]))
         ranges, _ = with_disc(empty, pose, ahead[:2])
         poses.append(robot.add_scan(ranges, 0.1 * k, odometry[k]).T_map_base)
     return truth, np.array(poses)
@@ -150,7 +150,7 @@ def test_a_robot_that_stands_is_no_ghost_in_what_this_robot_saw_last(joint):
         with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
             robot.fleet = Fleet(shifted)
             robot._joint = JointMap("a", robot.fleet, robot._config.map)
-            robot.fleet.mates = [mate(0.0, 0.0, name="a"), mate(*(standing - start))]
+            robot.fleet.hear(mate(*(standing - start)))
             robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
             for k, pose in enumerate(poses):
                 scan, _ = scan_at(pose, worlds.room(), standing)
@@ -182,27 +182,25 @@ def test_beams_are_those_of_the_laser_that_hit_the_teammate(joint):
     scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
     other = LaserModel(180, -math.pi, math.radians(2.0), 8.0)
     fleet = Fleet(joint)
-    fleet.mates = [mate(*HERE[:2], name="a"), mate(0.8, 0.2)]
+    fleet.hear(mate(0.8, 0.2))
     shown = JointMap("a", fleet, OccupancyConfig())
     shown.mark_teammates(scan, 0, None)
     assert np.array_equal(shown.mark_teammates(scan, 0, place(HERE)).on_teammates, hit)
-    track = ScanTrack()
-    track.extend(np.zeros(3))
     keyscans = [
         Keyscan(KeyscanId("a", 0), 0.0, frozen(np.full(180, 2.0), np.float32), laser=1),
         Keyscan(KeyscanId("a", 0), 0.0, scan.ranges_m, laser=0),
     ]
     packets = [Packet("a", 0, k, 0.0, body) for k, body in enumerate([Hello("a", 0, (LASER, other), {}), *keyscans])]
-    shown.add(packets, [track])
-    seen, marked = (one.ranges_m for one in shown._drawn)
-    assert (seen == 2.0).all()
-    assert np.array_equal(marked == 0.0, hit | (scan.ranges_m == 0.0))
+    shown.add(packets)
+    seen, marked = (one.on_teammates for one in shown._drawn)
+    assert seen is None
+    assert np.array_equal(marked, hit)
 
 
 def test_the_first_scan_of_a_session_is_not_placed_by_the_odometry_of_the_one_before(joint):
     scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
     fleet = Fleet(joint)
-    fleet.mates = [mate(*HERE[:2], name="a"), mate(0.8, 0.2)]
+    fleet.hear(mate(0.8, 0.2))
     shown = JointMap("a", fleet, OccupancyConfig())
     shown.mark_teammates(replace(scan, T_odom_base=frozen([5.0, 5.0, 1.0])), 0, place(HERE))
     assert shown.mark_teammates(scan, 1, place(HERE)).on_teammates is None

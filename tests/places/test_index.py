@@ -95,9 +95,10 @@ def check_stored(index, places):
     for number, of_place in words.items() if index._config.scoring is Scoring.WORDS else ():
         expected = sum(np.log(documents[word]) for word in of_place)
         assert entries.log_documents[index._row_of[number]] == pytest.approx(expected, abs=1e-9)
-    rows = index._rows()
     kept = np.concatenate([EMPTY, *(places[number] for number in index._row_of)])
-    np.testing.assert_array_equal(index._postings.gather(rows).view(np.uint8).reshape(-1, 32), kept)
+    np.testing.assert_array_equal(index.all_descriptors(), kept)
+    for number in words:
+        np.testing.assert_array_equal(index.descriptors(number), places[number])
 
 
 @pytest.mark.slow

@@ -34,8 +34,7 @@ class FleetConfig(Settings):
     submaps_kept: int = Field(
         default=100,
         gt=1,
-        description="number of submaps in the cache, 0.2 MB each for the 100 used last and 0.08 MB for others; those "
-        "beyond it are rebuilt from their keyscans",
+        description="number of submaps in the cache, 0.3 MB each; those beyond it are rebuilt from their keyscans",
     )
     contradiction: float = Field(
         default=0.06,

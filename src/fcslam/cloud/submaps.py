@@ -1,7 +1,6 @@
 """Submaps of places, built from keyscans on demand and cached."""
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -14,15 +13,12 @@ from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 from fcslam.storage.state_file import State
 
-READY: Final = 100
-"""Submaps that are kept as they are; those that were used before them are packed."""
-
 
 @dataclass(slots=True)
 class _Entry:
     """The submap around a place and values derived from it; None until they are needed."""
 
-    submap: Submap | PackedSubmap | None = None
+    submap: Submap | None = None
     noise: float | None = None
 
 
@@ -37,23 +33,14 @@ class SubmapCache:
         self._graph = graph
         self._capacity = capacity
         self._entries: dict[_Key, _Entry] = {}
-        self._ready: dict[_Key, _Entry] = {}
-        """Those that are not packed. In both, the one used last is the last."""
+        """The one used last is the last."""
 
     def of(self, place: Place) -> Submap:
         """The submap around a place, in its keyscan's frame, by the robot's own motions."""
-        entry, key = self._entry(place), (place.id, place.channel)
-        submap = entry.submap
-        if submap is None:
-            submap = build_submap(self._scans(place))
-        elif isinstance(submap, PackedSubmap):
-            submap = submap.unpack()
-        entry.submap = submap
-        self._ready.pop(key, None)
-        self._ready[key] = entry
-        if len(self._ready) > READY:
-            self._pack(next(iter(self._ready)))
-        return submap
+        entry = self._entry(place)
+        if entry.submap is None:
+            entry.submap = build_submap(self._scans(place))
+        return entry.submap
 
     def noise_of(self, place: Place) -> float:
         """How much the submap around a place contradicts itself (``self_violation``)."""
@@ -65,7 +52,7 @@ class SubmapCache:
     def state(self) -> State:
         """The submaps that were compared, so that they need not be built again; for ``restore``."""
         built = {key: entry for key, entry in self._entries.items() if entry.submap is not None}
-        content = [packed_bytes(_packed(entry.submap)) for entry in built.values() if entry.submap is not None]
+        content = [packed_bytes(PackedSubmap.of(entry.submap)) for entry in built.values() if entry.submap is not None]
         return {
             "keys": [(*identifier, channel) for identifier, channel in built],
             "noise": [entry.noise for entry in built.values()],
@@ -77,13 +64,13 @@ class SubmapCache:
         """Take over a ``state``."""
         content, begin = state["content"].tobytes(), 0
         for (robot, number, channel), noise, size in zip(state["keys"], state["noise"], state["sizes"], strict=True):
-            submap = read_packed(content[begin : begin + size])
+            submap = read_packed(content[begin : begin + size]).unpack()
             self._entries[KeyscanId(robot, number), Channel(channel)] = _Entry(submap, noise)
             begin += size
 
     def drop(self, place: Place) -> None:
         """Drop the submap around a place from the cache."""
-        self._drop((place.id, place.channel))
+        self._entries.pop((place.id, place.channel), None)
 
     def _entry(self, place: Place) -> _Entry:
         key = (place.id, place.channel)
@@ -91,18 +78,9 @@ class SubmapCache:
         if entry is None:
             entry = _Entry()
             if len(self._entries) >= self._capacity:
-                self._drop(next(iter(self._entries)))
+                del self._entries[next(iter(self._entries))]
         self._entries[key] = entry
         return entry
-
-    def _drop(self, key: _Key) -> None:
-        self._entries.pop(key, None)
-        self._ready.pop(key, None)
-
-    def _pack(self, key: _Key) -> None:
-        entry = self._ready.pop(key)
-        assert entry.submap is not None, "it is ready"
-        entry.submap = _packed(entry.submap)
 
     def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
         """The scans around a place, and their poses (3,) in its keyscan's base."""
@@ -111,7 +89,3 @@ class SubmapCache:
         poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
         keyscans = self._sessions.keyscans(robot, place.first, place.last)
         return [(keyscan_points(keyscan, lasers), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
-
-
-def _packed(submap: Submap | PackedSubmap) -> PackedSubmap:
-    return submap if isinstance(submap, PackedSubmap) else PackedSubmap.of(submap)

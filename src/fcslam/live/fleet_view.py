@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,18 @@ class Teammate:
     """Time since it was there."""
 
 
+class Mates(NamedTuple):
+    """The map that a robot is in, and the others in it, as the cloud knows them at one moment."""
+
+    map_index: int
+    robots: frozenset[str]
+    """The others."""
+    places: FloatArray
+    """Of each of them: x and y in the map, metres, and the age of its pose, seconds; shape (N, 3)."""
+    moment_s: float
+    """The moment, by the clock of the view."""
+
+
 class FleetView:
     """Follows the fleet of one robot. Any thread may call."""
 
@@ -68,12 +80,14 @@ class FleetView:
             limit_kbps: limit of the tiles, kB per second; None: ``DOWNLINK_KBPS``.
             clock: seconds.
         """
-        self._clients, self._robot, self._own_pose, self._clock = clients, robot, own_pose, clock
+        self._clients, self._robot, self._own_pose, self.clock = clients, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments
         self._limit_bytes = min(max(1, int(1e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS))), LARGEST_ANSWER)
         self._tiled, self._etag = TiledMap(), ""
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
+        self.mates: Mates | None = None
+        """As the newest reply says; None if the robot is in no map that the cloud draws."""
         self._map: OccupancyMap | None = None
         self._is_settling = False
         """In a new frame, some tiles are missing yet."""
@@ -120,15 +134,14 @@ class FleetView:
     @property
     def map_index(self) -> int | None:
         """Index of the map that the robot is in, as the cloud draws it; None if it is in none."""
-        own = self._own()
-        return None if own is None else own.map_index
+        return None if self.mates is None else self.mates.map_index
 
     def robots(self) -> list[Teammate]:
         """All robots that the cloud knows, with the ages of their poses now."""
         if self._reply is None:
             return []
         reply, came_s = self._reply
-        since_s = self._clock() - came_s
+        since_s = self.clock() - came_s
         return [
             Teammate(one.robot, one.map_index, one.floor, frozen(np.array(one.T_map_base)), one.age_s + since_s)
             for one in reply.robots
@@ -148,7 +161,7 @@ class FleetView:
         """
         client, own = self._clients[self._current], self._own_pose()
         pose = None if own is None or not np.isfinite(own[1]).all() else tuple(own[1].tolist())
-        reply = client.exchange(self._robot, None if own is None else own[0], pose), self._clock()
+        reply = client.exchange(self._robot, None if own is None else own[0], pose), self.clock()
         stamp = next((one.stamp for one in reply[0].robots if one.robot == self._robot), -np.inf)
         found = client.tiles(self._robot, self._etag, self._limit_bytes)
         is_complete = True
@@ -165,15 +178,16 @@ class FleetView:
             self._is_settling = (self._is_settling or is_new) and not is_complete
             self._map = None if self._is_settling else self._tiled.occupancy()
             self.version += 1
-        before, self._reply = self._members(), reply
-        self._tell(before, self._members())
+        before, self._reply = self.mates, reply
+        self.mates = _mates(self._robot, *reply)
+        self._tell(before, self.mates)
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
-        if self._clock() - self._frontiers_s >= FRONTIERS_S:
-            self._frontiers_s = self._clock()
+        if self.clock() - self._frontiers_s >= FRONTIERS_S:
+            self._frontiers_s = self.clock()
             self.frontiers = client.frontiers(self._robot)
-        if self._clock() - self._quality_s >= (QUALITY_S if self.quality else FRONTIERS_S):
-            self._quality_s = self._clock()
+        if self.clock() - self._quality_s >= (QUALITY_S if self.quality else FRONTIERS_S):
+            self._quality_s = self.clock()
             self.quality = client.quality(self._robot)
 
     def _run(self) -> None:
@@ -187,21 +201,10 @@ class FleetView:
                 self.trouble, self._failures = str(error), self._failures + 1
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 
-    def _own(self) -> Teammate | None:
-        return next((one for one in self.robots() if one.robot == self._robot), None)
-
-    def _members(self) -> tuple[int, frozenset[str]] | None:
-        """The robot's map and the others in it; None if it is in none."""
-        own = self._own()
-        if own is None:
-            return None
-        mates = (one.robot for one in self.robots() if one.map_index == own.map_index and one.robot != self._robot)
-        return own.map_index, frozenset(mates)
-
-    def _tell(self, before: tuple[int, frozenset[str]] | None, now: tuple[int, frozenset[str]] | None) -> None:
+    def _tell(self, before: Mates | None, now: Mates | None) -> None:
         """Note one line if the robots of the map changed."""
         known = {one.robot for one in self.robots()}
-        earlier, others = (frozenset() if one is None else one[1] for one in (before, now))
+        earlier, others = (frozenset() if one is None else one.robots for one in (before, now))
         if earlier == others and (before is None) == (now is None):
             return
         if now is None:
@@ -215,9 +218,18 @@ class FleetView:
             if gone := earlier - others - known:
                 parts.append(f"taken out: {', '.join(sorted(gone))}")
             everybody = ", ".join(sorted(others | {self._robot}))
-            line = f"map {now[0]} holds {everybody}" + "".join(f"; {part}" for part in parts)
+            line = f"map {now.map_index} holds {everybody}" + "".join(f"; {part}" for part in parts)
         if len(self.news) < MOST_NEWS:
             self.news.append(line)
+
+
+def _mates(robot: str, reply: FleetReply, came_s: float) -> Mates | None:
+    own = next((one.map_index for one in reply.robots if one.robot == robot), None)
+    if own is None:
+        return None
+    others = [one for one in reply.robots if one.map_index == own and one.robot != robot]
+    places = np.array([(*one.T_map_base[:2], one.age_s) for one in others], np.float64).reshape(-1, 3)
+    return Mates(own, frozenset(one.robot for one in others), places, came_s)
 
 
 @contextmanager

@@ -2,8 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +11,11 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
-from fcslam.live.fleet_view import FleetView, Teammate
+from fcslam.live.fleet_view import FleetView
 from fcslam.live.records import RobotPose
 from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
-from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, Ranges, Sweep, frozen
+from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, frozen, without
 from fcslam.robot.localization import Localizer
 from fcslam.robot.track import ScanTrack
 from fcslam.runs.map_files import OccupancyMap
@@ -32,17 +31,18 @@ class _DrawnKeyscan(NamedTuple):
     """A keyscan that the cloud may not have drawn yet."""
 
     part: int
-    stamp: float
-    ranges_m: Ranges
+    keyscan: Keyscan
     laser: LaserModel
-    T_odom_base: FloatArray
-    sweep: Sweep | None
+    on_teammates: NDArray[np.bool_] | None
+    """As in ``LaserScan``."""
 
 
 _MADE_UP = (
-    LaserScan(0.0, frozen(np.ones(4), np.float32), LaserModel(4, -np.pi, 0.5 * np.pi, 2.0), frozen(np.zeros(3))),
-    np.zeros(3),
-    (Teammate("", 0, "", np.zeros(3), 0.0),),
+    LaserScan(0.0, frozen(np.ones(4), np.float32), LaserModel(4, -np.pi, 0.5 * np.pi, 2.0), se2.IDENTITY),
+    se2.IDENTITY,
+    se2.IDENTITY,
+    np.zeros((1, 3)),
+    0.0,
     OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0)),
     0.5,
 )
@@ -72,38 +72,42 @@ class JointMap:
         self._lock = threading.Lock()
         beams_on_teammates(*_MADE_UP)  # no scan waits for the compiler
 
-    def add(self, packets: Iterable[Packet], tracks: Sequence[ScanTrack]) -> None:
-        """Keep the next keyscans until the cloud has drawn them; ``tracks`` are the robot's, by part."""
+    def add(self, packets: Iterable[Packet]) -> None:
+        """Keep the next keyscans until the cloud has drawn them."""
         for packet in packets:
-            if isinstance(packet.body, Hello):
-                self._lasers = packet.body.lasers
-            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
-                keyscan = packet.body
-                T_odom_base = tracks[packet.epoch].in_odom(ScanPose(keyscan.stamp, keyscan.id.number, np.zeros(3)))
+            keyscan = packet.body
+            if isinstance(keyscan, Hello):
+                self._lasers = keyscan.lasers
+            elif isinstance(keyscan, Keyscan) and len(keyscan.ranges_m):
                 laser = keyscan.laser_model(self._lasers)
-                on_teammates = self._met.pop(_key(keyscan.stamp, laser), np.zeros(1, np.bool_))
-                ranges_m = np.where(on_teammates, np.float32(0.0), keyscan.ranges_m)
+                on_teammates = self._met.pop(_key(keyscan.stamp, laser), None)
                 with self._lock:
-                    self._drawn.append(
-                        _DrawnKeyscan(packet.epoch, keyscan.stamp, ranges_m, laser, T_odom_base, keyscan.sweep)
-                    )
+                    self._drawn.append(_DrawnKeyscan(packet.epoch, keyscan, laser, on_teammates))
 
-    def draw(self, part: int, localizer: Localizer) -> OccupancyMap | None:
+    def draw(self, part: int, track: ScanTrack, localizer: Localizer) -> OccupancyMap | None:
         """The joint map, with the keyscans of a part drawn into it that the cloud has not drawn yet.
 
         None: the server has not drawn the map that the robot's poses are in.
+
+        Args:
+            part: the part of the robot.
+            track: that of the part.
+            localizer: that of the part.
         """
         fleet, joint = self._fleet, self._fleet.joint_map
         if joint is None or fleet.map_index is None or fleet.map_index != localizer.map_index:
             return None
         with self._lock:
-            while self._drawn and self._drawn[0].stamp <= fleet.drawn_s:
+            while self._drawn and self._drawn[0].keyscan.stamp <= fleet.drawn_s:
                 self._drawn.popleft()
-            lately = [
-                Casting(one.ranges_m, one.laser, moved, one.sweep)
-                for one in self._drawn
-                if one.part == part and (moved := localizer.T_map_base(one.T_odom_base)) is not None
-            ]
+            waiting = [one for one in self._drawn if one.part == part]
+        lately = [
+            Casting(ranges_m, laser, moved, keyscan.sweep)
+            for _, keyscan, laser, on_teammates in waiting
+            for ranges_m in [without(keyscan.ranges_m, on_teammates)]
+            for T_odom_base in [track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, se2.IDENTITY))]
+            if (moved := localizer.T_map_base(T_odom_base)) is not None
+        ]
         return padded(draw_over(joint, lately, self._config))
 
     def mark_teammates(self, scan: LaserScan, part: int, newest: RobotPose | None) -> LaserScan:
@@ -114,20 +118,18 @@ class JointMap:
             part: the part that it is of; ``odom`` is another frame in each.
             newest: the pose of the scan before; None before the first one.
         """
-        joint, radius_m = self._fleet.joint_map, self._config.robot_radius_m
+        fleet, radius_m = self._fleet, self._config.robot_radius_m
         before, self._newest = self._newest, (part, scan.T_odom_base)
-        if joint is None or newest is None or before is None or before[0] != part or radius_m <= 0.0:
+        joint, mates = fleet.joint_map, fleet.mates
+        if joint is None or mates is None or newest is None or before is None or before[0] != part or radius_m <= 0.0:
             return scan
-        known = self._fleet.robots()
-        own = next((mate.map_index for mate in known if mate.robot == self._robot), None)
-        if own is None or own != newest.map_index:  # the joint map is that of ``own``
+        if mates.map_index != newest.map_index:  # the joint map is that of the mates
             return scan
-        T_map_base = se2.compose(newest.T_map_base, se2.between(before[1], scan.T_odom_base))
-        others = [mate for mate in known if mate.map_index == own and mate.robot != self._robot]
-        on_teammates = beams_on_teammates(scan, T_map_base, others, joint, radius_m)
+        since_s = fleet.clock() - mates.moment_s
+        on_teammates = beams_on_teammates(scan, newest.T_map_base, before[1], mates.places, since_s, joint, radius_m)
         if on_teammates is None:
             return scan
         self._met[_key(scan.stamp, scan.laser)] = on_teammates
         while len(self._met) > MOST_MET:
             del self._met[next(iter(self._met))]
-        return replace(scan, on_teammates=on_teammates)
+        return LaserScan(scan.stamp, scan.ranges_m, scan.laser, scan.T_odom_base, scan.sweep, on_teammates)

@@ -3,6 +3,7 @@
 So a robot alone closes loops and draws maps as ``fcslam map`` does, and no scan waits for it.
 """
 
+import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
@@ -19,23 +20,28 @@ from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.records import ClosureStatus, Correction, FloatArray, frozen
 from fcslam.runs import Run
 from fcslam.runs.map_files import OccupancyMap
-from fcslam.wire.messages import Packet
+from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import SizedPacket, decode, measure
 
 Answer = TypeVar("Answer")
 Correct = Callable[[int, Correction], None]
-"""Takes a correction and the epoch of its session; called in another thread."""
+"""Takes a correction and the part of its session; called in another thread."""
 
 
 class OwnMap:
     """Gets all packets of one robot, in their order, and corrects its poses. Any thread may call."""
 
-    def __init__(self, robot: str, config: MissionConfig, executor: Executor, correct: Correct) -> None:
-        """Start a map in the only worker of ``executor``."""
-        self._robot, self._config, self._executor, self._correct = robot, config, executor, correct
+    def __init__(
+        self, robot: str, config: MissionConfig, executor: Executor, correct: Correct, first_epoch: int
+    ) -> None:
+        """Start a map in the only worker of ``executor``; part 0 of the robot is its session ``first_epoch``."""
+        self._robot, self._executor, self._correct, self._first_epoch = robot, executor, correct, first_epoch
         self.failure: str | None = None
         """Why the map stopped growing; None if it grows."""
         self._applying: deque[Future[list[tuple[int, Correction]]]] = deque()
+        self._kept: list[Packet] = []
+        """Packets that the worker does not have yet: to hand over each for itself would cost scans time."""
+        self._lock = threading.Lock()
         executor.submit(_open, robot, config).result()
 
     def restore(self, packets: Sequence[bytes]) -> None:
@@ -44,9 +50,18 @@ class OwnMap:
             self._await(self._submit(_restore, packets))
 
     def put(self, packets: Sequence[Packet]) -> None:
-        """Apply the next packets, later."""
-        if packets and self.failure is None:
-            self._await(self._submit(_apply, packets))
+        """Keep the next packets for ``hand_over``; each answer is of all packets so far."""
+        if self.failure is None:
+            with self._lock:
+                self._kept.extend(packets)
+
+    def hand_over(self, before_s: float = np.inf) -> None:
+        """Have the packets applied, later, if the oldest one is from before a time of its robot."""
+        if self._kept and self._kept[0].time < before_s:
+            with self._lock:
+                packets, self._kept = self._kept, []
+                if packets:  # no other thread was here first
+                    self._await(self._submit(_apply, packets, self._first_epoch))
 
     @property
     def backlog(self) -> int:
@@ -64,7 +79,7 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(self._submit(_draw, session, T_map_own))
+        return self._answer(_draw, session, T_map_own)
 
     def poses(self, session: str) -> FloatArray:
         """``T_own_base`` of the session's keyscans so far, shape (K, 3), metres and radians.
@@ -72,7 +87,7 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(self._submit(_poses, session))
+        return self._answer(_poses, session)
 
     def closures(self, session: str, T_map_own: FloatArray) -> FloatArray:
         """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``.
@@ -80,7 +95,7 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(self._submit(_closures, session, T_map_own))
+        return self._answer(_closures, session, T_map_own)
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
         """The result of all packets so far; arguments as in ``MissionCloud.run``.
@@ -88,7 +103,7 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(self._submit(_run, tracks, scans, recorded_s))
+        return self._answer(_run, tracks, scans, recorded_s)
 
     def _submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:
         try:
@@ -114,12 +129,13 @@ class OwnMap:
         if error is not None:
             self.failure = self.failure or f"{type(error).__name__}: {error}"
             return
-        for epoch, correction in done.result():
-            self._correct(epoch, correction)
+        for part, correction in done.result():
+            self._correct(part, correction)
 
-    def _answer(self, asked: Future[Answer]) -> Answer:
+    def _answer(self, function: Callable[..., Answer], *arguments: object) -> Answer:
+        self.hand_over()
         try:
-            return asked.result()
+            return self._submit(function, *arguments).result()
         except FcslamError:
             raise
         except Exception as error:
@@ -140,10 +156,16 @@ def _restore(robot: str, earlier: Sequence[bytes]) -> list[tuple[int, Correction
     return []
 
 
-def _apply(robot: str, packets: Sequence[Packet]) -> list[tuple[int, Correction]]:
-    """Apply packets; returns the corrections with their epochs."""
-    replies = [reply for packet in packets for reply in _clouds[robot].apply(measure(packet))]
-    return [(reply.epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]
+def _apply(robot: str, packets: Sequence[Packet], first_epoch: int) -> list[tuple[int, Correction]]:
+    """Apply packets, whose epochs are parts; returns the corrections with their parts."""
+    numbered = (_in_epoch(packet, first_epoch + packet.epoch) for packet in packets)
+    replies = [reply for packet in numbered for reply in _clouds[robot].apply(measure(packet))]
+    return [(reply.epoch - first_epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]
+
+
+def _in_epoch(packet: Packet, epoch: int) -> Packet:
+    body = replace(packet.body, epoch=epoch) if isinstance(packet.body, Hello) else packet.body
+    return replace(packet, epoch=epoch, body=body)
 
 
 def _draw(robot: str, session: str, T_map_own: FloatArray) -> OccupancyMap:

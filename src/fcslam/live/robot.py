@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
 from contextlib import ExitStack, closing
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -58,7 +57,7 @@ from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesTransport, Server, addresses
-from fcslam.wire.messages import Hello, Packet
+from fcslam.wire.messages import Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
 """Corrections that move the robot by less are not events."""
@@ -69,6 +68,8 @@ LARGEST_BACKLOG = 200
 """Largest number of inputs that wait for the back end, the map or the disk while a recording is played; a robot in real
 time never has as many."""
 
+BLOCK_S = 1.0
+"""Packets go to the robot's own map in blocks of so long."""
 
 LARGEST_OUTBOX_BYTES = 256_000_000
 """Limit of the packets that wait for the server; above three quarters, places are left out."""
@@ -271,7 +272,8 @@ class Robot(LiveTracker):
             return None
         with self._lock:
             part = self._part
-        return self._joint.draw(part, self._map_poses.localizer(part))
+            track = self._frontend.tracks[part]
+        return self._joint.draw(part, track, self._map_poses.localizer(part))
 
     def own_map(self) -> OccupancyMap:
         """The map of all that this robot has seen so far, corrected by all loop closures.
@@ -353,6 +355,8 @@ class Robot(LiveTracker):
             if not self._is_finished:
                 self._is_finished = True
                 self._take(self._frontend.finish())
+                if self._own is not None:
+                    self._own.hand_over()
         until_s = math.inf if timeout_s is None else self._clock() + timeout_s
         uplink = self._uplink
         if uplink is None:
@@ -429,7 +433,7 @@ class Robot(LiveTracker):
         robot = self._config.robot
         self._part_base = 0 if outbox is None else outbox.first_epoch
         try:
-            self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
+            self._own = OwnMap(self.name, self._config, executor, self._correct, self._part_base) if own_map else None
             backend = WorkerBackend(self.name, robot, executor, keyframes)
             self._frontend = RobotFrontend(self.name, robot, backend, self._mark_teammates)
         except BrokenExecutor as error:
@@ -490,20 +494,20 @@ class Robot(LiveTracker):
         packets = [packet.on_floor(self._floor(packet.epoch)) for packet in packets]
         self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
         if self._joint is not None:
-            self._joint.add(packets, self._frontend.tracks)
+            self._joint.add(packets)
         if self._uplink is not None:
             self._uplink.put(packets)
         if self._own is not None:
-            self._own.put([_in_epoch(packet, self._part_base + packet.epoch) for packet in packets])
+            self._own.put(packets)
 
     def _place(self) -> tuple[int, FloatArray] | None:
         """Index of the robot's map and its pose there, in any thread."""
         pose = self._pose
         return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
-    def _correct(self, epoch: int, correction: Correction) -> None:
+    def _correct(self, part: int, correction: Correction) -> None:
         """Take a correction of the robot's own map, in any thread."""
-        self._map_poses.correct(epoch - self._part_base, correction, self._is_server_away())
+        self._map_poses.correct(part, correction, self._is_server_away())
 
     def _is_server_away(self) -> bool:
         return self._uplink is None or self._uplink.trouble is not None
@@ -552,6 +556,8 @@ class Robot(LiveTracker):
             for line in self.fleet.news[self._news :]:
                 self._news += 1
                 self._event(EventKind.FLEET, line)
+        if self._own is not None:
+            self._own.hand_over(self._newest_s - BLOCK_S)
         broken = self._frontend.backend_failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")
@@ -589,11 +595,6 @@ def _checked_floor(floor: str) -> str:
     except PacketError as error:
         raise InputError(str(error)) from error
     return floor
-
-
-def _in_epoch(packet: Packet, epoch: int) -> Packet:
-    body = replace(packet.body, epoch=epoch) if isinstance(packet.body, Hello) else packet.body
-    return replace(packet, epoch=epoch, body=body)
 
 
 def _keyframe_folder(state: Path | None, playback: Playback) -> Path:

@@ -4,8 +4,6 @@ A robot that drives along with this one would look like a wall that stands still
 scan: whether the map shows them is decided where the scans of all robots are known (``fcslam.maps.teammates``).
 """
 
-import math
-from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
@@ -13,7 +11,6 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.lidar.scan import rays_of
-from fcslam.live.fleet_view import Teammate
 from fcslam.records import FloatArray, LaserScan
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
@@ -28,7 +25,13 @@ OCCUPIED: Final = int(Occupancy.OCCUPIED)
 
 
 def beams_on_teammates(
-    scan: LaserScan, T_map_base: FloatArray, mates: Iterable[Teammate], joint: OccupancyMap, radius_m: float
+    scan: LaserScan,
+    T_map_before: FloatArray,
+    T_odom_before: FloatArray,
+    places: FloatArray,
+    since_s: float,
+    joint: OccupancyMap,
+    radius_m: float,
 ) -> NDArray[np.bool_] | None:
     """Which beams hit another robot, shape (beam_count,); None if none does.
 
@@ -37,54 +40,77 @@ def beams_on_teammates(
     door, does not count while a robot says that it is there.
 
     Args:
-        scan: the scan.
-        T_map_base: where it was made, in the frame of ``joint``, shape (3,).
-        mates: the other robots in that map.
+        scan: the scan; its odometry says how far the robot drove since the scan before.
+        T_map_before: where the scan before was made, in the frame of ``joint``, shape (3,); read-only, as in a record.
+        T_odom_before: its odometry, shape (3,); read-only.
+        places: of the other robots in that map: x, y and the age of their poses ``since_s`` ago, shape (N, 3), metres
+            and seconds.
+        since_s: time since then.
         joint: the joint map.
         radius_m: of a robot.
     """
-    reach_m = scan.laser.max_range_m
-    own_x, own_y, _ = T_map_base.tolist()
-    near = [
-        (x, y, limit_m)
-        for mate in mates
-        for x, y, _ in [mate.T_map_base.tolist()]
-        if mate.age_s <= OLDEST_S
-        and math.hypot(x - own_x, y - own_y) <= reach_m + (limit_m := radius_m + SPEED_MPS * mate.age_s)
-    ]
-    if not near:
-        return None
     rays = rays_of(scan.laser, scan.sweep)
-    found: NDArray[np.bool_] = _on_discs(
+    found: NDArray[np.bool_] | None = _on_discs(
         scan.ranges_m,
         rays.origins,
         rays.directions,
-        reach_m,
-        np.array(T_map_base),  # a writable copy: code is compiled once
-        np.array(near),
+        scan.laser.max_range_m,
+        T_map_before,
+        T_odom_before,
+        scan.T_odom_base,
+        places,
+        since_s,
+        radius_m,
         joint.cells,
-        np.array(joint.origin_xy),
+        joint.origin_xy,
         joint.resolution_m,
     )
-    return found if found.any() else None
+    return found
 
 
 @njit
-def _on_discs(ranges, origins, directions, reach, pose, discs, cells, corner, side):  # type: ignore[no-untyped-def]
-    """Whether each return lies on the free floor of a map, within one of the ``discs`` (x, y, radius)."""
-    found = np.zeros(len(ranges), np.bool_)
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+def _on_discs(  # type: ignore[no-untyped-def]
+    ranges, origins, directions, reach, T_map_before, T_odom_before, T_odom_base,
+    places, since, radius, cells, corner, side,
+):  # fmt: skip
+    """Whether each return lies on the free floor of a map, where a robot may be; None if none does."""
+    pose_x, pose_y, pose_theta = _driven_on(T_map_before, T_odom_before, T_odom_base)
+    cos, sin = np.cos(pose_theta), np.sin(pose_theta)
+    near = np.empty((len(places), 3))  # x and y in ``base``, and the square of its radius
+    count = 0
+    for k in range(len(places)):
+        dx, dy, age = places[k, 0] - pose_x, places[k, 1] - pose_y, places[k, 2] + since
+        limit = radius + SPEED_MPS * age
+        if age <= OLDEST_S and np.hypot(dx, dy) <= reach + limit:
+            near[count] = cos * dx + sin * dy, cos * dy - sin * dx, limit * limit
+            count += 1
+    if count == 0:
+        return None
+    found, is_any = np.zeros(len(ranges), np.bool_), False
     for i in range(len(ranges)):
         r = ranges[i]
         if not 0.0 < r < reach:
             continue
         x, y = origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1]
-        x, y = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
-        for k in range(len(discs)):
-            if np.hypot(x - discs[k, 0], y - discs[k, 1]) <= discs[k, 2]:
-                found[i] = _is_floor(x - corner[0], y - corner[1], cells, side)
+        for k in range(count):
+            if (x - near[k, 0]) ** 2 + (y - near[k, 1]) ** 2 <= near[k, 2]:
+                right, up = pose_x + cos * x - sin * y - corner[0], pose_y + sin * x + cos * y - corner[1]
+                found[i] = _is_floor(right, up, cells, side)
+                is_any = is_any or found[i]
                 break
-    return found
+    return found if is_any else None
+
+
+@njit(allocates=False)
+def _driven_on(T_map_before, T_odom_before, T_odom_base):  # type: ignore[no-untyped-def]
+    """x, y and theta in ``map`` after a motion by odometry."""
+    dx, dy, turned = (
+        T_odom_base[0] - T_odom_before[0],
+        T_odom_base[1] - T_odom_before[1],
+        T_map_before[2] - T_odom_before[2],
+    )
+    cos, sin = np.cos(turned), np.sin(turned)  # of ``odom`` in ``map``
+    return T_map_before[0] + cos * dx - sin * dy, T_map_before[1] + sin * dx + cos * dy, turned + T_odom_base[2]
 
 
 @njit(allocates=False)

@@ -14,7 +14,7 @@ from fcslam.places.query_result import PlaceId, QueryResult, ScoredPlace
 from fcslam.places.scoring import TINY, empty_buffers, score_matches, score_words
 from fcslam.places.similarity import BagOfWords, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
-from fcslam.records import Codes, FloatArray
+from fcslam.records import Codes, FloatArray, frozen
 from fcslam.storage.state_file import State
 
 _MOST_LEVELS = 16
@@ -118,6 +118,18 @@ class PlaceIndex(Generic[PlaceId]):
         words = self._vocabulary.words[leaves]
         order = np.argsort(words)
         return BagOfWords(words[order], weights[order], self.version)
+
+    def descriptors(self, place: PlaceId) -> Codes:
+        """The descriptors of a stored place, shape (N, 32).
+
+        Raises:
+            KeyError: it is not stored.
+        """
+        return frozen(self._postings.codes(self._row_of[place]).view(np.uint8), np.uint8)
+
+    def all_descriptors(self) -> Codes:
+        """The descriptors of all stored places, in the order in which these were added, shape (M, 32)."""
+        return self._postings.gather(self._rows()).view(np.uint8)
 
     def forget(self, place: PlaceId) -> None:
         """Remove a place.

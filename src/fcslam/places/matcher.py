@@ -199,6 +199,7 @@ class PlaceMatcher:
         self._noise_of = noise_of
         self._verify_pairs = verify_pairs
         self._places: dict[KeyscanId, Place] = {}
+        """Without the descriptors that the index holds."""
         self._index: PlaceIndex[KeyscanId] = PlaceIndex(config.vocabulary, rng)
         self._backlog: list[Place] = []
 
@@ -277,7 +278,7 @@ class PlaceMatcher:
         near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
         others = (*self._candidates(result, is_unaligned), *lookalikes)
-        far = [_far(i, propose_motions(self._places[i], place)) for i in others]
+        far = [_far(i, propose_motions(self._stored(i), place)) for i in others]
         return [*near, *far]
 
     def state(self) -> State:
@@ -286,9 +287,11 @@ class PlaceMatcher:
         return {
             "ids": [place.id for place in places],
             "spans": np.array([(place.first, place.last) for place in places], np.int64).reshape(-1, 2),
-            "counts": np.array([len(place.descriptors) for place in places], np.int64),
+            "counts": np.array([len(place.keypoints) for place in places], np.int64),
             "keypoints": np.concatenate([place.keypoints for place in places]) if places else np.zeros((0, 2)),
-            "descriptors": np.concatenate([NO_DESCRIPTORS, *(place.descriptors for place in places)]),
+            "descriptors": np.concatenate(
+                [self._index.all_descriptors(), *(place.descriptors for place in self._backlog)]
+            ),
             "index": self._index.state(),
         }
 
@@ -298,18 +301,27 @@ class PlaceMatcher:
         ends = np.cumsum(state["counts"])[:-1]
         keypoints = np.split(frozen(state["keypoints"], np.float32), ends)
         descriptors = np.split(frozen(state["descriptors"], np.uint8), ends)
-        for row in zip(ids, state["spans"].tolist(), keypoints, descriptors, strict=True):
-            identifier, (first, last), points, codes = row
-            self._places[identifier] = Place(identifier, channel, detector_version, first, last, points, codes)
         indexed = state["index"]["size"]  # the oldest ones
+        kept = [*([NO_DESCRIPTORS] * indexed), *(codes.copy() for codes in descriptors[indexed:])]
+        for row in zip(ids, state["spans"].tolist(), keypoints, kept, strict=True):
+            identifier, (first, last), points, codes = row
+            self._places[identifier] = Place(
+                identifier, channel, detector_version, first, last, points, frozen(codes, np.uint8)
+            )
         self._index = PlaceIndex.restored(self._config.vocabulary, state["index"], ids[:indexed], descriptors[:indexed])
         self._backlog = list(self._places.values())[indexed:]
 
     def _query(self, place: Place) -> QueryResult[KeyscanId]:
         for stored in self._backlog:  # a single robot never needs the vocabulary
             self._index.add(stored.id, stored.descriptors)
+            self._places[stored.id] = replace(stored, descriptors=NO_DESCRIPTORS)
         self._backlog.clear()
         return self._index.compare(place.descriptors)
+
+    def _stored(self, i: KeyscanId) -> Place:
+        """A stored place with its descriptors."""
+        place = self._places[i]
+        return replace(place, descriptors=self._index.descriptors(i)) if i in self._index else place
 
     def forget(self, place: KeyscanId) -> None:
         """Remove a place.
@@ -357,10 +369,9 @@ class PlaceMatcher:
         different things, so one of their motions must confirm the prediction. If none does, the pair is compared
         without the prediction, because the map may be wrong.
         """
-        stored = self._places[i]
         if place.channel is Channel.LIDAR:
             return _Comparison(i, [(T_i_j, NO_PRIOR)], 0.0, predicted=True)
-        proposed = propose_motions(stored, place)
+        proposed = propose_motions(self._stored(i), place)
         motion = next((motion for motion in proposed if self._confirms(motion, T_i_j)), None)
         if motion is None:
             return _far(i, proposed)

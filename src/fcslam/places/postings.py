@@ -158,11 +158,19 @@ class Postings:
 
     def gather(self, rows: NDArray[np.int64]) -> CodeWords:
         """Codes (M, 4) of the places ``rows`` (P,), in ascending order of rows, place by place."""
+        return self._gathered(rows, np.arange(len(self.entries.heads)))
+
+    def codes(self, row: int) -> CodeWords:
+        """Codes (N, 4) of a place."""
+        return self._gathered(np.array([row]), np.unique(self.leaves(row)).astype(np.int64))
+
+    def _gathered(self, rows: NDArray[np.int64], leaves: NDArray[np.int64]) -> CodeWords:
+        """As ``gather``, from the ``leaves`` (L,) that hold them."""
         begins = np.full(self.row_count, -1, np.int64)
         counts = self.entries.counts[rows]
         begins[rows] = np.cumsum(counts) - counts
         codes = np.empty((int(counts.sum()), CODE_WORDS), np.uint64)
-        _gather(self.entries, begins, codes)
+        _gather(self.entries, leaves, begins, codes)
         return codes
 
     def _make_room(self, blocks: int, rows: int = 0, descriptors: int = 0) -> None:
@@ -358,8 +366,8 @@ def _move(
 
 
 @njit
-def _gather(entries: Entries, begins: NDArray[np.int64], codes: CodeWords) -> None:
-    for leaf in range(entries.heads.shape[0]):
+def _gather(entries: Entries, leaves: NDArray[np.int64], begins: NDArray[np.int64], codes: CodeWords) -> None:
+    for leaf in leaves:
         block, filled = newest_block(entries, leaf)
         while block >= 0:
             for place in range(filled):

@@ -8,28 +8,43 @@ import numpy as np
 from fcslam.lidar.facing import contradicted_facing
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.lost import FEWEST_SCANS, is_lost
-from fcslam.records import LaserModel, LaserScan, Sweep, frozen
+from fcslam.records import FloatArray, LaserModel, LaserScan, Ranges, Sweep, frozen
 from fcslam.robot.frontend import RobotConfig
 from fcslam.wire.quantisation import dequantise, quantise
 
-_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
-_STEP_M, _STEPS = 0.3, 30
-_ROOM, _OTHER_ROOM = (6.0, 4.5), (5.7, 4.2)
-"""Half the sides of two made-up rooms, metres: similar, so that a scan of one is near surfaces of the other."""
+MADE_UP_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
+_WALLS = np.array(
+    [
+        (0.0, 0.0, 16.0, 0.0),
+        (16.0, 0.0, 16.0, 9.0),
+        (16.0, 9.0, 0.0, 9.0),
+        (0.0, 9.0, 0.0, 0.0),
+        (4.0, 0.0, 4.0, 1.5),
+        (7.0, 9.0, 8.5, 7.0),
+        (12.0, 0.0, 12.5, 2.0),
+        (13.0, 6.5, 16.0, 6.0),
+    ]
+)
+"""x, y of both ends, metres, in a made-up room."""
+_OTHER_WALLS = 0.95 * _WALLS
+"""In a similar room: a scan of one is near surfaces of the other."""
+ROUND = 60
+"""Made-up scans of one round through the room."""
+_STEPS = 30
 
 
 def warm_up_tracking(config: RobotConfig) -> None:
     """Compile, or load from the cache, all code that the pose of a scan may need.
 
-    A simulated robot crosses a room and is put down in another one, so it is lost and searches. Its laser is
+    A made-up robot drives around in a room and is put down in another one, so it is lost and searches. Its laser is
     compared with the odometry. Garbage collection would take longer than a scan, so it excludes all objects that are in
     memory then.
     """
     frontend = LidarFrontend("warm-up", config.lidar)
-    scans = list(_scans(_ROOM, 0.0))
+    scans = list(made_up_scans(_STEPS, sweep=Sweep(0.0, 0.1)))
     for scan in scans:
         frontend.process(scan)
-    elsewhere = list(_scans(_OTHER_ROOM, scans[-1].stamp))[:FEWEST_SCANS]
+    elsewhere = list(made_up_scans(FEWEST_SCANS, _OTHER_WALLS, Sweep(0.0, 0.1)))
     first = frontend.localize(elsewhere[0]).tracked
     is_lost(elsewhere, first.T_local_base, frontend)
     contradicted_facing(scans)
@@ -37,17 +52,27 @@ def warm_up_tracking(config: RobotConfig) -> None:
     gc.freeze()
 
 
-def _scans(room: tuple[float, float], began_s: float) -> Iterator[LaserScan]:
-    """Scans of a robot that drives to and fro along the middle of a room."""
-    to_and_fro = np.cos(np.arange(_STEPS) * _STEP_M / room[0])
-    for number, x in enumerate(0.8 * room[0] * to_and_fro):
-        pose = np.array([x, 0.0, 0.1 * np.sin(0.3 * number)])
-        ranges = dequantise(quantise(frozen(_ranges(room, pose), np.float32)))
-        yield LaserScan(began_s + 0.1 * (number + 1), ranges, _LASER, frozen(pose), Sweep(0.0, 0.1))
+def made_up_scans(count: int, walls: FloatArray = _WALLS, sweep: Sweep | None = None) -> Iterator[LaserScan]:
+    """Scans of a robot that drives around in a room with ``walls``, shape (W, 4), at most 0.5 m at a time."""
+    turn = 2.0 * np.pi / ROUND
+    for k in range(count):
+        x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)
+        heading = float(np.arctan2(2.0 * np.cos(k * turn), -5.0 * np.sin(k * turn)))
+        pose = np.array((x, y, heading))
+        yield LaserScan(float(k), made_up_ranges(pose, walls), MADE_UP_LASER, frozen(pose), sweep)
 
 
-def _ranges(room: tuple[float, float], pose: np.ndarray) -> np.ndarray:
-    """Distances from a pose to the walls of a room around the origin, shape (beams,)."""
-    angles = _LASER.angles_rad() + pose[2]
-    direction = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-    return np.asarray(((np.sign(direction) * room - pose[:2]) / (direction + 1e-9)).min(axis=1))
+def made_up_ranges(pose: FloatArray, walls: FloatArray = _WALLS) -> Ranges:
+    """Distance to the nearest wall along every beam, as it is sent, shape (B,)."""
+    angles = pose[2] + MADE_UP_LASER.angles_rad()
+    beams = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, np.newaxis]
+    starts, along = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        facing = _cross(beams, along)
+        distance, share = _cross(starts, along) / facing, _cross(starts, beams) / facing
+    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
+    return dequantise(quantise(np.where(hit, distance, np.inf).min(axis=1)))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

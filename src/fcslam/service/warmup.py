@@ -37,37 +37,20 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     KeyscanId,
-    LaserModel,
-    LaserScan,
     Place,
     Sweep,
     frozen,
 )
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.own_places import OwnPlaces
+from fcslam.robot.warmup import MADE_UP_LASER, ROUND, made_up_ranges, made_up_scans
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import decode, encode, measure
-from fcslam.wire.quantisation import dequantise, quantise
+from fcslam.wire.quantisation import dequantise
 
-_WALLS = np.array(
-    [
-        (0.0, 0.0, 16.0, 0.0),
-        (16.0, 0.0, 16.0, 9.0),
-        (16.0, 9.0, 0.0, 9.0),
-        (0.0, 9.0, 0.0, 0.0),
-        (4.0, 0.0, 4.0, 1.5),
-        (7.0, 9.0, 8.5, 7.0),
-        (12.0, 0.0, 12.5, 2.0),
-        (13.0, 6.5, 16.0, 6.0),
-    ]
-)
-"""x, y of both ends, metres."""
-_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
 _STEP_M, _STEPS, _PLACE_EVERY, _AROUND = 0.4, 31, 3, 3
 _EMPTY_SCAN = PointScan(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(2))
-_ROUND = 60
-"""Scans of one round."""
 _LANDMARKS = 120
 _DETECTOR = "made-up-1"
 _MOTION = np.diag((1e4, 1e4, 1e5))
@@ -77,7 +60,7 @@ _CLOSURE_AFTER = 15
 
 def warm_up_scanning() -> None:
     """Compile what the first scan of a robot needs: points, normals and the field."""
-    scan = next(_scans(1))
+    scan = next(made_up_scans(1))
     field_of([(point_scan(scan.ranges_m, scan.laser, Sweep(0.0, 0.1)), np.zeros(3))])
 
 
@@ -95,7 +78,7 @@ def warm_up_searching() -> None:
 def warm_up_robot() -> None:
     """Compile submaps, their description, loop closing, and packets of places."""
     robot = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
-    for scan in _scans(2 * _ROUND):
+    for scan in made_up_scans(2 * ROUND):
         for packet in robot.process(scan):
             measure(packet)
 
@@ -104,7 +87,7 @@ def warm_up_recognition() -> None:
     """Compile the vocabulary, and what compares places."""
     vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
     places = OwnPlaces(vocabulary)
-    surface = build_submap([(point_scan(s.ranges_m, s.laser), s.T_odom_base) for s in _scans(9)]).surface.points
+    surface = build_submap([(point_scan(s.ranges_m, s.laser), s.T_odom_base) for s in made_up_scans(9)]).surface.points
     for k in range(4):
         places.store(k, surface)
         places.most_similar(k, range(k), 3)
@@ -180,16 +163,6 @@ def _compile(run: Callable[[], None], turns: Any) -> None:
         run()
 
 
-def _scans(count: int) -> Iterator[LaserScan]:
-    """Scans of a robot that drives around in the room, 0.4 m at a time."""
-    turn = 2.0 * np.pi / _ROUND
-    for k in range(count):
-        x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)
-        heading = float(np.arctan2(2.0 * np.cos(k * turn), -5.0 * np.sin(k * turn)))
-        pose = np.array((x, y, heading))
-        yield LaserScan(float(k), dequantise(quantise(_ranges(pose))), _LASER, frozen(pose))
-
-
 def _packets() -> Iterator[bytes]:
     """Two robots that cross the room in opposite directions, one after the other."""
     rng = np.random.default_rng(0)
@@ -204,9 +177,9 @@ def _packets() -> Iterator[bytes]:
 
 
 def _bodies(robot: str, start_s: float, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
-    yield Hello(robot, 0, (_LASER,), dict.fromkeys(PLACE_CHANNELS, _DETECTOR))
+    yield Hello(robot, 0, (MADE_UP_LASER,), dict.fromkeys(PLACE_CHANNELS, _DETECTOR))
     for k, pose in enumerate(poses):
-        yield Keyscan(KeyscanId(robot, k), start_s + k, dequantise(quantise(_ranges(pose))))
+        yield Keyscan(KeyscanId(robot, k), start_s + k, made_up_ranges(pose))
         if k:
             yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
         anchor = k - _AROUND
@@ -233,19 +206,3 @@ def _place(
         frozen(keypoints[:, : KEYPOINT_AXES[channel]], np.float32),
         frozen(codes[seen], np.uint8),
     )
-
-
-def _ranges(pose: FloatArray) -> FloatArray:
-    """Distance to the nearest wall along every beam, shape (B,)."""
-    angles = pose[2] + _LASER.angles_rad()
-    beams = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, np.newaxis]
-    starts, walls = _WALLS[:, :2] - pose[:2], _WALLS[:, 2:] - _WALLS[:, :2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        facing = _cross(beams, walls)
-        distance, share = _cross(starts, walls) / facing, _cross(starts, beams) / facing
-    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
-    return np.asarray(np.where(hit, distance, np.inf).min(axis=1))
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
