@@ -82,6 +82,7 @@ def match_scan(
     prior_information: FloatArray,
     velocity_information: FloatArray = FIXED,
     wide_scale_m: float = WIDE_SCALE_M,
+    clutter_scale_m: float = NARROW_SCALE_M,
 ) -> ScanMatch:
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
@@ -96,6 +97,7 @@ def match_scan(
         prior_information: over (x, y, theta) in the field's coordinates, shape (3, 3); zeros for no prior.
         velocity_information: of the assumed velocity (x, y, theta), shape (3,), in (m/s)^-2 and (rad/s)^-2.
         wide_scale_m: scale of the robust loss at the first step, metres.
+        clutter_scale_m: least scale of the loss of points without a normal, metres.
 
     Returns:
         The pose, the information of the points, and how well they fit.
@@ -107,6 +109,7 @@ def match_scan(
         velocity_information,
         field.arrays,
         wide_scale_m,
+        clutter_scale_m,
     )
     return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihoods, velocity)
 
@@ -122,8 +125,8 @@ class _Points(NamedTuple):
 
 
 @njit
-def _match(scan, guess, prior, velocity_prior, field, wide):  # type: ignore[no-untyped-def]
-    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``NARROW_SCALE_M``.
+def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: ignore[no-untyped-def]
+    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``NARROW_SCALE_M``, in clutter to ``clutter``.
 
     It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + v^T diag(velocity_prior) v. The
     Jacobian of e_i over pose and velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J,
@@ -134,7 +137,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide):  # type: ignore[no-
     H, g, reduced = equations.H, equations.g, equations.reduced
     scale = wide
     for _ in range(MOST_ITERATIONS):
-        _normal_equations(equations, scan, pose, velocity, field, scale, velocity_prior)
+        _normal_equations(equations, scan, pose, velocity, field, (scale, max(scale, clutter)), velocity_prior)
         turned = (pose[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi
         difference = pose[0] - guess[0], pose[1] - guess[1], turned
         for r in range(3):
@@ -155,7 +158,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide):  # type: ignore[no-
             break
         scale = max(NARROW_SCALE_M, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    _normal_equations(equations, scan, pose, velocity, field, NARROW_SCALE_M, velocity_prior)
+    _normal_equations(equations, scan, pose, velocity, field, (NARROW_SCALE_M, clutter), velocity_prior)
     explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
@@ -193,10 +196,10 @@ class _Equations(NamedTuple):
 
 
 @njit(allocates=False)
-def _normal_equations(equations, scan, pose, velocity, field, scale, velocity_prior):  # type: ignore[no-untyped-def]
+def _normal_equations(equations, scan, pose, velocity, field, scales, velocity_prior):  # type: ignore[no-untyped-def]
     """Write the normal equations at ``pose`` and ``velocity`` into ``equations``."""
     H, g, mixed, own, reduced = equations
-    own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, scale)
+    own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, scales)
     s2 = 1.0 / (POINT_SIGMA_M * POINT_SIGMA_M)
     _scale_symmetric(H, s2, own_pose)
     for r in range(3):
@@ -228,16 +231,17 @@ def _scale_symmetric(matrix, factor, upper):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _sums(scan, pose, velocity, field, scale):  # type: ignore[no-untyped-def]
+def _sums(scan, pose, velocity, field, scales):  # type: ignore[no-untyped-def]
     """Sums over the points of w J^T J, t w J^T J, t^2 w J^T J (upper triangles), w J^T e and t w J^T e."""
     hxx = hxy = hxt = hyy = hyt = htt = gx = gy = gt = 0.0  # scalars, which stay in registers
     kxx = kxy = kxt = kyy = kyt = ktt = fx = fy = ft = 0.0
     lxx = lxy = lxt = lyy = lyt = ltt = 0.0
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     swept = len(scan.times) > 0
+    c2, clutter2 = scales[0] * scales[0], scales[1] * scales[1]
     for i in range(len(scan.points)):
         t = scan.times[i] if swept else 0.0
-        axx, axy, axt, ayy, ayt, att, bx, by, bt = _terms(scan, i, pose, cos, sin, t, velocity, field, scale * scale)
+        axx, axy, axt, ayy, ayt, att, bx, by, bt = _terms(scan, i, pose, cos, sin, t, velocity, field, c2, clutter2)
         hxx, hxy, hxt, hyy, hyt, htt = hxx + axx, hxy + axy, hxt + axt, hyy + ayy, hyt + ayt, htt + att
         gx, gy, gt = gx + bx, gy + by, gt + bt
         if swept:
@@ -255,12 +259,12 @@ def _sums(scan, pose, velocity, field, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _terms(scan, i, pose, cos, sin, t, velocity, field, c2):  # type: ignore[no-untyped-def]
+def _terms(scan, i, pose, cos, sin, t, velocity, field, c2, clutter2):  # type: ignore[no-untyped-def]
     """w J^T J (upper triangle) and w J^T e of point i, measured at t.
 
     e is the distance from the point to the line of its surfel. Its Jacobian over the pose is J = (n_x, n_y, n x r),
     with the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
-    and along y. The weight w is that of Geman and McClure.
+    and along y. The weight w is that of Geman and McClure, with the squared scale ``clutter2`` without a normal.
     """
     none = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     rx, ry = _swept_point(scan.points, i, cos, sin, t, velocity)
@@ -279,7 +283,7 @@ def _terms(scan, i, pose, cos, sin, t, velocity, field, c2):  # type: ignore[no-
     if nx == 0.0 and ny == 0.0:
         nx, ny = mx, my
     if nx == 0.0 and ny == 0.0:
-        w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
+        w = NO_NORMAL_WEIGHT * (clutter2 / (clutter2 + d2)) ** 2
         if scan.solitary[i]:
             return w, 0.0, -w * ry, w, w * rx, w * (rx * rx + ry * ry), w * dx, w * dy, w * (rx * dy - ry * dx)
         # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot to its
