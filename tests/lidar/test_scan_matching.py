@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
-from fcslam.lidar.matching import POINT_SIGMA_M, match_scan
+from fcslam.lidar.matching import NEW_SCANS, POINT_SIGMA_M, match_scan
 from tests.lidar.worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 NO_PRIOR = np.zeros((3, 3))
@@ -123,7 +123,7 @@ def test_a_wall_seen_from_both_sides_keeps_its_thickness():
 
 def test_moving_field_and_guess_moves_the_result():
     rng = np.random.default_rng(4)
-    poses = ring_drive()[:60:12]
+    poses = ring_drive()[:60:6]
     scans = [scan_at(pose, ring(), noise_m=0.01, rng=rng) for pose in poses]
     truth = ring_drive()[30]
     scan, guess = scan_at(truth, ring(), noise_m=0.01, rng=rng), truth + np.array([0.08, -0.05, 0.03])
@@ -139,6 +139,18 @@ def test_moving_field_and_guess_moves_the_result():
         rotation[:2, :2] = se2.transform((0, 0, move[2]), np.eye(2)).T
         expected = rotation @ here.information @ rotation.T
         np.testing.assert_allclose(there.information, expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_points_on_new_surfaces_do_not_outweigh_those_on_older_ones():
+    """Most points lie on walls that the last poses have turned by 0.2 deg against an older, small wall."""
+    small, large = path((-6, -2), (-6, 2), (-4.5, 2)), path((-5, 5), (5, 5), (5, -5), (-5, -5))
+    here, turned, off = np.zeros(3), np.array([0.0, 0.0, np.deg2rad(0.2)]), []
+    for later in (0, NEW_SCANS):  # scans after which the large walls are no longer new
+        views = [(small, here)] * 6 + [(large, turned)] * NEW_SCANS + [(small, here)] * later
+        field = field_of([(scan_at(here, walls), pose) for walls, pose in views])
+        off.append(match_scan(scan_at(here, np.vstack((small, large))), field, here, NO_PRIOR).T_field_base[2])
+    assert off[1] > 0.85 * turned[2]
+    assert off[0] < 0.65 * turned[2]
 
 
 def test_nothing_known_leaves_the_guess(field):

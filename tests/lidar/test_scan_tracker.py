@@ -225,3 +225,14 @@ def test_the_learned_error_of_odometry_is_its_true_error(truth, share):
     learned = [tracker.trust.scale(error) for error in model]
     normalised = [error.mahalanobis2(e) / 3.0 for error, e in zip(learned, errors, strict=True)]
     assert 0.5 < np.sqrt(np.mean(normalised)) < 2.0
+
+
+@pytest.mark.parametrize("error_m", [0.15, 0.25, -0.2, -0.25])
+def test_a_long_step_beside_a_fence_ends_at_the_right_post(error_m):
+    """Posts 0.4 m apart attract a match that starts nearer to the next one."""
+    posts = [box(x, y, x + 0.05, y + 0.05) for x in np.arange(-5.0, 12.0, 0.4) for y in (-2.5, 2.5)]
+    truth = np.array([(0.0, 0.0, 0.0), (1.03, 0.1, 0.1)])
+    odometry = truth + [(0.0, 0.0, 0.0), (error_m, 0.05, 0.03)]
+    shift, turn = pose_errors(track(recording(truth, odometry, np.vstack(posts)))[0], truth)
+    assert shift[1] < 0.02
+    assert turn[1] < 0.005

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -34,7 +35,14 @@ USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 LARGEST_VELOCITY = 30.0
 """Largest velocity of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
+UNSURE_M = 0.05
+"""Learned standard deviation of odometry, in metres, beyond which a match has several starts. After a long step a match
+may end at a maximum of the likelihood that is nearer to odometry than the right one."""
+CLUTTER_SCALE_M = 0.15
+"""Least scale of the loss of points without a normal after such a step, metres: in clutter, as a hedge, the robot then
+sees other points than before."""
 _NO_INFORMATION = np.zeros((3, 3))
+_DIRECTIONS = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
 
 
 STILL_M = 0.005
@@ -245,7 +253,10 @@ class ScanTracker:
         """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
         field = self._fields[0][0]
         learned = self._trust.scale(error)
-        match = match_scan(thinned, field, T_local_guess, error.information, velocity)
+        if learned.position_m > UNSURE_M:
+            match = _likeliest(thinned, field, T_local_guess, learned, velocity)
+        else:
+            match = match_scan(thinned, field, T_local_guess, error.information, velocity)
         innovation = se2.between(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
         is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= SURPRISE**2
@@ -262,6 +273,21 @@ class ScanTracker:
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
             return other
         return match
+
+
+def _likeliest(
+    scan: PointScan, field: SurfelField, T_local_guess: FloatArray, learned: OdometryError, velocity: FloatArray
+) -> ScanMatch:
+    """The likeliest match of several starts: the guess, and one standard deviation from it in every direction."""
+    deviations = _DIRECTIONS * (learned.position_m, learned.position_m, learned.heading_rad)
+    matches = (
+        match_scan(scan, field, start, _NO_INFORMATION, velocity, clutter_scale_m=CLUTTER_SCALE_M)
+        for start in se2.compose(T_local_guess, deviations)
+    )
+    return max(
+        matches,
+        key=lambda match: match.log_likelihood + learned.log_likelihood(se2.between(T_local_guess, match.T_field_base)),
+    )
 
 
 def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
