@@ -232,7 +232,7 @@ def test_a_long_step_beside_a_fence_ends_at_the_right_post(error_m):
     """Posts 0.4 m apart attract a match that starts nearer to the next one."""
     posts = [box(x, y, x + 0.05, y + 0.05) for x in np.arange(-5.0, 12.0, 0.4) for y in (-2.5, 2.5)]
     truth = np.array([(0.0, 0.0, 0.0), (1.03, 0.1, 0.1)])
-    odometry = truth + [(0.0, 0.0, 0.0), (error_m, 0.05, 0.03)]
+    odometry = truth + np.array([(0.0, 0.0, 0.0), (error_m, 0.05, 0.03)])
     shift, turn = pose_errors(track(recording(truth, odometry, np.vstack(posts)))[0], truth)
     assert shift[1] < 0.02
     assert turn[1] < 0.005
