@@ -10,8 +10,9 @@ Age: from the moment at which the scan of another robot looked through a cell un
 only cells that this robot did not see itself before, and that were
 seen after the maps of all robots had joined. The end: the maps on the robots 5 s after the service was asked
 for its result, against `map.pgm` of that result, which is that of `fcslam map` on the recordings
-(`tests/service/test_worker.py`). The CPU of a scan is the mean of the thread that adds it, and beside it that of robots
-that only send to the service. Ghosts: occupied cells of that map within 0.25 m of where a robot drove.
+(`tests/service/test_worker.py`). The CPU of a scan is the mean of the thread that adds it. Robots that only send, to a
+service of their own, drive at the same time and get the same scans half a period later. Ghosts: occupied cells of that
+map within 0.25 m of where a robot drove.
 """
 
 import tempfile
@@ -54,15 +55,24 @@ def main() -> None:
             replace(scan, stamp=at_s, ranges_m=_with_robots(scan, pose, [_at(other, at_s) for other in others]))
             for scan, pose, at_s in zip(robot.scans(), robot.T_building_base, ways[k][0].tolist(), strict=True)
         ])  # fmt: skip
-    with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (_, port), ExitStack() as opened:
-        live = [
-            opened.enter_context(closing(fcslam.Robot(robot.name, server=f"http://127.0.0.1:{port}")))
-            for robot in robots
-        ]
+    with ExitStack() as opened:
+        port, other_port = (
+            opened.enter_context(cloud(Path(opened.enter_context(tempfile.TemporaryDirectory()))))[1] for _ in range(2)
+        )
+        live, apart = (
+            [
+                opened.enter_context(
+                    closing(fcslam.Robot(robot.name, server=f"http://127.0.0.1:{at}", own_map=own_map))
+                )
+                for robot in robots
+            ]
+            for at, own_map in ((port, True), (other_port, False))
+        )
         samples: list[list[tuple[float, OccupancyMap]]] = [[] for _ in robots]
         joined_s, joins = 0.0, 0
         began_s = time.monotonic()
         threads, costs = _started(live, scans)
+        others_drive, alone = _started(apart, scans, 0.5 / lidar.rate_hz)
         while any(thread.is_alive() for thread in threads):
             time.sleep(1.0)
             if (count := sum(len(robot.fleet.news) for robot in live)) > joins:
@@ -71,6 +81,8 @@ def main() -> None:
                 if (joint := robot.joint_map()) is not None:
                     samples[k].append((time.monotonic() - began_s, joint))
         duration_s = time.monotonic() - began_s
+        for thread in others_drive:
+            thread.join()
         for robot in live:
             robot.finish(60.0)
         received = [robot.fleet.received_bytes for robot in live]
@@ -80,10 +92,6 @@ def main() -> None:
         ends = [robot.joint_map() or final for robot in live]
         same = [_difference(end, final) for end in ends]
         news = [robot.fleet.news for robot in live]
-    with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (_, port), ExitStack() as opened:
-        url = f"http://127.0.0.1:{port}"
-        apart = [opened.enter_context(closing(fcslam.Robot(one.name, server=url, own_map=False))) for one in robots]
-        alone = _driven(apart, scans)
     paths = [run.trajectories[robot.name] for robot in robots]
     ages = [_ages(samples[k], paths, scans, k, joined_s) for k in range(len(robots))]
     report.table(
@@ -128,9 +136,9 @@ def _at(way, at_s):
     return way[1][min(max(int(np.searchsorted(way[0], at_s)), 0), len(way[0]) - 1)]
 
 
-def _started(robots, scans):
+def _started(robots, scans, after_s=0.0):
     """Threads in which robots add their scans at real time, and the CPU time of each scan, as it grows."""
-    began_s, costs = time.monotonic(), [[] for _ in robots]
+    began_s, costs = time.monotonic() + after_s, [[] for _ in robots]
     threads = [
         threading.Thread(target=_drive, args=(robot, some, began_s, taken))
         for robot, some, taken in zip(robots, scans, costs, strict=True)
@@ -138,14 +146,6 @@ def _started(robots, scans):
     for thread in threads:
         thread.start()
     return threads, costs
-
-
-def _driven(robots, scans):
-    """The CPU time of each scan of robots that add them at real time."""
-    threads, costs = _started(robots, scans)
-    for thread in threads:
-        thread.join()
-    return costs
 
 
 def _drive(robot, scans, began_s, costs):
