@@ -52,7 +52,7 @@ from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import LossSettings, TrainingSettings
 from fcslam.learning.stages import keypoint_response, read_labelled_images
 from fcslam.learning.trainer import AVERAGE_DECAY, ExecutionOptions
-from fcslam.learning.training_step import create_optimiser, descend, learning_rate
+from fcslam.learning.training_step import CLIP_NORM, create_optimiser, learning_rate
 
 SOURCES = (
     "bsds500", "coco_subset", "urban100", "sun_hays80", "kodak24", "icl_nuim_snippet", "camvid", "ie_tower",
@@ -61,8 +61,6 @@ SOURCES = (
 )  # fmt: skip
 UNSEEN = tuple(f"ie_tower/floor{number}/" for number in range(11, 16))
 LABELS = TrainingSettings(label_copies=4)
-KEPT_AT = (0.6, 0.8, 1.0)
-"""Shares of a training after which the light network is kept."""
 EQUATIONS_STEPS = 1000
 WATCH_EVERY = 50
 WATCHED_PAIRS = 32
@@ -208,7 +206,7 @@ def train_arm(
     photographs = Photographs.of(train_on, device)
     generator = torch.Generator(device).manual_seed(SEED)
     seen = draw(Photographs.of(held_out, device), WATCHED_PAIRS, generator=torch.Generator(device).manual_seed(SEED))
-    watch, begins, kept, step, progress = Watch(watched(folder, name), seen), time.time(), 0, 0, 0.0
+    watch, begins, step, progress = Watch(watched(folder, name), seen), time.time(), 0, 0.0
     parts = {"detector": torch.zeros(())}
     watch.look(name, 0, average, parts)
     while progress < 1.0:
@@ -219,19 +217,22 @@ def train_arm(
         maps = network.train()(batch.images.contiguous(memory_format=torch.channels_last))
         shift = grid_shift(settings.encoder, SEED, step)
         total, parts = objective(maps, batch, settings.loss, progress, shift, None)
-        descend(network, optimiser, total, step)
+        optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        if torch.isfinite(torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)):
+            optimiser.step()
+        else:
+            print(f"{name} {step}: left out, because it is not finite: {parts}", flush=True)
         follow(average, network, step)
         step += 1
         share_of_time = (time.time() - begins) / max(ends - begins, 1e-3)
         progress = share_of_time if arm.steps is None else max(step / arm.steps, share_of_time)
         if step % (WATCH_EVERY if arm.steps else 500) == 0 or progress >= 1.0:
             watch.look(name, step, network if arm.steps else average, parts)
-            print(f"{name} {step} {progress:.3f}", *(f"{key} {float(value):.4f}" for key, value in parts.items()),
+            print(f"{name} {step} {progress:.3f}", *(f"{key} {value.item():.4f}" for key, value in parts.items()),
                   *(f"{value:.3f}" for value in watch.rows[-1][2:]), flush=True)  # fmt: skip
-        while kept < len(KEPT_AT) and progress >= KEPT_AT[kept]:
-            if arm.steps is None:
-                keep(average, folder / f"{name}-{round(100 * KEPT_AT[kept])}.onnx")
-            kept += 1
+    if arm.steps is None:
+        keep(average, folder / f"{name}.onnx")
 
 
 def follow(average: KeypointNetwork, network: KeypointNetwork, step: int) -> None:
@@ -285,10 +286,7 @@ def measure(chosen: Any) -> None:
     vision = common.recordings(*PLANES, kind="vision")
     report.table("Codes while training", CODES, code_rows(chosen.networks, chosen.arms))
     weights = {"bundled": BUNDLED_NETWORK} | {
-        f"{arm}, {share:.0%}": path
-        for arm in chosen.arms
-        for share in KEPT_AT
-        if (path := chosen.networks / f"{arm}-{round(100 * share)}.onnx").exists()
+        arm: chosen.networks / f"{arm}.onnx" for arm in chosen.arms if ARMS[arm].steps is None
     }
     columns = {"": "s", "NMS": "d"} | dict.fromkeys(MEASURES, ".3f")
     with tempfile.TemporaryDirectory() as made:
