@@ -51,7 +51,7 @@ def main() -> None:
     report = common.Report(__file__, __doc__ or "", chosen)
     folder = common.recordings(*SOURCES, kind="vision")
     with tempfile.TemporaryDirectory() as made:
-        scenes = _make_scenes(folder, Path(made))
+        scenes = make_scenes(folder, Path(made), IMAGES)
         measured = evaluate_homography(find_scenes(scenes), choose_detectors(DETECTORS, chosen.weights, []))
     columns = {"": "s", "NMS": "d", "repeatability": "s"} | dict.fromkeys(MEASURES, "s")
     report.table("Homography and matching", columns, _rows(measured))
@@ -60,10 +60,10 @@ def main() -> None:
     report.write()
 
 
-def _make_scenes(folder: Path, made: Path) -> list[Path]:
+def make_scenes(folder: Path, made: Path, images: int) -> list[Path]:
     """A scene for every image: itself, and its copies with their homographies."""
     scenes = []
-    for number, path in enumerate(_images(folder)):
+    for number, path in enumerate(_images(folder, images)):
         rng = np.random.default_rng([SEED, number])
         scene = made / f"v_{number:03}"
         scene.mkdir()
@@ -79,12 +79,12 @@ def _make_scenes(folder: Path, made: Path) -> list[Path]:
     return scenes
 
 
-def _images(folder: Path) -> list[Path]:
+def _images(folder: Path, count: int) -> list[Path]:
     """As many of every source, spread over it."""
     chosen: list[Path] = []
     for left, (name, patterns) in zip(range(len(SOURCES), 0, -1), SOURCES.items(), strict=True):
         files = sorted(path for pattern in patterns for path in (folder / name).glob(pattern))
-        wanted = -(-(IMAGES - len(chosen)) // left)
+        wanted = -(-(count - len(chosen)) // left)
         chosen += [files[row] for row in np.linspace(0, len(files) - 1, wanted).round().astype(int)]
     return chosen
 

@@ -1,6 +1,6 @@
 """Does an image pyramid find more keypoints again from farther away? Recall by the distance between two views.
 
-    python benchmarks/pyramid.py [--fleets FOLDER]
+    python benchmarks/pyramid.py [--fleets FOLDER] [--weights NETWORK]
 
 The bundled network at the scales of a robot (1) and at those of `fcslam tools extract` (1, 0.71, 0.5), with as many
 keypoints. Fleets of three robots in simulated buildings that no training saw, in equal light; FOLDER keeps the
@@ -31,36 +31,40 @@ from fcslam.records import FloatArray
 DISTANCES_M = (0.0, 0.5, 1.5, 2.5)
 """Limits of the distances between two views."""
 MOST_PAIRS = 60
-SCALES = {"one scale": (1.0,), "three scales": MATCHING_SCALES}
+SCALES = {"one scale": OnnxConfig(), "three scales": OnnxConfig(scales=MATCHING_SCALES)}
 ROWS = {"building": "d", "distance, m": "s", "pairs": "d", "": "s", "recall": ".4f", "right matches a pair": ".1f",
         "precision": ".3f"}  # fmt: skip
-GAINS = {"distance, m": "s", "pairs": "d", **dict.fromkeys(SCALES, ".3f"), "recall, difference": "s",
-         "right matches a pair, difference": "s"}  # fmt: skip
+DIFFERENCES = {"recall, difference": "s", "right matches a pair, difference": "s"}
 
 
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--seeds", nargs="+", type=int, default=simulated_fleet.SEEDS, help="of the buildings")
     parser.add_argument("--fleets", type=Path, help="folder that keeps the recordings [they are deleted]")
+    parser.add_argument("--weights", type=Path, help="a network at one scale beside the bundled one, not three scales")
     chosen = parser.parse_args()
+    other = {"bundled": OnnxConfig(), "other": OnnxConfig(weights=chosen.weights)}
+    arms = SCALES if chosen.weights is None else other
     report = common.Report(__file__, __doc__, chosen)
     with tempfile.TemporaryDirectory() as place:
-        rows = [row for seed in chosen.seeds for row in building_rows(seed, chosen.fleets or Path(place))]
-    report.table("Three scales less one", GAINS, gains(rows))
+        rows = [row for seed in chosen.seeds for row in building_rows(seed, chosen.fleets or Path(place), arms)]
+    first, second = arms
+    columns = {"distance, m": "s", "pairs": "d", **dict.fromkeys(arms, ".3f"), **DIFFERENCES}
+    report.table(f"{second.capitalize()} less {first}", columns, gains(rows, list(arms)))
     report.table("Buildings", ROWS, rows)
     report.write()
 
 
-def building_rows(seed: int, fleets: Path) -> Iterator[tuple]:
-    """Each distance at one scale and at three, in one building."""
+def building_rows(seed: int, fleets: Path, arms: dict[str, OnnxConfig]) -> Iterator[tuple]:
+    """Each distance and network in one building."""
     fleet = common.simulated(fleets / f"default-{seed}", "--robots", simulated_fleet.ROBOTS, "--seed", seed)
     views, overlap = views_of(fleet, ROBOTS)
     poses = np.array([view.T_building_base for view in views])
     robots = np.array([view.robot for view in views])
     shared = (robots[:, None] < robots) & (overlap > PAIR_OVERLAP)
     apart_m = np.linalg.norm(poses[:, None, :2] - poses[None, :, :2], axis=2)
-    for name, scales in SCALES.items():
-        detector = OnnxDetector(OnnxConfig(scales=scales))
+    for name, config in arms.items():
+        detector = OnnxDetector(config)
         frames = [Keyframe.of(v.picture, detector.detect(v.picture), v.camera, v.surroundings) for v in views]
         for near, far in itertools.pairwise(DISTANCES_M):
             pairs = np.argwhere(shared & (near <= apart_m) & (apart_m < far))
@@ -71,13 +75,13 @@ def building_rows(seed: int, fleets: Path) -> Iterator[tuple]:
         print(seed, name, file=sys.stderr, flush=True)
 
 
-def gains(rows: list[tuple]) -> Iterator[tuple]:
+def gains(rows: list[tuple], arms: list[str]) -> Iterator[tuple]:
     for distance in dict.fromkeys(row[1] for row in rows):
-        one, three = (of(rows, distance, name) for name in SCALES)
-        intervals = (mean_interval(gain, np.random.default_rng(1)) for gain in (three - one).T)
+        first, second = (of(rows, distance, name) for name in arms)
+        intervals = (mean_interval(gain, np.random.default_rng(1)) for gain in (second - first).T)
         shown = (f"{each.mean:+.3f} [{each.low:+.3f}, {each.high:+.3f}]" for each in intervals)
-        pairs = sum(row[2] for row in rows if row[1] == distance) // len(SCALES)
-        yield distance, pairs, float(one[:, 0].mean()), float(three[:, 0].mean()), *shown
+        pairs = sum(row[2] for row in rows if row[1] == distance) // len(arms)
+        yield distance, pairs, float(first[:, 0].mean()), float(second[:, 0].mean()), *shown
 
 
 def of(rows: list[tuple], distance: str, name: str) -> FloatArray:

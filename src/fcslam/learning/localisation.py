@@ -6,12 +6,10 @@ detector refines its peaks, so it moves them by parts of a pixel.
 
 from typing import Final
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from fcslam.features.dense import find_peaks
 from fcslam.features.detector import OnnxConfig
 
 SAME_POINT_PX: Final = 2.5
@@ -25,6 +23,8 @@ HUBER_PX: Final = 0.5
 """Distance at which the loss turns from square to linear."""
 _FLAT: Final = 1e-6
 """A parabola that bends less has no peak."""
+_NOWHERE_PX: Final = 1e6
+"""Where a peak lies that there is not."""
 
 
 def localisation_loss(scores: Tensor, homographies: Tensor) -> Tensor:
@@ -36,40 +36,48 @@ def localisation_loss(scores: Tensor, homographies: Tensor) -> Tensor:
         scores: shape (2B, H, W), probability of a keypoint at each pixel, first views before second views.
         homographies: shape (B, 3, 3), map pixels of the first view to pixels of the second.
     """
-    terms = [_distance_loss(*pair) for pair in zip(*scores.chunk(2), homographies, strict=True)]
-    every = torch.cat(terms)
-    return every.mean() if len(every) else scores.new_zeros(())
+    (here, there), (found, found_there) = (each.chunk(2) for each in peaks(scores))
+    moved = torch.cat((here, torch.ones_like(here[..., :1])), dim=-1) @ homographies.transpose(-1, -2)
+    moved = moved[..., :2] / moved[..., 2:]
+    nowhere = torch.full_like(moved, _NOWHERE_PX)
+    gaps = torch.cdist(
+        torch.where(found[..., None], moved, nowhere).detach(),
+        torch.where(found_there[..., None], there, -nowhere).detach(),
+        compute_mode="donot_use_mm_for_euclid_dist",
+    )
+    closest, nearest = gaps.min(-1)
+    back = gaps.argmin(-2).gather(-1, nearest)
+    shared = (back == torch.arange(moved.shape[1], device=gaps.device)) & (closest < SAME_POINT_PX)
+    partner = there.gather(1, nearest[..., None].expand(-1, -1, 2))
+    terms = F.smooth_l1_loss(moved, partner, beta=HUBER_PX, reduction="none").sum(-1)
+    return torch.where(shared, terms, 0.0).sum() / shared.sum().clamp(min=1)
 
 
-def peaks(scores: Tensor) -> Tensor:
-    """Positions (N, 2) [px] of the keypoints of a map (H, W), strongest first, differentiable by the map.
+def peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Keypoints of maps (B, H, W): positions (B, K, 2) [px], differentiable by the maps, and which there are (B, K).
 
-    They are those of ``find_peaks`` with a robot's default settings, without the ones at the border.
+    They are the strongest maxima over ``least_score`` of a robot's default settings that no stronger pixel is near,
+    without the ones at the border.
     """
     config = OnnxConfig()
-    found, _ = find_peaks(scores.detach().cpu().numpy(), config.least_score, config.nms_px, MOST_PEAKS)
-    pixels = np.rint(found).astype(np.int64)
-    last = np.array(scores.shape[::-1]) - 1 - BORDER_PX
-    inside = ((pixels >= BORDER_PX) & (pixels <= last)).all(axis=1)
-    x, y = torch.from_numpy(pixels[inside]).to(scores.device).unbind(1)
-    middle = scores[y, x]
-    dx = _vertex(scores[y, x - 1], middle, scores[y, x + 1])
-    dy = _vertex(scores[y - 1, x], middle, scores[y + 1, x])
-    return torch.stack((x + dx, y + dy), dim=1)
+    width = scores.shape[-1]
+    levels = scores.detach()
+    side = 2 * round(config.nms_px) - 1
+    strongest = F.max_pool2d(levels.unsqueeze(1), side, 1, side // 2).squeeze(1)
+    inner = torch.zeros_like(levels, dtype=torch.bool)
+    inner[:, BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
+    strength = torch.where((levels == strongest) & (levels > config.least_score) & inner, levels, 0.0).flatten(1)
+    strength, pixels = strength.topk(min(MOST_PEAKS, strength.shape[1]))
+    found = strength > 0.0
+    pixels = torch.where(found, pixels, BORDER_PX * (width + 1))  # any inner pixel, so that it has neighbours
+    flat = scores.flatten(1)
 
+    def level(step: int) -> Tensor:
+        return flat.gather(1, pixels + step)
 
-def _distance_loss(first: Tensor, second: Tensor, homography: Tensor) -> Tensor:
-    """The loss of each keypoint that two maps (H, W) share, shape (N,)."""
-    here, there = peaks(first), peaks(second)
-    moved = torch.cat((here, torch.ones_like(here[:, :1])), dim=1) @ homography.T
-    moved = moved[:, :2] / moved[:, 2:]
-    gaps = torch.cdist(moved.detach(), there.detach())
-    if not gaps.numel():
-        return gaps.new_zeros(0)
-    nearest, back = gaps.argmin(1), gaps.argmin(0)
-    rows = torch.arange(len(moved), device=gaps.device)
-    shared = (back[nearest] == rows) & (gaps[rows, nearest] < SAME_POINT_PX)
-    return F.smooth_l1_loss(moved[shared], there[nearest[shared]], beta=HUBER_PX, reduction="none").sum(1)
+    offsets = [_vertex(level(-step), level(0), level(step)) for step in (1, width)]
+    whole = torch.stack((pixels % width, pixels // width), dim=-1)
+    return whole + torch.stack(offsets, dim=-1), found
 
 
 def _vertex(before: Tensor, middle: Tensor, behind: Tensor) -> Tensor:
