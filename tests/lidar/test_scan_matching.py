@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
-from fcslam.lidar.matching import NEW_SCANS, POINT_SIGMA_M, match_scan
+from fcslam.lidar.matching import NARROW_SCALE_M, NEW_MOTION, POINT_SIGMA_M, match_scan
 from tests.lidar.worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 NO_PRIOR = np.zeros((3, 3))
@@ -123,7 +123,7 @@ def test_a_wall_seen_from_both_sides_keeps_its_thickness():
 
 def test_moving_field_and_guess_moves_the_result():
     rng = np.random.default_rng(4)
-    poses = ring_drive()[:60:6]
+    poses = ring_drive()[:60:12]
     scans = [scan_at(pose, ring(), noise_m=0.01, rng=rng) for pose in poses]
     truth = ring_drive()[30]
     scan, guess = scan_at(truth, ring(), noise_m=0.01, rng=rng), truth + np.array([0.08, -0.05, 0.03])
@@ -145,12 +145,31 @@ def test_points_on_new_surfaces_do_not_outweigh_those_on_older_ones():
     """Most points lie on walls that the last poses have turned by 0.2 deg against an older, small wall."""
     small, large = path((-6, -2), (-6, 2), (-4.5, 2)), path((-5, 5), (5, 5), (5, -5), (-5, -5))
     here, turned, off = np.zeros(3), np.array([0.0, 0.0, np.deg2rad(0.2)]), []
-    for later in (0, NEW_SCANS):  # scans after which the large walls are no longer new
-        views = [(small, here)] * 6 + [(large, turned)] * NEW_SCANS + [(small, here)] * later
-        field = field_of([(scan_at(here, walls), pose) for walls, pose in views])
+    away = np.array([0.001 * NEW_MOTION, 0.0, 0.0])
+    for later in ([], [away]):  # the robot moves on, and the large walls are no longer new
+        field = field_of(
+            [(scan_at(pose, small), pose) for pose in (here, away)]
+            + [(scan_at(here, large), turned)]
+            + [(scan_at(pose, small), pose) for pose in later]
+        )
         off.append(match_scan(scan_at(here, np.vstack((small, large))), field, here, NO_PRIOR).T_field_base[2])
     assert off[1] > 0.85 * turned[2]
     assert off[0] < 0.65 * turned[2]
+
+
+def test_a_wide_loss_in_clutter_averages_over_leaves():
+    """Leaves that each scan hits elsewhere: over many scans a wide loss ends nearer to the truth."""
+    rng, off = np.random.default_rng(2), {NARROW_SCALE_M: [], 0.15: []}
+    for _ in range(30):
+        hedge = rng.uniform(-6.0, 6.0, (150, 2))
+        field = field_of([(bare_scan(hedge), np.zeros(3))])
+        scan = bare_scan(hedge + rng.normal(0.0, 0.1, hedge.shape))
+        for scale_m, errors in off.items():
+            found = match_scan(scan, field, OFFSET, NO_PRIOR, clutter_scale_m=scale_m)
+            errors.append(error(found.T_field_base, np.zeros(3)))
+    (narrow_m, narrow_deg), (wide_m, wide_deg) = (np.mean(errors, axis=0) for errors in off.values())
+    assert wide_m < 0.8 * narrow_m
+    assert wide_deg < 0.8 * narrow_deg
 
 
 def test_nothing_known_leaves_the_guess(field):

@@ -5,6 +5,7 @@ tiles stores in each cell the nearest surfel, so the distance to the map is exac
 look-up. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
 """
 
+import math
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -30,7 +31,7 @@ EMPTY: Final = -1
 MERGED: Final = 4
 """Columns of a surfel that later ones serve to merge returns."""
 FIRST_SEEN: Final = 6
-"""Column of the number of the scan that showed a surfel first."""
+"""Column of the motion after which a surfel was first seen."""
 MOST_SURFELS: Final = 32767
 """Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
 TOO_MANY_WALLS: Final = f"has too many walls; at most {1e-3 * MERGE_M * MOST_SURFELS:.1f} km can be used"
@@ -51,16 +52,19 @@ class FieldArrays(NamedTuple):
     labels: NDArray[np.int16]
     """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
     surfels: FloatArray
-    """x, y, normal x, normal y, number of returns, whether all of them were solitary, and the number of the scan that
-    showed it first; shape (capacity, 7).
+    """x, y, normal x, normal y, number of returns, whether all of them were solitary, and the motion of the robot (see
+    ``used``) when it was first seen; shape (capacity, 7).
 
     A compact field has the first four only: it takes no more returns."""
     used: NDArray[np.int64]
-    """Tiles and surfels in use, and scans inserted, shape (3,)."""
+    """Tiles and surfels in use, and the motion of the robot between the scans inserted, in mm and mrad, shape (3,)."""
 
 
 class SurfelField:
     """Nearest-surfel field around an origin, in the coordinate frame of its submap."""
+
+    _T_field_last: FloatArray | None = None
+    """Pose of the last scan inserted, shape (3,)."""
 
     def __init__(self, origin_xy: FloatArray) -> None:
         self.arrays = FieldArrays(
@@ -81,7 +85,9 @@ class SurfelField:
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
         done = 0
-        self.arrays.used[2] += 1
+        x, y, turn = se2.between(T_field_base if self._T_field_last is None else self._T_field_last, T_field_base)
+        self._T_field_last = T_field_base
+        self.arrays.used[2] += round(1e3 * (math.hypot(x, y) + abs(turn)))
         while (done := _insert(scan.points, scan.normals, scan.solitary, T_field_base, done, self.arrays)) < len(scan):
             self._grow()
 

@@ -18,10 +18,10 @@ ALONG: Final = 0.25
 
 NO_NORMAL_WEIGHT: Final = 0.5
 """Weight of points without a normal: their surface is uncertain."""
-NEW_SCANS: Final = 4
-"""A surface is new if it was first seen in one of so many scans that were inserted last."""
+NEW_MOTION: Final = 1000
+"""A surface is new until the robot has moved by so much since it was first seen, in mm, turns in mrad."""
 LEAST_NEW_WEIGHT: Final = 0.1
-"""Least weight of a point on a new surface."""
+"""Least weight of a point on a new surface, as where nothing else is seen."""
 ALONG_LIMIT2: Final = 9.0
 """A point on a surface is within 3 times ``EXPLAINED_M`` of the surfel itself (squared): the surface ends somewhere."""
 DAMPING: Final = 1e-6
@@ -175,7 +175,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
             break
         scale = max(NARROW_SCALE_M, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    loss = _Loss(NARROW_SCALE_M, clutter, _new_weight(scan, pose, field))
+    loss = _Loss(NARROW_SCALE_M, NARROW_SCALE_M, 1.0)
     _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
     explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -240,12 +240,12 @@ def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_pri
 
 @njit(allocates=False)
 def _new_weight(scan, pose, field):  # type: ignore[no-untyped-def]
-    """Weight of points on new surfaces, with which they count together no more than those on older ones.
+    """Weight of points on new surfaces, so that they count together no more than those on older ones, within a limit.
 
     A new surface lies where the last few poses have put it, and its points confirm these poses. Where most points are
     on such surfaces, as behind a corner, small errors would add up from scan to scan.
     """
-    if field.surfels.shape[1] <= MERGED or field.used[2] <= NEW_SCANS:
+    if field.surfels.shape[1] <= MERGED or field.used[2] <= NEW_MOTION:
         return 1.0
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     old = new = 0
@@ -263,8 +263,8 @@ def _new_weight(scan, pose, field):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _is_new(surfel, field):  # type: ignore[no-untyped-def]
-    """Whether a surfel of a field that takes returns was first seen a few scans ago."""
-    return surfel[FIRST_SEEN] > field.used[2] - NEW_SCANS
+    """Whether a surfel of a field that takes returns was first seen a moment ago."""
+    return surfel[FIRST_SEEN] > field.used[2] - NEW_MOTION
 
 
 @njit(allocates=False)

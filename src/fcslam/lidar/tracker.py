@@ -39,8 +39,10 @@ UNSURE_M = 0.05
 """Learned standard deviation of odometry, in metres, beyond which a match has several starts. After a long step a match
 may end at a maximum of the likelihood that is nearer to odometry than the right one."""
 CLUTTER_SCALE_M = 0.15
-"""Least scale of the loss of points without a normal after such a step, metres: in clutter, as a hedge, the robot then
-sees other points than before."""
+"""Least scale of the loss of points without a normal after such a step, metres: of a hedge, the robot then sees other
+points than before."""
+UNSURE_SUPPORTED = 0.2
+"""``SUPPORTED`` after such a step: odometry alone errs by more than a match of which less is known."""
 _NO_INFORMATION = np.zeros((3, 3))
 _DIRECTIONS = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
 
@@ -168,7 +170,8 @@ class ScanTracker:
                 thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, velocity
             )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
-        if match.explained < SUPPORTED:
+        is_unsure = self._trust.scale(error).position_m > UNSURE_M
+        if match.explained < (UNSURE_SUPPORTED if is_unsure else SUPPORTED):
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
