@@ -68,7 +68,7 @@ def main() -> None:
         columns = {"": "s", **dict.fromkeys(MEASURES, "s")}
         report.table(f"{features.name}: as the index answers in the end", columns, _asked(growths))
         if number == 0:
-            draw(report, growths, places, groups)
+            draw(report, growths, places, groups, PICTURE if chosen.results == common.RESULTS else None)
         report.write()  # after each detector, because all of them take an hour
 
 
@@ -87,7 +87,7 @@ def grow(images: Path, features: FeatureChoice) -> tuple[dict[str, Growth], int,
     return growths, len(arrivals), len(groups)
 
 
-def draw(report: common.Report, growths: dict[str, Growth], places: int, groups: int) -> None:
+def draw(report: common.Report, growths: dict[str, Growth], places: int, groups: int, picture: Path | None) -> None:
     caption = (
         f"{places} places, 40 at a time: CamVid, ICL-NUIM and TUM snippets, IE Tower without floors 11 to 15, "
         f"RTAB-Map corridor, freiburg1_rpy (in place of the paper's TUM scenes);\n"
@@ -95,7 +95,8 @@ def draw(report: common.Report, growths: dict[str, Growth], places: int, groups:
     )
     figure = draw_growth(growths, caption, SEED)
     report.picture(caption.replace("\n", " "), figure)
-    save(figure, PICTURE)
+    if picture is not None:
+        save(figure, picture)
 
 
 def _ends(growths: dict[str, Growth]) -> Iterator[tuple[object, ...]]:

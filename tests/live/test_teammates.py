@@ -131,7 +131,7 @@ def test_a_robot_that_follows_another_through_a_corridor_knows_that_it_drives():
         config = {"map": {"robot_radius_m": radius_m}}
         with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
             robot.fleet = Fleet(corridor_map())
-            robot._joint = JointMap("a", robot.fleet, robot._config.map)
+            robot._joint = JointMap(robot.fleet, robot._config.map)
             robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
             truth, poses = convoy(robot, robot.fleet)
             ends[radius_m] = np.hypot(*(poses - truth)[-1, :2])
@@ -149,7 +149,7 @@ def test_a_robot_that_stands_is_no_ghost_in_what_this_robot_saw_last(joint):
         config = {"map": {"robot_radius_m": radius_m}}
         with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
             robot.fleet = Fleet(shifted)
-            robot._joint = JointMap("a", robot.fleet, robot._config.map)
+            robot._joint = JointMap(robot.fleet, robot._config.map)
             robot.fleet.hear(mate(*(standing - start)))
             robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
             for k, pose in enumerate(poses):
@@ -183,7 +183,7 @@ def test_beams_are_those_of_the_laser_that_hit_the_teammate(joint):
     other = LaserModel(180, -math.pi, math.radians(2.0), 8.0)
     fleet = Fleet(joint)
     fleet.hear(mate(0.8, 0.2))
-    shown = JointMap("a", fleet, OccupancyConfig())
+    shown = JointMap(fleet, OccupancyConfig())
     shown.mark_teammates(scan, 0, None)
     assert np.array_equal(shown.mark_teammates(scan, 0, place(HERE)).on_teammates, hit)
     keyscans = [
@@ -201,7 +201,7 @@ def test_the_first_scan_of_a_session_is_not_placed_by_the_odometry_of_the_one_be
     scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
     fleet = Fleet(joint)
     fleet.hear(mate(0.8, 0.2))
-    shown = JointMap("a", fleet, OccupancyConfig())
+    shown = JointMap(fleet, OccupancyConfig())
     shown.mark_teammates(replace(scan, T_odom_base=frozen([5.0, 5.0, 1.0])), 0, place(HERE))
     assert shown.mark_teammates(scan, 1, place(HERE)).on_teammates is None
     assert np.array_equal(shown.mark_teammates(scan, 1, place(HERE)).on_teammates, hit)

@@ -140,7 +140,7 @@ fcslam tools train photos --quick
 fcslam tools extract photos -o features --keypoints 1000
 fcslam tools vocabulary runs/building -o building.words
 """
-"""Of the help of each command: the lines that begin with it."""
+"""Examples for the help of each command: the lines that begin with it."""
 
 
 def _register() -> None:

@@ -102,7 +102,7 @@ def map_recordings(
         typer.Option(
             metavar="NAME=X,Y,THETA",
             help="Where a robot starts, in metres and radians, in one frame for all robots. It helps to join maps and "
-            "forces nothing; `-c fleet.start_sigma=[M,RAD]` says how exactly you know it. Can be repeated.",
+            "forces nothing; `-c 'fleet.start_sigma=[M,RAD]'` says how exactly you know it. Can be repeated.",
         ),
     ] = None,
     sensors: Sensors = None,

@@ -55,7 +55,7 @@ class Mates(NamedTuple):
     robots: frozenset[str]
     """The others."""
     places: FloatArray
-    """Of each of them: x and y in the map, metres, and the age of its pose, seconds; shape (N, 3)."""
+    """One row for each of them: x and y in the map, metres, and the age of its pose, seconds; shape (N, 3)."""
     moment_s: float
     """The moment, by the clock of the view."""
 

@@ -59,8 +59,8 @@ def _key(stamp: float, laser: LaserModel) -> _ScanKey:
 class JointMap:
     """What a robot makes of the joint map of its fleet. ``draw`` may be called from any thread, the others from one."""
 
-    def __init__(self, robot: str, fleet: FleetView, config: OccupancyConfig) -> None:
-        self._robot, self._fleet, self._config = robot, fleet, config
+    def __init__(self, fleet: FleetView, config: OccupancyConfig) -> None:
+        self._fleet, self._config = fleet, config
         self._drawn: deque[_DrawnKeyscan] = deque(maxlen=MOST_DRAWN)
         """Keyscans that the joint map of the cloud may not show yet."""
         self._lasers: tuple[LaserModel, ...] = ()

@@ -57,17 +57,17 @@ class OwnMap:
 
     def hand_over(self, before_s: float = np.inf) -> None:
         """Have the packets applied, later, if the oldest one is from before a time of its robot."""
-        if self._kept and self._kept[0].time < before_s:
-            with self._lock:
+        with self._lock:
+            if self._kept and self._kept[0].time < before_s:
                 packets, self._kept = self._kept, []
-                if packets:  # no other thread was here first
-                    self._await(self._submit(_apply, packets, self._first_epoch))
+                self._await(self._submit(_apply, packets, self._first_epoch))
 
     @property
     def backlog(self) -> int:
         """Number of batches of packets that are not applied yet."""
-        self._forget_applied()
-        return len(self._applying)
+        with self._lock:
+            self._forget_applied()
+            return len(self._applying)
 
     def draw(self, session: str, T_map_own: FloatArray) -> OccupancyMap:
         """The map that a session is in, moved into another frame.

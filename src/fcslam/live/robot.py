@@ -65,11 +65,11 @@ JUMP_M, JUMP_RAD = 0.01, 0.005
 POLL_INTERVAL_S = 0.1
 """Interval at which ``finish`` looks whether the server has everything."""
 LARGEST_BACKLOG = 200
-"""Largest number of inputs that wait for the back end, the map or the disk while a recording is played; a robot in real
-time never has as many."""
+"""Largest number of inputs that wait for the back end or the disk, or of blocks of packets that wait for the map, while
+a recording is played; a robot in real time never has as many."""
 
 BLOCK_S = 1.0
-"""Packets go to the robot's own map in blocks of so long."""
+"""Length of the blocks in which packets go to the robot's own map, seconds."""
 
 LARGEST_OUTBOX_BYTES = 256_000_000
 """Limit of the packets that wait for the server; above three quarters, places are left out."""
@@ -165,7 +165,7 @@ class Robot(LiveTracker):
                 if own_map:
                     followed = [FleetClient(url, *shown) for url in urls]
                     self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
-                    self._joint = JointMap(name, self.fleet, self._config.map)
+                    self._joint = JointMap(self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)
             keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)

@@ -53,7 +53,7 @@ def warm_up_tracking(config: RobotConfig) -> None:
 
 
 def made_up_scans(count: int, walls: FloatArray = _WALLS, sweep: Sweep | None = None) -> Iterator[LaserScan]:
-    """Scans of a robot that drives around in a room with ``walls``, shape (W, 4), at most 0.5 m at a time."""
+    """Scans of a robot that drives around in a room with ``walls``, shape (W, 4), about 0.5 m at a time."""
     turn = 2.0 * np.pi / ROUND
     for k in range(count):
         x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)

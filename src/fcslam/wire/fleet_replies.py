@@ -1,4 +1,7 @@
-"""Replies of a cloud about the joint map, as the service writes and robots read them: names in JSON have no units."""
+"""Replies of a cloud about the joint map, as the service writes and robots read them.
+
+Names of lengths in JSON have no units.
+"""
 
 from pydantic import ConfigDict, Field
 
