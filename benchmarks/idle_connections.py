@@ -1,11 +1,17 @@
-"""Strangers hold idle connections: how long a live robot's requests take.
+"""Strangers hold connections: how long a live robot's requests take.
 
-    python benchmarks/idle_connections.py [--idle 2000] [--robots 20] [--seconds 60]
+    python benchmarks/idle_connections.py [--connections 1000] [--robots 20] [--seconds 60]
 
 `fcslam serve` runs on this machine without TLS. Robots ask for their news once a second, as live robots with nothing
-to send do, each over a connection of its own: first alone, then while another process holds idle connections and opens
-a new one for each that the service closes. A request that finds its connection closed is sent again, as a robot does;
-its time counts from the first attempt.
+to send do, each over a connection of its own: first alone, then while another process holds connections and opens a
+new one for each that the service closes. A request that finds its connection closed is sent again, as a robot does; its
+time counts from the first attempt.
+
+Strangers
+- idle: send nothing
+- slow headers: send one byte of a header a second
+- pipelined: send 150 requests for `/openapi.json` at once, and read the answers
+- never read: the same, but read nothing
 """
 
 import asyncio
@@ -25,36 +31,38 @@ from fcslam.service.http.protocol import allow_many_connections
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, write_batch
 
 COLUMNS = {
-    "idle connections": ",d", "robots": "d", "requests": ",d", "failed": "d", "median, ms": ".1f", "99 %, ms": ".1f",
-    "most, ms": ".1f",
+    "strangers": "", "connections": ",d", "robots": "d", "requests": ",d", "failed": "d",
+    "median, ms": ".1f", "99 %, ms": ".1f", "most, ms": ".1f",
 }  # fmt: skip
 SETTLE_S = 5.0
+PIPELINE = 150 * b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--idle", type=int, default=2000, help="idle connections")
+    parser.add_argument("--connections", type=int, default=1000, help="of strangers")
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=60.0, help="of each measurement")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     rows = []
     with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (_, port):
-        for idle in (0, chosen.idle):
-            strangers = multiprocessing.Process(target=hold, args=(port, idle), daemon=True)
+        for kind in ("none", "idle", "slow headers", "pipelined", "never read"):
+            count = 0 if kind == "none" else chosen.connections
+            strangers = multiprocessing.Process(target=hold, args=(port, count, kind), daemon=True)
             strangers.start()
             time.sleep(SETTLE_S)
             took_s, failed = asyncio.run(asked(port, chosen.robots, chosen.seconds))
             strangers.kill()
             strangers.join()
             quantiles = 1e3 * np.quantile(took_s, (0.5, 0.99, 1.0))
-            rows.append((idle, chosen.robots, len(took_s), failed, *quantiles.tolist()))
+            rows.append((kind, count, chosen.robots, len(took_s), failed, *quantiles.tolist()))
     report.table("Requests of robots", COLUMNS, rows)
     report.write()
 
 
-def hold(port: int, count: int) -> None:
-    """Hold so many connections without a request, for ever."""
+def hold(port: int, count: int, kind: str) -> None:
+    """Hold so many connections of strangers, for ever."""
     allow_many_connections()
     assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > count
 
@@ -62,6 +70,16 @@ def hold(port: int, count: int) -> None:
         while True:
             try:
                 reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                if kind in ("pipelined", "never read"):
+                    writer.write(PIPELINE)
+                if kind == "slow headers":
+                    writer.write(b"GET /healthz HTTP/1.1\r\nA: ")
+                while kind == "slow headers" and not reader.at_eof():
+                    writer.write(b"a")
+                    await writer.drain()
+                    await asyncio.sleep(1.0)
+                while kind == "never read" and not writer.is_closing():
+                    await asyncio.sleep(1.0)
                 await reader.read()
                 writer.close()
             except OSError:
