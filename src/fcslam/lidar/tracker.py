@@ -170,8 +170,7 @@ class ScanTracker:
                 thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, velocity
             )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
-        is_unsure = self._trust.scale(error).position_m > UNSURE_M
-        if match.explained < (UNSURE_SUPPORTED if is_unsure else SUPPORTED):
+        if match.explained < (UNSURE_SUPPORTED if self._is_unsure(error) else SUPPORTED):
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
             rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
@@ -235,6 +234,10 @@ class ScanTracker:
         x, y, theta = se2.between(self._T_local_base, T_local_guess).tolist()
         return math.hypot(x, y) > JUMP_M or abs(theta) > JUMP_RAD
 
+    def _is_unsure(self, error: OdometryError) -> bool:
+        """Whether odometry may have erred so much that a match has several starts."""
+        return self._odometry.is_measured and self._trust.position * error.position_m > UNSURE_M
+
     def _velocity_information(self, sweep: Sweep | None) -> FloatArray:
         """Information of the velocity in a sweep, shape (3,), by odometry's error in the motion during the sweep."""
         if sweep is None:
@@ -256,7 +259,7 @@ class ScanTracker:
         """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
         field = self._fields[0][0]
         learned = self._trust.scale(error)
-        if learned.position_m > UNSURE_M:
+        if self._is_unsure(error):
             match = _likeliest(thinned, field, T_local_guess, learned, velocity)
         else:
             match = match_scan(thinned, field, T_local_guess, error.information, velocity)
