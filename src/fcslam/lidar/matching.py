@@ -135,6 +135,8 @@ class _Loss(NamedTuple):
     """Scale of the loss, metres."""
     clutter: float
     """The same for points without a normal."""
+    old_weight: float
+    """Weight of points on older surfaces."""
     new_weight: float
     """Weight of points on new surfaces."""
 
@@ -150,10 +152,10 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
     pose, velocity = guess.copy(), np.zeros(3)
     equations = _Equations(np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((4, 3)))
     H, g, reduced = equations.H, equations.g, equations.reduced
-    new_weight = _new_weight(scan, pose, field)
+    old_weight, new_weight = _weights(scan, pose, field)
     scale = wide
     for _ in range(MOST_ITERATIONS):
-        loss = _Loss(scale, max(scale, clutter), new_weight)
+        loss = _Loss(scale, max(scale, clutter), old_weight, new_weight)
         _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
         turned = (pose[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi
         difference = pose[0] - guess[0], pose[1] - guess[1], turned
@@ -175,7 +177,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
             break
         scale = max(NARROW_SCALE_M, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    loss = _Loss(NARROW_SCALE_M, NARROW_SCALE_M, 1.0)
+    loss = _Loss(NARROW_SCALE_M, NARROW_SCALE_M, 1.0, 1.0)
     _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
     explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -239,14 +241,15 @@ def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_pri
 
 
 @njit(allocates=False)
-def _new_weight(scan, pose, field):  # type: ignore[no-untyped-def]
-    """Weight of points on new surfaces, so that they count together no more than those on older ones, within a limit.
+def _weights(scan, pose, field):  # type: ignore[no-untyped-def]
+    """Weights of points on older and on new surfaces, so that the new count together no more than the older, in limits.
 
     A new surface lies where the last few poses have put it, and its points confirm these poses. Where most points are
-    on such surfaces, as behind a corner, small errors would add up from scan to scan.
+    on such surfaces, as behind a corner, small errors would add up from scan to scan. The mean weight is 1, as the
+    prior must not count more than otherwise.
     """
     if field.surfels.shape[1] <= MERGED or field.used[2] <= NEW_MOTION:
-        return 1.0
+        return 1.0, 1.0
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     old = new = 0
     for point in scan.points:
@@ -258,7 +261,11 @@ def _new_weight(scan, pose, field):  # type: ignore[no-untyped-def]
             new += 1
         else:
             old += 1
-    return max(LEAST_NEW_WEIGHT, old / new) if new > old else 1.0
+    if new <= old:
+        return 1.0, 1.0
+    weight = max(LEAST_NEW_WEIGHT, old / new)
+    share = (old + new) / (old + weight * new)
+    return share, share * weight
 
 
 @njit(allocates=False)
@@ -326,7 +333,7 @@ def _terms(scan, i, pose, cos, sin, t, velocity, field, loss):  # type: ignore[n
     if nx * mx + ny * my < OPPOSED:  # the two sides of a thin wall do not attract each other
         return none
     d2 = dx * dx + dy * dy
-    weight = loss.new_weight if loss.new_weight < 1.0 and _is_new(s, field) else 1.0
+    weight = loss.new_weight if loss.new_weight < 1.0 and _is_new(s, field) else loss.old_weight
     if nx == 0.0 and ny == 0.0:
         nx, ny = mx, my
     if nx == 0.0 and ny == 0.0:
