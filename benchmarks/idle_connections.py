@@ -2,10 +2,10 @@
 
     python benchmarks/idle_connections.py [--connections 1000] [--robots 20] [--seconds 60]
 
-`fcslam serve` runs on this machine without TLS. Robots ask for their news once a second, as live robots with nothing
-to send do, each over a connection of its own: first alone, then while another process holds connections and opens a
-new one for each that the service closes. A request that finds its connection closed is sent again, as a robot does; its
-time counts from the first attempt.
+`fcslam serve` runs on this machine with tokens and without TLS. Robots ask for their news once a second, as live robots
+with nothing to send do, each with its token and over a connection of its own: first alone, then while another process
+without a token holds connections and opens a new one for each that the service closes. A request that finds its
+connection closed is sent again, as a robot does; its time counts from the first attempt.
 
 Strangers
 - idle: send nothing
@@ -19,14 +19,18 @@ import multiprocessing
 import resource
 import tempfile
 import time
+from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 
 import common
 import httpx
 import numpy as np
-from faults import cloud
+from processes import cloud
 
 from fcslam.robot.sender import SEND_INTERVAL_S
+from fcslam.service.credentials import TOKEN, folder_of, make_credentials
+from fcslam.service.http.authentication import Role
 from fcslam.service.http.protocol import allow_many_connections
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, write_batch
 
@@ -46,19 +50,31 @@ def main() -> None:
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     rows = []
-    with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (_, port):
+    with ExitStack() as stack:
+        place = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        tokens = make_tokens(place, chosen.robots)
+        _, port = stack.enter_context(cloud(place, "--credentials", place / "service"))
         for kind in ("none", "idle", "slow headers", "pipelined", "never read"):
             count = 0 if kind == "none" else chosen.connections
             strangers = multiprocessing.Process(target=hold, args=(port, count, kind), daemon=True)
             strangers.start()
             time.sleep(SETTLE_S)
-            took_s, failed = asyncio.run(asked(port, chosen.robots, chosen.seconds))
+            took_s, failed = asyncio.run(asked(port, tokens, chosen.seconds))
             strangers.kill()
             strangers.join()
             quantiles = 1e3 * np.quantile(took_s, (0.5, 0.99, 1.0))
             rows.append((kind, count, chosen.robots, len(took_s), failed, *quantiles.tolist()))
     report.table("Requests of robots", COLUMNS, rows)
     report.write()
+
+
+def make_tokens(place: Path, robots: int) -> dict[str, str]:
+    """The token of each robot; a folder `service` has what the service needs, without certificates."""
+    names = [f"robot{number}" for number in range(robots)]
+    make_credentials(place / "all", [], dict.fromkeys(names, Role.ROBOT), datetime.now(UTC))
+    (place / "service").mkdir()
+    (place / "all" / "tokens.yaml").rename(place / "service" / "tokens.yaml")
+    return {name: (folder_of(place / "all", name, Role.ROBOT) / TOKEN).read_text().strip() for name in names}
 
 
 def hold(port: int, count: int, kind: str) -> None:
@@ -91,17 +107,18 @@ def hold(port: int, count: int, kind: str) -> None:
     asyncio.run(all_of_them())
 
 
-async def asked(port: int, robots: int, seconds: float) -> tuple[list[float], int]:
+async def asked(port: int, tokens: dict[str, str], seconds: float) -> tuple[list[float], int]:
     """Seconds of each request, and how many failed twice."""
     took_s: list[float] = []
     failures: list[str] = []
     end = time.perf_counter() + seconds
 
-    async def robot(number: int) -> None:
+    async def robot(number: int, name: str, token: str) -> None:
         headers = {"Content-Type": MEDIA_TYPE, AGENT_HEADER: f"{number:032x}", CORRECTION_HEADER: "-1"}
-        url = f"http://127.0.0.1:{port}/api/v1/robots/robot{number}/packets"
+        headers["Authorization"] = f"Bearer {token}"
+        url = f"http://127.0.0.1:{port}/api/v1/robots/{name}/packets"
         async with httpx.AsyncClient(headers=headers, timeout=60.0, trust_env=False) as client:
-            await asyncio.sleep(number / robots * SEND_INTERVAL_S)
+            await asyncio.sleep(number / len(tokens) * SEND_INTERVAL_S)
             while time.perf_counter() < end:
                 began = time.perf_counter()
                 try:
@@ -115,7 +132,7 @@ async def asked(port: int, robots: int, seconds: float) -> tuple[list[float], in
                 took_s.append(time.perf_counter() - began)
                 await asyncio.sleep(max(0.0, began + SEND_INTERVAL_S - time.perf_counter()))
 
-    await asyncio.gather(*(robot(number) for number in range(robots)))
+    await asyncio.gather(*(robot(number, *each) for number, each in enumerate(tokens.items())))
     return took_s, len(failures)
 
 

@@ -76,12 +76,13 @@ class Process:
 
 
 @contextmanager
-def cloud(place: Path) -> Iterator[tuple[Process, int]]:
-    """A server on a port of its own."""
+def cloud(place: Path, *options: object) -> Iterator[tuple[Process, int]]:
+    """A server on a port of its own, with these options of `fcslam serve`."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    server = Process(("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port), place / "server.log")
+    arguments = ("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port, *options)
+    server = Process(arguments, place / "server.log")
     wait_for(port, server)
     try:
         yield server, port
