@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
-from fcslam.lidar.matching import NARROW_SCALE_M, POINT_SIGMA_M, match_scan
+from fcslam.lidar.matching import NARROW_SCALE_M, NEW_MOTION, POINT_SIGMA_M, match_scan
 from tests.lidar.worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 NO_PRIOR = np.zeros((3, 3))
@@ -139,6 +139,22 @@ def test_moving_field_and_guess_moves_the_result():
         rotation[:2, :2] = se2.transform((0, 0, move[2]), np.eye(2)).T
         expected = rotation @ here.information @ rotation.T
         np.testing.assert_allclose(there.information, expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_points_on_new_surfaces_do_not_outweigh_those_on_older_ones():
+    """Most points lie on walls that the last poses have turned by 0.2 deg against an older, small wall."""
+    small, large = path((-6, -2), (-6, 2), (-4.5, 2)), path((-5, 5), (5, 5), (5, -5), (-5, -5))
+    here, turned, off = np.zeros(3), np.array([0.0, 0.0, np.deg2rad(0.2)]), []
+    away = np.array([0.001 * NEW_MOTION, 0.0, 0.0])
+    for later in ([], [away]):  # the robot moves on, and the large walls are no longer new
+        field = field_of(
+            [(scan_at(pose, small), pose) for pose in (here, away)]
+            + [(scan_at(here, large), turned)]
+            + [(scan_at(pose, small), pose) for pose in later]
+        )
+        off.append(match_scan(scan_at(here, np.vstack((small, large))), field, here, NO_PRIOR).T_field_base[2])
+    assert off[1] > 0.85 * turned[2]
+    assert off[0] < 0.9 * off[1]
 
 
 def test_a_wide_loss_in_clutter_averages_over_leaves():

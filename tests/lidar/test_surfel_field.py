@@ -110,12 +110,12 @@ def test_growth_of_storage_changes_nothing():
     poses = ring_drive()[::25]
     scans = [(scan_at(pose, ring(), noise_m=0.01, rng=np.random.default_rng(k)), pose) for k, pose in enumerate(poses)]
     grown, large = SurfelField(poses[0]), SurfelField(poses[0])
-    roomy = {"labels": np.full((4000, TILE, TILE), EMPTY, np.int16), "surfels": np.zeros((50_000, 6))}
+    roomy = {"labels": np.full((4000, TILE, TILE), EMPTY, np.int16), "surfels": np.zeros((50_000, 7))}
     large.arrays = large.arrays._replace(**roomy)
     for scan, pose in scans:
         grown.insert(scan, pose)
         large.insert(scan, pose)
-    tiles, surfels = grown.arrays.used
+    tiles, surfels, _ = grown.arrays.used
     assert surfels > 1024
     assert tiles > 64
     np.testing.assert_array_equal(grown.arrays.used, large.arrays.used)

@@ -5,6 +5,7 @@ tiles stores in each cell the nearest surfel, so the distance to the map is exac
 look-up. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
 """
 
+import math
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -29,6 +30,8 @@ TABLE: Final = 512
 EMPTY: Final = -1
 MERGED: Final = 4
 """Columns of a surfel that later ones serve to merge returns."""
+FIRST_SEEN: Final = 6
+"""Column of the motion after which a surfel was first seen."""
 MOST_SURFELS: Final = 32767
 """Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
 TOO_MANY_WALLS: Final = f"has too many walls; at most {1e-3 * MERGE_M * MOST_SURFELS:.1f} km can be used"
@@ -49,23 +52,27 @@ class FieldArrays(NamedTuple):
     labels: NDArray[np.int16]
     """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
     surfels: FloatArray
-    """x, y, normal x, normal y, number of returns, whether all of them were solitary; shape (capacity, 6).
+    """x, y, normal x, normal y, number of returns, whether all of them were solitary, and the motion of the robot (see
+    ``used``) when it was first seen; shape (capacity, 7).
 
     A compact field has the first four only: it takes no more returns."""
     used: NDArray[np.int64]
-    """Tiles and surfels in use, shape (2,)."""
+    """Tiles and surfels in use, and the motion of the robot between the scans inserted, in mm and mrad, shape (3,)."""
 
 
 class SurfelField:
     """Nearest-surfel field around an origin, in the coordinate frame of its submap."""
+
+    _T_field_last: FloatArray | None = None
+    """Pose of the last scan inserted, shape (3,)."""
 
     def __init__(self, origin_xy: FloatArray) -> None:
         self.arrays = FieldArrays(
             corner=np.asarray(origin_xy[:2], dtype=np.float64) - 0.5 * TABLE * TILE * CELL_M,
             table=np.full((TABLE, TABLE), EMPTY, np.int32),
             labels=np.full((64, TILE, TILE), EMPTY, np.int16),
-            surfels=np.zeros((1024, 6)),
-            used=np.zeros(2, np.int64),
+            surfels=np.zeros((1024, 7)),
+            used=np.zeros(3, np.int64),
         )
 
     @classmethod
@@ -78,6 +85,9 @@ class SurfelField:
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
         done = 0
+        x, y, turn = se2.between(T_field_base if self._T_field_last is None else self._T_field_last, T_field_base)
+        self._T_field_last = T_field_base
+        self.arrays.used[2] += round(1e3 * (math.hypot(x, y) + abs(turn)))
         while (done := _insert(scan.points, scan.normals, scan.solitary, T_field_base, done, self.arrays)) < len(scan):
             self._grow()
 
@@ -175,7 +185,7 @@ def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-unty
             return i
         surfel = field.surfels[field.used[1]]
         surfel[0], surfel[1], surfel[2], surfel[3] = x, y, nx, ny
-        surfel[4], surfel[5] = 1.0, 1.0 if solitary[i] else 0.0
+        surfel[4], surfel[5], surfel[FIRST_SEEN] = 1.0, 1.0 if solitary[i] else 0.0, field.used[2]
         _spread(x, y, field.used[1], field)
         field.used[1] += 1
     return len(points)

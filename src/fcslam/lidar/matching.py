@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.lidar.field import EMPTY, SurfelField, label_at
+from fcslam.lidar.field import EMPTY, FIRST_SEEN, MERGED, SurfelField, label_at
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
@@ -18,6 +18,12 @@ ALONG: Final = 0.25
 
 NO_NORMAL_WEIGHT: Final = 0.5
 """Weight of points without a normal: their surface is uncertain."""
+NEW_MOTION: Final = 1000
+"""A surface is new until the robot has moved by so much since it was first seen, in mm, turns in mrad."""
+MOST_NEW: Final = 2.0
+"""Points on new surfaces count together as much as so many times the points on older ones, at most."""
+LEAST_NEW_WEIGHT: Final = 0.3
+"""Least weight of a point on a new surface, as where hardly anything else is seen and odometry may slip."""
 ALONG_LIMIT2: Final = 9.0
 """A point on a surface is within 3 times ``EXPLAINED_M`` of the surfel itself (squared): the surface ends somewhere."""
 DAMPING: Final = 1e-6
@@ -124,6 +130,17 @@ class _Points(NamedTuple):
     times: FloatArray
 
 
+class _Loss(NamedTuple):
+    """The robust loss of the points at one step."""
+
+    scale: float
+    """Scale of the loss, metres."""
+    clutter: float
+    """The same for points without a normal."""
+    new_weight: float
+    """Weight of points on new surfaces."""
+
+
 @njit
 def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: ignore[no-untyped-def]
     """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``NARROW_SCALE_M``, in clutter to ``clutter``.
@@ -135,9 +152,11 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
     pose, velocity = guess.copy(), np.zeros(3)
     equations = _Equations(np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((4, 3)))
     H, g, reduced = equations.H, equations.g, equations.reduced
+    new_weight = _weight_of_new(scan, pose, field)
     scale = wide
     for _ in range(MOST_ITERATIONS):
-        _normal_equations(equations, scan, pose, velocity, field, (scale, max(scale, clutter)), velocity_prior)
+        loss = _Loss(scale, max(scale, clutter), new_weight)
+        _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
         turned = (pose[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi
         difference = pose[0] - guess[0], pose[1] - guess[1], turned
         for r in range(3):
@@ -158,7 +177,8 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
             break
         scale = max(NARROW_SCALE_M, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    _normal_equations(equations, scan, pose, velocity, field, (NARROW_SCALE_M, NARROW_SCALE_M), velocity_prior)
+    loss = _Loss(NARROW_SCALE_M, NARROW_SCALE_M, 1.0)
+    _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
     explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
@@ -196,10 +216,10 @@ class _Equations(NamedTuple):
 
 
 @njit(allocates=False)
-def _normal_equations(equations, scan, pose, velocity, field, scales, velocity_prior):  # type: ignore[no-untyped-def]
+def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior):  # type: ignore[no-untyped-def]
     """Write the normal equations at ``pose`` and ``velocity`` into ``equations``."""
     H, g, mixed, own, reduced = equations
-    own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, scales)
+    own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, loss)
     s2 = 1.0 / (POINT_SIGMA_M * POINT_SIGMA_M)
     _scale_symmetric(H, s2, own_pose)
     for r in range(3):
@@ -221,6 +241,35 @@ def _normal_equations(equations, scan, pose, velocity, field, scales, velocity_p
 
 
 @njit(allocates=False)
+def _weight_of_new(scan, pose, field):  # type: ignore[no-untyped-def]
+    """Weight of a point on a new surface: below 1 where most points are on such surfaces.
+
+    A new surface lies where the last few poses have put it, and its points confirm these poses. Where most points are
+    on such surfaces, as behind a corner or beside a hedge, small errors add up from scan to scan.
+    """
+    if field.surfels.shape[1] <= MERGED or field.used[2] <= NEW_MOTION:
+        return 1.0
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    old = new = 0
+    for point in scan.points:
+        x, y = pose[0] + cos * point[0] - sin * point[1], pose[1] + sin * point[0] + cos * point[1]
+        label = label_at(x, y, field)
+        if label == EMPTY:
+            continue
+        if _is_new(field.surfels[label], field):
+            new += 1
+        else:
+            old += 1
+    return 1.0 if new <= MOST_NEW * old else max(LEAST_NEW_WEIGHT, MOST_NEW * old / new)
+
+
+@njit(allocates=False)
+def _is_new(surfel, field):  # type: ignore[no-untyped-def]
+    """Whether a surfel of a field that takes returns was first seen a moment ago."""
+    return surfel[FIRST_SEEN] > field.used[2] - NEW_MOTION
+
+
+@njit(allocates=False)
 def _scale_symmetric(matrix, factor, upper):  # type: ignore[no-untyped-def]
     """Write ``factor`` times a symmetric matrix, given by its upper triangle, into ``matrix``."""
     xx, xy, xt, yy, yt, tt = upper
@@ -231,17 +280,16 @@ def _scale_symmetric(matrix, factor, upper):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _sums(scan, pose, velocity, field, scales):  # type: ignore[no-untyped-def]
+def _sums(scan, pose, velocity, field, loss):  # type: ignore[no-untyped-def]
     """Sums over the points of w J^T J, t w J^T J, t^2 w J^T J (upper triangles), w J^T e and t w J^T e."""
     hxx = hxy = hxt = hyy = hyt = htt = gx = gy = gt = 0.0  # scalars, which stay in registers
     kxx = kxy = kxt = kyy = kyt = ktt = fx = fy = ft = 0.0
     lxx = lxy = lxt = lyy = lyt = ltt = 0.0
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     swept = len(scan.times) > 0
-    c2, clutter2 = scales[0] * scales[0], scales[1] * scales[1]
     for i in range(len(scan.points)):
         t = scan.times[i] if swept else 0.0
-        axx, axy, axt, ayy, ayt, att, bx, by, bt = _terms(scan, i, pose, cos, sin, t, velocity, field, c2, clutter2)
+        axx, axy, axt, ayy, ayt, att, bx, by, bt = _terms(scan, i, pose, cos, sin, t, velocity, field, loss)
         hxx, hxy, hxt, hyy, hyt, htt = hxx + axx, hxy + axy, hxt + axt, hyy + ayy, hyt + ayt, htt + att
         gx, gy, gt = gx + bx, gy + by, gt + bt
         if swept:
@@ -259,12 +307,12 @@ def _sums(scan, pose, velocity, field, scales):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _terms(scan, i, pose, cos, sin, t, velocity, field, c2, clutter2):  # type: ignore[no-untyped-def]
+def _terms(scan, i, pose, cos, sin, t, velocity, field, loss):  # type: ignore[no-untyped-def]
     """w J^T J (upper triangle) and w J^T e of point i, measured at t.
 
     e is the distance from the point to the line of its surfel. Its Jacobian over the pose is J = (n_x, n_y, n x r),
     with the normal n and the point r relative to the robot. A solitary return has two residuals, the distances along x
-    and along y. The weight w is that of Geman and McClure, with the squared scale ``clutter2`` without a normal.
+    and along y. The weight w is that of Geman and McClure, less on new surfaces.
     """
     none = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     rx, ry = _swept_point(scan.points, i, cos, sin, t, velocity)
@@ -280,10 +328,12 @@ def _terms(scan, i, pose, cos, sin, t, velocity, field, c2, clutter2):  # type: 
     if nx * mx + ny * my < OPPOSED:  # the two sides of a thin wall do not attract each other
         return none
     d2 = dx * dx + dy * dy
+    weight = loss.new_weight if loss.new_weight < 1.0 and _is_new(s, field) else 1.0
     if nx == 0.0 and ny == 0.0:
         nx, ny = mx, my
     if nx == 0.0 and ny == 0.0:
-        w = NO_NORMAL_WEIGHT * (clutter2 / (clutter2 + d2)) ** 2
+        c2 = loss.clutter * loss.clutter
+        w = weight * NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
         if scan.solitary[i]:
             return w, 0.0, -w * ry, w, w * rx, w * (rx * rx + ry * ry), w * dx, w * dy, w * (rx * dy - ry * dx)
         # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot to its
@@ -295,7 +345,8 @@ def _terms(scan, i, pose, cos, sin, t, velocity, field, c2, clutter2):  # type: 
         e = nx * dx + ny * dy
     else:
         e = nx * dx + ny * dy
-        w = (c2 / (c2 + e * e + ALONG * max(0.0, d2 - e * e))) ** 2
+        c2 = loss.scale * loss.scale
+        w = weight * (c2 / (c2 + e * e + ALONG * max(0.0, d2 - e * e))) ** 2
     lever = ny * rx - nx * ry
     return (
         w * nx * nx,
