@@ -9,6 +9,7 @@ metre or so; stamps are missing in some, so each scan is given the next second. 
 reference if it is more than 1 m off.
 """
 
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -35,11 +36,14 @@ COLUMNS = {"log": "", "seed": "", "scans": ",", "path, m": ".0f", "odometry: mea
            "fcslam: mean, m": ".3f", "fcslam: max, m": ".3f", "closures": "", "revoked": "",
            "contradict the reference": "", "CPU, s": ".1f"}  # fmt: skip
 
+SUMMARY = {"log": "", "seeds": "", "odometry: mean, m": ".2f", "fcslam: mean, m": ".3f", "worst seed: mean, m": ".3f",
+           "worst seed: max, m": ".3f", "closures that contradict the reference": ""}  # fmt: skip
+
 
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--logs", nargs="+", default=LOGS, choices=LOGS, metavar="LOG", help="only these")
-    parser.add_argument("--seeds", nargs="+", type=int, default=(0, 1), help="of the odometry's noise")
+    parser.add_argument("--seeds", nargs="+", type=int, default=range(10), help="of the odometry's noise")
     chosen = parser.parse_args()
     files = {name: f"rbpf-corrected/{name}-corrected.log.gz" for name in chosen.logs}
     folder = common.recordings(*files.values())
@@ -49,8 +53,18 @@ def main() -> None:
         f"Odometry noise of a step of d m that turns by a rad: N(0, {TRAVEL_NOISE} d + {STANDING_NOISE_M}) m in each "
         f"direction, N(0, {HEADING_NOISE_RAD} sqrt(d) + {TURN_NOISE} a) rad."
     )
+    report.table("Logs", SUMMARY, summary(rows))
     report.table("Corrected logs with noisy odometry", COLUMNS, rows)
     report.write()
+
+
+def summary(rows: list[tuple]) -> list[tuple]:
+    """A row for each log: means over the seeds, and the worst one."""
+    logs = []
+    for name, of_log in itertools.groupby(rows, key=lambda row: row[0]):
+        *_, odometry, _, mean, most, _, _, contradict, _ = map(np.array, zip(*of_log, strict=True))
+        logs.append((name, len(mean), odometry.mean(), mean.mean(), mean.max(), most.max(), int(contradict.sum())))
+    return logs
 
 
 @dataclass(frozen=True)
