@@ -1,4 +1,7 @@
-"""Decisions about closures: which are accepted, which maps they join, and what is revoked when evidence turns."""
+"""Decisions about closures as they arrive: which are accepted, and which maps they join.
+
+``reevaluation`` decides all of them again for the final result.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple
