@@ -83,27 +83,6 @@ class PoseReference:
         return np.flatnonzero((away_s <= self.bridge_s) & (robots[self.rows] == robots[row]))
 
 
-class RelationReference:
-    """Single reference relations, in both directions, neither chained nor optimised."""
-
-    def __init__(self, run: PoseTable, bridge_s: float, ends: Rows, T_1_2: FloatArray) -> None:
-        """``ends``, shape (R, 2), are the rows that the relative poses ``T_1_2``, shape (R, 3), connect."""
-        self._run, self._bridge_s = run, bridge_s
-        self._ends = np.concatenate((ends, ends[:, ::-1]))
-        self._T_a_b = np.concatenate((T_1_2, se2.inverse(T_1_2)))
-
-    def motion(self, i: int, j: int) -> ReferenceMotion | None:
-        """As in Reference."""
-        stamps, robots = self._run.stamps, self._run.robots
-        away_s = np.abs(stamps[self._ends] - stamps[[i, j]])
-        near = np.flatnonzero(np.all((away_s <= self._bridge_s) & (robots[self._ends] == robots[[i, j]]), axis=1))
-        if not len(near):
-            return None
-        best = near[np.argmin(away_s[near].sum(axis=1))]
-        a, b = self._ends[best]
-        return ReferenceMotion(int(a), int(b), self._T_a_b[best])
-
-
 @dataclass(frozen=True, slots=True)
 class ClosureErrors:
     """Errors of closures, one row each; NaN without a reference."""
