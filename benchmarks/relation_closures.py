@@ -1,11 +1,14 @@
 """Precision and recall of a run's closures by stage, against the optimised graph of reference relations.
 
-The optimum of all relations gives relative poses of stamps that no single relation connects.
+The optimum of all relations gives relative poses of stamps that no single relation connects. The ends of a closure are
+other poses, shortly before or after. The run's own trajectory bridges this gap; over such a short time it is as
+accurate as odometry.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,23 +23,21 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureScope, closure_rows, closure_sets
 from fcslam.lab.evaluation.fleet.relations import pose_table
 from fcslam.metrics.closures import (
-    BRIDGE_S,
     WITHIN_GAP_S,
     ClosureErrors,
     Mask,
-    PoseReference,
     Precision,
     Recall,
-    ReferenceMotion,
     Rows,
-    closure_errors,
     precision,
     revisits_found,
 )
-from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, PoseTable, Relations, read_relations
+from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, PoseTable, Relations, motion_errors, read_relations
 from fcslam.records import ClosureStatus, FloatArray, frozen
 from fcslam.runs import Run, open_run
 
+BRIDGE_S: Final = 1.0
+"""Largest time between an end of a closure and a reference pose that covers it."""
 SIGMA_M, SIGMA_DEG = 0.05, 1.0
 """Assumed standard deviation of a manual relation, the same for all. It decides which relations contradict each other;
 for consistent relations, it cancels out."""
@@ -107,6 +108,56 @@ def build_relation_graph(relations: Relations) -> RelationGraph:
     )
 
 
+class ReferenceMotion(NamedTuple):
+    """A relative pose of a reference, near two poses of a run."""
+
+    a: int
+    """Row of the reference pose near the first pose."""
+    b: int
+    """Row of the reference pose near the second pose."""
+    T_a_b: FloatArray
+    """Shape (3,)."""
+
+
+class Reference(Protocol):
+    """A source of true relative poses between some of a run's poses."""
+
+    def motion(self, i: int, j: int) -> ReferenceMotion | None:
+        """The relative pose whose ends are nearest in time to rows i and j; None if none is near enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseReference:
+    """Reference poses in components; relative poses are only known within a component."""
+
+    run: PoseTable
+    bridge_s: float
+    rows: Rows
+    """Rows of the reference poses in the run, shape (M,)."""
+    T_component_base: FloatArray
+    """Reference poses in the frame of their component, shape (M, 3)."""
+    components: NDArray[np.int64]
+    """Component of each pose, shape (M,)."""
+
+    def motion(self, i: int, j: int) -> ReferenceMotion | None:
+        """As in Reference."""
+        a, b = self._near(i), self._near(j)
+        stamps = self.run.stamps
+        away_s = np.abs(stamps[self.rows[a]] - stamps[i])[:, None] + np.abs(stamps[self.rows[b]] - stamps[j])
+        away_s[self.components[a][:, None] != self.components[b]] = np.inf
+        if not np.isfinite(away_s).any():
+            return None
+        best_a, best_b = np.unravel_index(np.argmin(away_s), away_s.shape)
+        first, second = a[best_a], b[best_b]
+        T_a_b = se2.between(self.T_component_base[first], self.T_component_base[second])
+        return ReferenceMotion(int(self.rows[first]), int(self.rows[second]), T_a_b)
+
+    def _near(self, row: int) -> NDArray[np.int64]:
+        """Reference poses of the same robot at most ``bridge_s`` away."""
+        away_s, robots = np.abs(self.run.stamps[self.rows] - self.run.stamps[row]), self.run.robots
+        return np.flatnonzero((away_s <= self.bridge_s) & (robots[self.rows] == robots[row]))
+
+
 class RelationReference:
     """Single reference relations, in both directions, neither chained nor optimised."""
 
@@ -126,6 +177,28 @@ class RelationReference:
         best = near[np.argmin(away_s[near].sum(axis=1))]
         a, b = self._ends[best]
         return ReferenceMotion(int(a), int(b), self._T_a_b[best])
+
+
+@dataclass(frozen=True, slots=True)
+class BridgedErrors(ClosureErrors):
+    """Errors against reference poses near the ends."""
+
+    ends: Rows
+    """Rows of the reference poses that a closure was compared with, shape (K, 2); -1 without a reference."""
+
+
+def closure_errors(pairs: Rows, T_i_j: FloatArray, run: PoseTable, reference: Reference) -> BridgedErrors:
+    """Errors of closures ``T_i_j`` (K, 3), metres and radians, between rows ``pairs`` (K, 2) of ``run``."""
+    ends = np.full((len(pairs), 2), -1, dtype=np.int64)
+    true = np.full((len(pairs), 3), np.nan)
+    for k, (i, j) in enumerate(pairs.tolist()):
+        motion = reference.motion(i, j) if min(i, j) >= 0 else None
+        if motion is not None:
+            ends[k] = motion.a, motion.b
+            T_i_a = se2.between(run.T_map_base[i], run.T_map_base[motion.a])
+            T_b_j = se2.between(run.T_map_base[motion.b], run.T_map_base[j])
+            true[k] = se2.compose(se2.compose(T_i_a, motion.T_a_b), T_b_j)
+    return BridgedErrors(*motion_errors(true, T_i_j), frozen(ends, np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +252,7 @@ class _Evidence:
     poses: PoseTable
     pairs: Rows
     """Rows of the ends of the closures, shape (K, 2)."""
-    by_graph: ClosureErrors
+    by_graph: BridgedErrors
     by_one: ClosureErrors
     chains: FloatArray
     """Number of relations between the ends of each closure, shape (K,); NaN if they are not connected."""
@@ -236,7 +309,7 @@ def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable) -> Mask:
     return longer
 
 
-def _chains(graph: RelationGraph, node_rows: Rows, errors: ClosureErrors) -> FloatArray:
+def _chains(graph: RelationGraph, node_rows: Rows, errors: BridgedErrors) -> FloatArray:
     """Number of relations between the ends of each closure, shape (K,); NaN if the graph does not cover it."""
     number_of = {row: number for number, row in enumerate(node_rows.tolist()) if row >= 0}
     covered = errors.covered
