@@ -9,7 +9,7 @@ odometry's. "A place with 300 descriptors" is every place that has as many, cut 
 Thinner places: the real command with `robot.lidar.keyscans.submap_every_m` at 2 (the default), 4, 8 and 16 m and
 nothing else changed; a robot's own closures become rarer with its submaps. Errors are over the relations between
 different robots, of which those between robots in different maps cannot be used. Closures as
-`fcslam evaluate closures` judges them.
+`benchmarks/closures.py` says how they are judged.
 """
 
 import heapq
@@ -21,9 +21,10 @@ from typing import Any
 
 import common
 import numpy as np
+from relation_closures import evaluate_closures
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.lab.evaluation.fleet.closures import ClosureScope, evaluate_closures
+from fcslam.lab.evaluation.fleet.closures import ClosureScope
 from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place

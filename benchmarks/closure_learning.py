@@ -43,6 +43,8 @@ from pathlib import Path
 import common
 import numpy as np
 import torch
+from federated_study.mapped_drives import MappedDrive, map_drives
+from federated_study.poison import PoisonedClient
 from matplotlib.figure import Figure
 
 from fcslam.features.codes import mutual_matches
@@ -54,8 +56,6 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import evaluate_homography
 from fcslam.lab.evaluation.detectors.measures import mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.lab.evaluation.federated.mapped_drives import MappedDrive, map_drives
-from fcslam.lab.evaluation.federated.poison import PoisonedClient
 from fcslam.lab.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
 from fcslam.lab.evaluation.places.simulated_views import EVERY_M, EVERY_RAD, lidar_overlap
 from fcslam.lab.simulation.options import Lighting

@@ -44,9 +44,8 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
+    from federated_study.study import StudyResults
     from training_fleet import Rows
-
-    from fcslam.lab.evaluation.federated.study import StudyResults
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
@@ -163,7 +162,7 @@ def places() -> list[tuple[str, str]]:
 
 def home_rows(findings: "StudyResults") -> Iterator[tuple[object, ...]]:
     """What a robot's own network makes of its own images, and of others', beside the networks that all have."""
-    from fcslam.lab.evaluation.federated.pairs import MEASURES
+    from federated_study.pairs import MEASURES
 
     owners = np.array(findings.owners)
     everybody = {arm: np.nanmean(findings.measured[arm], axis=(0, 1)) for arm in ("central", "together")}

@@ -11,16 +11,14 @@ over groups. rebuild trains at every place, as Algorithm 1 does; windowed after 
 trained on photographs. The picture is that of the first features.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import common
 import numpy as np
-
-from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.lab.evaluation.places.figures import save
-from fcslam.lab.evaluation.places.growth_figure import draw_growth
-from fcslam.lab.evaluation.places.vocabulary_growth import (
+from vocabulary_growth import (
+    BATCH,
     MEASURES,
     Arrival,
     Growth,
@@ -30,8 +28,12 @@ from fcslam.lab.evaluation.places.vocabulary_growth import (
     group_measures,
     grow_vocabulary,
 )
+
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
+from fcslam.lab.evaluation.places.figures import COLOURS, panel_figure, save
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
+from fcslam.records import FloatArray
 
 FIRST = (
     "camvid", "icl_nuim_snippet", "tum_rgbd/freiburg3_cabinet_58/rgb", "tum_rgbd/freiburg2_desk_snippet",
@@ -42,6 +44,16 @@ TRAINING = ("bsds500", "coco_subset", "urban100", "sun_hays80", "kodak24")
 UNSEEN_FLOORS = {f"floor{number}" for number in range(11, 16)}
 GROUPS, SEED = 120, 1
 PICTURE = common.REPOSITORY / "docs" / "images" / "figure4.png"
+TITLES = {
+    "significance": "(a) significance of the true match",
+    "mismatch rate": "(b) mismatch rate",
+    "wrong places, mean": "(c) similarity of wrong places, mean",
+    "wrong places, variance": "(c) similarity of wrong places, variance",
+    "words": "(d) words",
+    "relative significance": "relative significance",
+    "seconds": f"seconds to take in {BATCH} places",
+}
+LOGARITHMIC = ("words", "seconds")
 
 
 def main() -> None:
@@ -97,6 +109,29 @@ def draw(report: common.Report, growths: dict[str, Growth], places: int, groups:
     report.picture(caption.replace("\n", " "), figure)
     if picture is not None:
         save(figure, picture)
+
+
+def draw_growth(growths: Mapping[str, Growth], caption: str, seed: int) -> Any:
+    figure, axes = panel_figure(len(TITLES), 4, (4.4, 3.6))
+    for axis, (measure, title) in zip(axes, TITLES.items(), strict=True):
+        for colour, (name, growth) in zip(COLOURS, growths.items(), strict=False):
+            values = _series(growth, measure, seed)
+            if np.isfinite(values[:, 0]).any():
+                axis.plot(growth.places, values[:, 0], color=colour, linewidth=1.2, label=name)
+                axis.fill_between(growth.places, values[:, 1], values[:, 2], color=colour, alpha=0.15, linewidth=0)
+        axis.set(xlabel="places", title=title, yscale="log" if measure in LOGARITHMIC else "linear")
+        axis.grid(alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(0.94, 0.2))
+    figure.supxlabel(caption, fontsize=9)
+    return figure
+
+
+def _series(growth: Growth, measure: str, seed: int) -> FloatArray:
+    """Mean, lower and upper bound after every batch, shape (U, 3)."""
+    if measure in MEASURES:
+        return np.array([growth.intervals(update, seed)[measure] for update in range(len(growth.places))])
+    values = growth.words if measure == "words" else growth.seconds
+    return np.repeat(values[:, None], 3, axis=1)
 
 
 def _ends(growths: dict[str, Growth]) -> Iterator[tuple[object, ...]]:

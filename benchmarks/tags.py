@@ -27,6 +27,7 @@ import common
 import cv2
 import numpy as np
 from robustness import Recording
+from wall_tags import SIZE_M, WallTag, draw_tags, hang_tags
 
 from fcslam.config import parse
 from fcslam.geometry import se2
@@ -42,7 +43,6 @@ from fcslam.lab.simulation.simulated_fleet import (
     SimulationSettings,
     simulate_fleet,
 )
-from fcslam.lab.simulation.tags import SIZE_M, WallTag, draw_tags, hang_tags
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
 from fcslam.runs import Run

@@ -20,7 +20,16 @@ from fcslam.records import Channel
 from tests.features.networks import tiny_network
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-SHARED = ("common", "device_pairs", "map_search", "processes", "training_fleet")
+SHARED = (
+    "common",
+    "device_pairs",
+    "map_search",
+    "processes",
+    "training_fleet",
+    "vocabulary_growth",
+    "wall_tags",
+    "relation_closures",
+)
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
 

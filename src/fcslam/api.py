@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,15 @@ from fcslam.config import load, parse
 from fcslam.errors import SourceError
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.mission.driving import side_by_side
-from fcslam.mission.mission import Beginning, MissionConfig, Watch, check_robots, continued_config, run_mission
+from fcslam.mission.mission import (
+    Beginning,
+    Live,
+    MissionConfig,
+    Watch,
+    check_robots,
+    continued_config,
+    run_mission,
+)
 from fcslam.mission.mission_file import EMPTY, SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.robot.calibrating import calibrated
@@ -80,15 +88,31 @@ def map_recordings(
     settings = settings_of(continued_config(earlier) if config is None else config)
     opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
-    check_robots(robots)
-    sources.check_copies(robots)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
     beginning = Beginning(earlier, tuple(vetoes), floors, anchors)
-    run = run_mission(robots, settings, progress or (lambda _: None), beginning, side_by_side(processes))
+    run = run_recordings(robots, settings, beginning, processes, progress or (lambda _: None))
     if output is not None:
         run.save(output, force)
     return run
+
+
+def run_recordings(
+    recordings: Sequence[Source],
+    settings: MissionConfig,
+    beginning: Beginning,
+    processes: int,
+    watch: Watch,
+    live: Live = lambda _: None,
+) -> Run:
+    """Map opened recordings, ``processes`` robots at a time, after a check that none is there twice.
+
+    Raises:
+        InputError: as ``run_mission`` does, or two recordings share scans.
+    """
+    check_robots(recordings)
+    sources.check_copies(recordings)
+    return run_mission(recordings, settings, watch, beginning, side_by_side(processes), live)
 
 
 def localize(

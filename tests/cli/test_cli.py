@@ -15,8 +15,7 @@ from fcslam.cli import BAD_INPUT, main
 from fcslam.config import Settings, load
 from fcslam.lab.presets import Preset
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
-from fcslam.runs import ClosureRow, RobotTrajectory, Run, open_run
+from fcslam.runs import RobotTrajectory, Run
 
 
 @pytest.fixture
@@ -80,34 +79,6 @@ def test_relations_across_robots_with_the_parts_of_another_run(run_and_relations
     assert "1 of 2 relations across robots used" in capsys.readouterr().out
 
 
-def test_closures_tables(run_and_relations, capsys, tmp_path):
-    run, relations = run_and_relations
-    ends = ("r0", 0.0, "r1", 100.0)
-    closures = [
-        ClosureRow(*ends, Channel.LIDAR, 0.5, np.array([x, 0.0, 0.0]), status, Reason(ReasonCode.VERIFIED))
-        for x, status in ((1.0, ClosureStatus.ACCEPTED), (2.0, ClosureStatus.REVOKED))
-    ]
-    Run(open_run(Path(run)).trajectories, tuple(closures)).save(Path(run), force=True)
-    assert main(["evaluate", "closures", run, relations, "--csv", str(tmp_path / "table.csv")]) == 0
-    out = capsys.readouterr().out
-    assert "between, verified  │ 2   │ 2, 100.0% │ 1     │ 50.0%     │ 1/1, 100.0%" in out
-    assert "between, accepted  │ 0.250 / 0.250 │ 0.00 / 0.00 │ 1 / 1 │ 1, 0 wrong" in out
-    assert "2 relations optimised together; 1 components of 3 stamps (2 in the run), 3 in the largest" in out
-    assert "contradict" not in out
-    rows = (tmp_path / "table.csv").read_text().splitlines()
-    assert "inter_robot_accepted_translation_error_max,0.25,m" in rows
-
-
-def test_closures_say_when_the_relations_contradict_each_other(run_and_relations, capsys, tmp_path):
-    run, _ = run_and_relations
-    (tmp_path / "torn").write_text("0 100 1 0 0 0 0 0\n0 100 1.01 0 0 0 0 0\n100 0 3 0 0 0 0 0\n")
-    assert main(["evaluate", "closures", run, str(tmp_path / "torn")]) == 0
-    assert "The relations contradict each other: 1 of 3 left out" in capsys.readouterr().out
-    (tmp_path / "torn").write_text("0 100 1 0 0 0 0 0\n100 0 3 0 0 0 0 0\n")
-    assert main(["evaluate", "closures", run, str(tmp_path / "torn")]) == 0
-    assert "The relations contradict each other: 2 of 2 left out" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -121,25 +92,6 @@ def test_closures_say_when_the_relations_contradict_each_other(run_and_relations
 def test_bad_input_is_one_line_and_exit_code_2(run_and_relations, capsys, arguments, message):
     names = dict(zip(("{run}", "{relations}"), run_and_relations, strict=True))
     assert main(["evaluate", "relations", *(names.get(argument, argument) for argument in arguments)]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.startswith("fcslam: ")
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["missing", "{relations}"], "missing: no run folder"),
-        (["{run}", "missing"], "missing: cannot read the relations"),
-        (["{run}", "foreign"], "names a stamp"),
-        (["{run}", "{relations}", "--csv", "missing/table.csv"], "cannot write the table"),
-    ],
-)
-def test_closures_of_bad_input_are_one_line_and_exit_code_2(run_and_relations, capsys, tmp_path, arguments, message):
-    (tmp_path / "foreign").write_text("7 8 0 0 0 0 0 0\n")
-    names = dict(zip(("{run}", "{relations}"), run_and_relations, strict=True))
-    assert main(["evaluate", "closures", *(names.get(argument, argument) for argument in arguments)]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.startswith("fcslam: ")

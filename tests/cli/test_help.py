@@ -9,7 +9,7 @@ import click
 import pytest
 import typer
 
-from fcslam.cli import app, main
+from fcslam.cli import EXAMPLES, app, main
 from tests.test_docs import complaint
 from tests.test_imports import HEAVY
 
@@ -46,6 +46,11 @@ def test_every_example_runs_this_command(words):
     assert [complaint(example, complete=True) for example in examples] == [""] * len(examples)
     called = [tuple(shlex.split(example)[1 : len(words) + 1]) for example in examples]
     assert words in called
+
+
+def test_every_line_of_the_examples_is_of_a_command():
+    shown = {example for command in COMMANDS.values() for example in command.epilog.split("\n\n")}
+    assert set(EXAMPLES.splitlines()) - shown == set()
 
 
 @every_command

@@ -153,13 +153,6 @@ def test_a_robot_that_is_stopped_twice_says_what_is_left_and_goes_on_later(log, 
     assert list(cloud.cloud.stored) == [(0, k) for k in range(len(cloud.cloud.stored))]
 
 
-def test_the_traffic_is_explained_without_a_recording(capsys):
-    assert main(["robot", "--explain-traffic"]) == 0
-    out = capsys.readouterr().out
-    assert "descriptors" in out
-    assert "no image" in " ".join(out.split())
-
-
 def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begins():
     console = Console(file=io.StringIO(), width=200)
     with ProgressDisplay(console) as display:

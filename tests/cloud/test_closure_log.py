@@ -17,12 +17,13 @@ def found(line, **changed):
     return PlaceMatch.verified(line.i, line.j, Channel.LIDAR, 0.5, replace(verified(line), **changed), predicted=False)
 
 
-def test_ties_are_what_is_accepted_between_a_robot_and_others_the_newest_first():
+def test_ties_are_what_is_accepted_between_a_place_and_those_of_others():
     ledger = ClosureLog()
     entries = [ledger.add(found(line)) for line in LINES]
     ledger.add(found(LINES[0], strict=False))
     for entry in entries[1:]:
         entry.set(ClosureStatus.ACCEPTED, "")
-    assert list(ledger.ties("a")) == entries[2:0:-1]
-    assert list(ledger.ties("c")) == entries[:1:-1]
-    assert list(ledger.ties("d")) == []
+    assert list(ledger.ties_at(KeyscanId("a", 0))) == []
+    assert list(ledger.ties_at(KeyscanId("a", 1))) == entries[1:2]
+    assert list(ledger.ties_at(KeyscanId("c", 3))) == entries[3:]
+    assert list(ledger.ties_at(KeyscanId("d", 0))) == []

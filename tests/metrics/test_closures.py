@@ -5,12 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.relation_closures import BRIDGE_S, PoseReference, RelationReference, closure_errors
 from fcslam.geometry import se2
 from fcslam.metrics.closures import (
-    BRIDGE_S,
-    PoseReference,
-    RelationReference,
-    closure_errors,
     path_lengths,
     precision,
     revisits_found,

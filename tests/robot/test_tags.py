@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.wall_tags import WallTag, draw_tags
 from fcslam.config import parse
 from fcslam.errors import ConfigError
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import CameraSettings
-from fcslam.lab.simulation.tags import WallTag, draw_tags
 from fcslam.records import CameraImage, KeyscanId, TagFamily
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.tags import TagDetector, TagsConfig

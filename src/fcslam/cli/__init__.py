@@ -112,7 +112,6 @@ fcslam show runs/building/mission.fcslam --port 8350 --no-open
 fcslam robot ros2:/robot1 -o runs/robot1
 fcslam robot ros2:/robot1 --server https://hub --state s --credentials c
 fcslam robot anna=ros1:/robot1 --sensors scan-topic=/front/scan
-fcslam robot --explain-traffic
 fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state
 fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c
 fcslam localize today.bag --map runs/building

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
-    from fcslam.mission.mission import MissionConfig
 
-RECORDINGS, LEARNING, RUN, FIGURE, TABLE = "recordings", "learning", "run", "figure.png", "evaluation.csv"
+RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
+STAGES = 4
 ABOUT = "about"
 """The file that marks a folder as the output of a demo, which the next demo may replace."""
 
@@ -33,17 +33,10 @@ def demo(
     seed: BuildingSeed = 1,
     path_length: PathLength = None,
     no_camera: NoCamera = False,
-    learn: Annotated[
-        bool,
-        typer.Option(
-            "--learn", help="First let the robots train their detector together; two to three minutes of one processor."
-        ),
-    ] = False,
     live: Live = False,
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
-    from fcslam.cli.demo_learning import learn_together
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
     from fcslam.lab.simulation.noise import SCANNERS
@@ -53,8 +46,6 @@ def demo(
     from fcslam.sources import open_source
 
     began = time.perf_counter()
-    if learn:
-        _check_learning(no_camera)
     camera = None if no_camera else CameraSettings()
     settings = SimulationSettings(
         robots=robots,
@@ -67,17 +58,13 @@ def demo(
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed)
     console = notices(quiet)
-    stages = _Stages(console, 5 if learn else 4)
+    stages = _Stages(console)
     stages.begin(f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, console)
     sources = [open_source(place) for place in recordings]
-    config = MissionConfig(seed=seed)
-    if learn:
-        stages.begin("learn: the robots train the detector together, and no image leaves its robot")
-        config = _with_detector(config, learn_together(sources, config, output / LEARNING, console))
     stages.begin("map each robot, recognise places, fuse the maps")
     with live_page(output / RUN) if live else nullcontext() as page:
-        map_sources(sources, config, Beginning(), output / RUN, console, force=True, page=page)
+        map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
         stages.begin("evaluate: compare with the truth")
         _evaluate(output, console)
         stages.begin("draw")
@@ -111,7 +98,7 @@ def _prepare(output: Path) -> None:
             raise OutputError(
                 f"{output}: holds something that is not a demo; remove it, or name another folder with --output"
             )
-        names = (RECORDINGS, LEARNING, RUN, FIGURE, TABLE)
+        names = (RECORDINGS, RUN, FIGURE, TABLE)
         (output / ABOUT).write_text(
             f"Written by `fcslam demo`, which replaces {', '.join(names)} here when it runs again.\n", encoding="utf-8"
         )
@@ -122,30 +109,6 @@ def _prepare(output: Path) -> None:
                 place.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
-
-
-def _check_learning(no_camera: bool) -> None:
-    """Check that the robots can learn.
-
-    Raises:
-        InputError: they have no camera.
-        TrainingError: a library is missing.
-    """
-    from fcslam.cli.training_options import require_training_libraries
-    from fcslam.errors import InputError
-
-    if no_camera:
-        raise InputError("robots without a camera have nothing to learn from; leave out --learn or --no-camera")
-    require_training_libraries("flwr", extra="federated")
-
-
-def _with_detector(config: "MissionConfig", network: Path | None) -> "MissionConfig":
-    """The mission with a released network for camera images; None: with the bundled one."""
-    if network is None:
-        return config
-    onnx = config.robot.views.onnx.model_copy(update={"weights": network})
-    views = config.robot.views.model_copy(update={"onnx": onnx})
-    return config.model_copy(update={"robot": config.robot.model_copy(update={"views": views})})
 
 
 def _evaluate(output: Path, console: "Console") -> None:
@@ -180,9 +143,9 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
 class _Stages:
     """Announces the stages of the demo."""
 
-    def __init__(self, console: "Console", count: int) -> None:
-        self._console, self._count, self._begun = console, count, 0
+    def __init__(self, console: "Console") -> None:
+        self._console, self._begun = console, 0
 
     def begin(self, text: str) -> None:
         self._begun += 1
-        print_line(self._console, f"{self._begun} of {self._count} {text}")
+        print_line(self._console, f"{self._begun} of {STAGES} {text}")

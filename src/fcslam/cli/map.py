@@ -170,10 +170,8 @@ def map_sources(
     A run that appeared at ``output`` meanwhile is replaced only with ``force``.
     """
     with _without_collection():
+        from fcslam.api import run_recordings
         from fcslam.cli.progress import ProgressDisplay
-        from fcslam.mission.driving import side_by_side
-        from fcslam.mission.mission import check_robots, run_mission
-        from fcslam.sources import check_copies
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -184,10 +182,8 @@ def map_sources(
         faults: dict[str, Faults] = {}
         known = sum(len(track.stamps) for track in beginning.onto.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
-        check_robots(sources)
-        check_copies(sources)
         look = (lambda _: None) if page is None else page.look
-        run = run_mission(sources, settings, progress, beginning, side_by_side(cores()), look)
+        run = run_recordings(sources, settings, beginning, cores(), progress, look)
         display.start("writing")
         run.save(output, force)
     if page is not None:

@@ -9,32 +9,10 @@ import typer
 from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, output_option
-from fcslam.cli.output import RUNS, answers, notices
+from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
 from fcslam.cli.ros_options import RosParameters, UseSimTime
-from fcslam.cli.server_options import NETWORK, Budget, Credentials, Floor, ServerUrl, access
-
-
-def _explain_traffic(wanted: bool) -> None:
-    if not wanted:
-        return
-    from rich.table import Table
-
-    from fcslam.wire.disclosure import disclosures
-
-    console = answers()
-    for message in disclosures():
-        table = Table("field", "type", "what it could reveal", title=f"{message.name}: {message.direction}")
-        table.title_justify = "left"
-        for field in message.fields:
-            table.add_row(field.name, field.type, field.reveals)
-        console.print(table)
-    console.print(
-        "A message has no other field, and unknown fields are refused. The network sees the robot's address and the "
-        "times of its requests, and without TLS also their content. A token and a random number identify the robot.",
-        soft_wrap=True,
-    )
-    raise typer.Exit
+from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
 
 
 def robot(
@@ -62,16 +40,6 @@ def robot(
     use_sim_time: UseSimTime = False,
     learn: Learn = False,
     quiet: Quiet = False,
-    _explain: Annotated[
-        bool,
-        typer.Option(
-            "--explain-traffic",
-            callback=_explain_traffic,
-            is_eager=True,
-            rich_help_panel=NETWORK,
-            help="List every message, its fields and what they could reveal, and exit.",
-        ),
-    ] = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
     from fcslam.cli.live import drive_live, is_live, live_source

@@ -68,10 +68,8 @@ class ClosureLog:
         self._entries: list[ClosureEntry] = []
         self._between: dict[frozenset[str], list[ClosureEntry]] = {}
         """Entries by pair of robots, because every place queries its pairs."""
-        self._ties: dict[str, list[ClosureEntry]] = {}
-        """Verified entries between each robot and others; a candidate never changes its status."""
         self._at: dict[KeyscanId, list[ClosureEntry]] = {}
-        """Verified entries between robots, by each of their two places."""
+        """Verified entries between robots, by each of their two places; a candidate never changes its status."""
 
     def __iter__(self) -> Iterator[ClosureEntry]:
         return iter(self._entries)
@@ -148,8 +146,6 @@ class ClosureLog:
         i, j = entry.closure.i, entry.closure.j
         self._between.setdefault(frozenset((i.robot, j.robot)), []).append(entry)
         if entry.closure.status is not ClosureStatus.CANDIDATE:
-            for robot in (i.robot, j.robot):
-                self._ties.setdefault(robot, []).append(entry)
             for place in (i, j):
                 self._at.setdefault(place, []).append(entry)
         return entry
@@ -218,8 +214,3 @@ class ClosureLog:
     def ties_at(self, place: KeyscanId) -> Iterator[ClosureEntry]:
         """The accepted closures between this place and those of other robots."""
         return (entry for entry in self._at.get(place, ()) if entry.closure.status is ClosureStatus.ACCEPTED)
-
-    def ties(self, robot: str) -> Iterator[ClosureEntry]:
-        """The accepted closures between a robot and others, newest first."""
-        entries = reversed(self._ties.get(robot, ()))
-        return (entry for entry in entries if entry.closure.status is ClosureStatus.ACCEPTED)

@@ -22,6 +22,10 @@ ORB_VERSION = "orb-1"
 
 _CORNERS: Final = 600
 """Most corners of an image, as in the evaluation of SuperPoint (DeTone et al. 2018)."""
+_NMS_PX: Final = 4.0
+"""Distance of non-maximum suppression of corners."""
+_FAST_THRESHOLD: Final = 10
+"""OpenCV's default for FAST corners [grey levels of 255]."""
 _SIFT_NUMBERS: Final = 128
 """Dimension of a SIFT descriptor."""
 _PYRAMID_STEP: Final = 1.2
@@ -90,40 +94,33 @@ class Sift:
 class Fast:
     """FAST corners (segment test, Rosten and Drummond 2006)."""
 
-    def __init__(self, threshold: int = 10, nms_px: float = 4.0) -> None:
-        self._fast = cv2.FastFeatureDetector.create(threshold)
-        self._nms_px = nms_px
+    def __init__(self) -> None:
+        self._fast = cv2.FastFeatureDetector.create(_FAST_THRESHOLD)
 
     def detect(self, image: GreyImage) -> Keypoints:
         """Corners of an image (H, W), the strongest first."""
-        return _strongest(*_positions_and_responses(self._fast.detect(image)), self._nms_px)
+        return _strongest(*_positions_and_responses(self._fast.detect(image)))
 
 
 class Harris:
     """Harris corners (Harris and Stephens 1988): every pixel with a positive response, then non-maximum suppression."""
 
-    def __init__(self, nms_px: float = 4.0) -> None:
-        self._nms_px = nms_px
-
     def detect(self, image: GreyImage) -> Keypoints:
         """Corners of an image (H, W), the strongest first."""
         response = cv2.cornerHarris(image.astype(np.float32) / np.float32(255.0), blockSize=4, ksize=3, k=0.04)
         rows, columns = np.nonzero(response > 0.0)
-        return _strongest(np.column_stack((columns, rows)), response[rows, columns], self._nms_px)
+        return _strongest(np.column_stack((columns, rows)), response[rows, columns])
 
 
 class ShiTomasi:
     """Shi-Tomasi corners, "good features to track" (Shi and Tomasi 1994)."""
 
-    def __init__(self, nms_px: float = 4.0) -> None:
-        self._nms_px = nms_px
-
     def detect(self, image: GreyImage) -> Keypoints:
         """Corners of an image (H, W), the strongest first."""
         corners, qualities = cv2.goodFeaturesToTrackWithQuality(image, _CORNERS, 1e-4, 5, None)
         if corners is None:
-            return _strongest(np.empty((0, 2)), np.empty(0), self._nms_px)
-        return _strongest(corners.reshape(-1, 2), qualities.ravel(), self._nms_px)
+            return _strongest(np.empty((0, 2)), np.empty(0))
+        return _strongest(corners.reshape(-1, 2), qualities.ravel())
 
 
 def _positions_and_responses(keypoints: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
@@ -138,6 +135,6 @@ def _ranked(positions: FloatArray, responses: FloatArray) -> tuple[Keypoints, ND
     return Keypoints(frozen(positions[order], np.float32), frozen(responses[order], np.float32)), order
 
 
-def _strongest(positions: FloatArray, responses: FloatArray, nms_px: float) -> Keypoints:
+def _strongest(positions: FloatArray, responses: FloatArray) -> Keypoints:
     corners, _ = _ranked(positions, responses)
-    return corners.take(box_nms(corners.keypoints_px, nms_px)[:_CORNERS])
+    return corners.take(box_nms(corners.keypoints_px, _NMS_PX)[:_CORNERS])

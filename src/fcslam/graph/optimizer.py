@@ -9,10 +9,8 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 from scipy.special import gammaincinv
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.pose_graph import PoseGraph, anchors
@@ -28,31 +26,14 @@ _TRUSTED_WEIGHT = 0.5
 """A closure of a larger weight is trusted at the start of a refinement."""
 _REFINEMENT_ROUNDS = 200
 """Limit of alternating solves and decisions, which end by themselves."""
-
-
-class GncSettings(Settings):
-    """Graduated non-convexity (Yang et al., RA-L 2020)."""
-
-    inlier_probability: float = Field(
-        default=0.99, gt=0.0, lt=1.0, description="probability with which a true closure passes the chi-square test"
-    )
-    control_step: float = Field(
-        default=1.4, gt=1.0, description="factor of the control parameter from step to step, which sharpens the loss"
-    )
-    first_iterations: int = Field(
-        default=5, ge=1, description="solver iterations with all closures before the first step"
-    )
-    step_iterations: int = Field(default=1, ge=1, description="solver iterations in each step")
-    maximum_steps: int = Field(
-        default=100,
-        ge=1,
-        description="largest number of steps; closures that are still undecided are then decided by their residuals",
-    )
-
-    @property
-    def limit(self) -> float:
-        """The chi-square quantile of ``inlier_probability`` for the three degrees of freedom of a closure."""
-        return float(2.0 * gammaincinv(1.5, self.inlier_probability))
+_LIMIT = float(2.0 * gammaincinv(1.5, 0.99))
+"""Chi-square of three degrees of freedom that a true closure keeps with a probability of 0.99."""
+_FIRST_ITERATIONS, _STEP_ITERATIONS = 5, 1
+"""Solver iterations of graduated non-convexity, with all closures before the first step, and in each step."""
+_CONTROL_STEP = 1.4
+"""Factor of its control parameter from step to step, which sharpens the loss."""
+_MAXIMUM_STEPS = 100
+"""Largest number of its steps; closures that are still undecided are then decided by their residuals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +99,6 @@ def optimize_gnc(
     graph: PoseGraph,
     initial: ArrayLike | None = None,
     *,
-    settings: GncSettings | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
     """Optimise under the truncated squared loss on closures: each ends at weight 1 (inlier) or 0 (outlier).
@@ -133,7 +113,6 @@ def optimize_gnc(
     Args:
         graph: N variables and E edges.
         initial: poses to start from, shape (N, 3), odometry or better; None: the graph's own.
-        settings: steps and threshold.
         factors: as in ``optimize``.
 
     Returns:
@@ -142,17 +121,15 @@ def optimize_gnc(
     Raises:
         ValueError: as ``optimize``.
     """
-    chosen = settings or GncSettings()
     start, cache = _start(graph, initial), _cache(graph, factors)
     robust = graph.arrays().robust
     if not graph.edges:
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
-    limit = chosen.limit
     steps = _Steps(cache, start)
-    steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
-    _graduate(steps, limit, chosen)
-    weights = _alternate(steps, limit, (steps.chi2() <= limit).astype(np.float64))
-    return _with_truncated_cost(graph, start, steps, weights, limit)
+    steps.solve(np.ones(int(robust.sum())), _FIRST_ITERATIONS)
+    _graduate(steps)
+    weights = _alternate(steps, (steps.chi2() <= _LIMIT).astype(np.float64))
+    return _with_truncated_cost(graph, start, steps, weights)
 
 
 def refine_inliers(
@@ -179,7 +156,6 @@ def refine_inliers(
     Raises:
         ValueError: ``weights`` do not fit the graph, or as ``optimize``.
     """
-    limit = GncSettings().limit
     start, cache = _start(graph, initial), _cache(graph, factors)
     trusted = np.asarray(weights, dtype=np.float64)
     if trusted.shape != (len(graph.edges),):
@@ -188,8 +164,8 @@ def refine_inliers(
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     robust = graph.arrays().robust
     steps = _Steps(cache, start)
-    decided = _alternate(steps, limit, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
-    return _with_truncated_cost(graph, start, steps, decided, limit)
+    decided = _alternate(steps, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
+    return _with_truncated_cost(graph, start, steps, decided)
 
 
 class _Steps:
@@ -216,30 +192,30 @@ class _Steps:
         return self.cache.graph.chi2(self.poses, self._robust)
 
 
-def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
+def _graduate(steps: _Steps) -> None:
     """Sharpen the loss from almost squared to truncated, with few iterations per step."""
     chi2 = steps.chi2()
     largest = chi2.max(initial=0.0)
-    if largest <= limit:
+    if largest <= _LIMIT:
         return
-    mu = limit / (2.0 * largest - limit)
-    for _ in range(settings.maximum_steps):
-        weights = _truncated_weights(chi2, limit, mu)
+    mu = _LIMIT / (2.0 * largest - _LIMIT)
+    for _ in range(_MAXIMUM_STEPS):
+        weights = _truncated_weights(chi2, mu)
         if np.all((weights < _BINARY) | (weights > 1.0 - _BINARY)):
             return
-        steps.solve(weights, settings.step_iterations)
+        steps.solve(weights, _STEP_ITERATIONS)
         chi2 = steps.chi2()
-        mu *= settings.control_step
+        mu *= _CONTROL_STEP
 
 
-def _alternate(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
+def _alternate(steps: _Steps, weights: FloatArray) -> FloatArray:
     """Alternate solve and decision until no decision changes; returns the weights of the last solve.
 
     Each round lowers the truncated loss, so it ends by itself; the limit covers the tolerance of the solver.
     """
     for _ in range(_REFINEMENT_ROUNDS):
         steps.solve(weights, _MAXIMUM_ITERATIONS)
-        decided = (steps.chi2() <= limit).astype(np.float64)
+        decided = (steps.chi2() <= _LIMIT).astype(np.float64)
         if np.array_equal(decided, weights):
             return weights
         weights = decided
@@ -247,24 +223,22 @@ def _alternate(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
     return weights
 
 
-def _with_truncated_cost(
-    graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray, limit: float
-) -> Solution:
+def _with_truncated_cost(graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray) -> Solution:
     poses, robust = steps.poses, graph.arrays().robust
     steps.cache.complete(poses)
-    costs = [_truncated(graph.chi2(x), robust, limit) for x in (start, poses)]
+    costs = [_truncated(graph.chi2(x), robust) for x in (start, poses)]
     return _solution(graph, start, poses, weights, SolveStats(steps.iterations, *costs))
 
 
-def _truncated_weights(chi2: FloatArray, limit: float, mu: float) -> FloatArray:
+def _truncated_weights(chi2: FloatArray, mu: float) -> FloatArray:
     """Weights of the surrogate of the truncated squared loss at ``mu`` (Yang et al. 2020, eq. 14)."""
     with np.errstate(divide="ignore"):
-        between = np.sqrt(limit * mu * (mu + 1.0) / chi2) - mu
+        between = np.sqrt(_LIMIT * mu * (mu + 1.0) / chi2) - mu
     return np.clip(between, 0.0, 1.0)
 
 
-def _truncated(chi2: FloatArray, robust: ArrayLike, limit: float) -> float:
-    return 0.5 * float(np.where(robust, np.minimum(chi2, limit), chi2).sum())
+def _truncated(chi2: FloatArray, robust: ArrayLike) -> float:
+    return 0.5 * float(np.where(robust, np.minimum(chi2, _LIMIT), chi2).sum())
 
 
 def _levenberg_marquardt(problem: Any, values: Any, iterations: int) -> tuple[Any, int]:

@@ -71,13 +71,13 @@ def collapse_warnings(figures: dict[str, float]) -> list[str]:
     return found
 
 
-def shift_repeatability(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> float:
+def shift_repeatability(network: KeypointNetwork, image: Tensor) -> float:
     """Share of the strongest points found again within 1 px after rolling the image by 1 to 7 px; NaN without any."""
-    points, _ = detect(network, image, most)
+    points, _ = detect(network, image)
     size = (image.shape[-1], image.shape[-2])
     shares = []
     for row, column in SHIFTS:
-        rolled, _ = detect(network, image.roll((row, column), (-2, -1)), most)
+        rolled, _ = detect(network, image.roll((row, column), (-2, -1)))
         expected = points + np.array([column, row])
         kept = expected[well_inside(expected, size, ROLLED_RIM_PX)]
         if len(kept):

@@ -58,10 +58,10 @@ def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImag
     return np.asarray(warped, np.uint8)
 
 
-def visible_mask(shape: tuple[int, int], homography: FloatArray, size: Size, border: int = 2) -> NDArray[np.bool_]:
-    """Which pixels (height, width) of a view show the image of this shape without ``border`` pixels at its border."""
+def visible_mask(shape: tuple[int, int], homography: FloatArray, size: Size) -> NDArray[np.bool_]:
+    """Which pixels (height, width) of a view show the image of this shape without two pixels at its border."""
     own = np.zeros(shape, np.uint8)
-    own[border:-border, border:-border] = 1
+    own[2:-2, 2:-2] = 1
     warped = cv2.warpPerspective(own, homography, size, flags=cv2.INTER_NEAREST)
     return np.asarray(warped, np.bool_)
 

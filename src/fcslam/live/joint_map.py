@@ -3,6 +3,7 @@
 import threading
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -132,4 +133,4 @@ class JointMap:
         self._met[_key(scan.stamp, scan.laser)] = on_teammates
         while len(self._met) > MOST_MET:
             del self._met[next(iter(self._met))]
-        return LaserScan(scan.stamp, scan.ranges_m, scan.laser, scan.T_odom_base, scan.sweep, on_teammates)
+        return replace(scan, on_teammates=on_teammates)

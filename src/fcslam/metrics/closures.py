@@ -1,18 +1,13 @@
-"""Precision and recall of loop closures against reference poses.
-
-A reference has relative poses between some of a run's poses. The ends of a closure are other poses, shortly before or
-after. The run's own trajectory bridges this gap; over such a short time it is as accurate as odometry.
-"""
+"""Precision and recall of loop closures, by their errors against a reference."""
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
-from fcslam.metrics.relations import PoseTable, motion_errors
-from fcslam.records import FloatArray, frozen
+from fcslam.metrics.relations import PoseTable
+from fcslam.records import FloatArray
 
 Rows = NDArray[np.int64]
 """Rows of a run's pose table; -1 for none."""
@@ -21,8 +16,6 @@ Mask = NDArray[np.bool_]
 """Selection, shape (K,) for K closures."""
 
 
-BRIDGE_S: Final = 1.0
-"""Largest time between an end of a closure and a reference pose that covers it."""
 WRONG_M: Final = 0.5
 """A covered closure with a larger translation error is wrong."""
 WRONG_DEG: Final = 10.0
@@ -33,83 +26,10 @@ WITHIN_GAP_S: Final = 60.0
 """Shortest time between two passes of one robot that count as a revisit."""
 
 
-class ReferenceMotion(NamedTuple):
-    """A relative pose of a reference, near two poses of a run."""
-
-    a: int
-    """Row of the reference pose near the first pose."""
-    b: int
-    """Row of the reference pose near the second pose."""
-    T_a_b: FloatArray
-    """Shape (3,)."""
-
-
-class Reference(Protocol):
-    """A source of true relative poses between some of a run's poses."""
-
-    def motion(self, i: int, j: int) -> ReferenceMotion | None:
-        """The relative pose whose ends are nearest in time to rows i and j; None if none is near enough."""
-
-
-@dataclass(frozen=True, slots=True)
-class PoseReference:
-    """Reference poses in components; relative poses are only known within a component."""
-
-    run: PoseTable
-    bridge_s: float
-    rows: Rows
-    """Rows of the reference poses in the run, shape (M,)."""
-    T_component_base: FloatArray
-    """Reference poses in the frame of their component, shape (M, 3)."""
-    components: NDArray[np.int64]
-    """Component of each pose, shape (M,)."""
-
-    def motion(self, i: int, j: int) -> ReferenceMotion | None:
-        """As in Reference."""
-        a, b = self._near(i), self._near(j)
-        stamps = self.run.stamps
-        away_s = np.abs(stamps[self.rows[a]] - stamps[i])[:, None] + np.abs(stamps[self.rows[b]] - stamps[j])
-        away_s[self.components[a][:, None] != self.components[b]] = np.inf
-        if not np.isfinite(away_s).any():
-            return None
-        best_a, best_b = np.unravel_index(np.argmin(away_s), away_s.shape)
-        first, second = a[best_a], b[best_b]
-        T_a_b = se2.between(self.T_component_base[first], self.T_component_base[second])
-        return ReferenceMotion(int(self.rows[first]), int(self.rows[second]), T_a_b)
-
-    def _near(self, row: int) -> NDArray[np.int64]:
-        """Reference poses of the same robot at most ``bridge_s`` away."""
-        away_s, robots = np.abs(self.run.stamps[self.rows] - self.run.stamps[row]), self.run.robots
-        return np.flatnonzero((away_s <= self.bridge_s) & (robots[self.rows] == robots[row]))
-
-
-class RelationReference:
-    """Single reference relations, in both directions, neither chained nor optimised."""
-
-    def __init__(self, run: PoseTable, bridge_s: float, ends: Rows, T_1_2: FloatArray) -> None:
-        """``ends``, shape (R, 2), are the rows that the relative poses ``T_1_2``, shape (R, 3), connect."""
-        self._run, self._bridge_s = run, bridge_s
-        self._ends = np.concatenate((ends, ends[:, ::-1]))
-        self._T_a_b = np.concatenate((T_1_2, se2.inverse(T_1_2)))
-
-    def motion(self, i: int, j: int) -> ReferenceMotion | None:
-        """As in Reference."""
-        stamps, robots = self._run.stamps, self._run.robots
-        away_s = np.abs(stamps[self._ends] - stamps[[i, j]])
-        near = np.flatnonzero(np.all((away_s <= self._bridge_s) & (robots[self._ends] == robots[[i, j]]), axis=1))
-        if not len(near):
-            return None
-        best = near[np.argmin(away_s[near].sum(axis=1))]
-        a, b = self._ends[best]
-        return ReferenceMotion(int(a), int(b), self._T_a_b[best])
-
-
 @dataclass(frozen=True, slots=True)
 class ClosureErrors:
     """Errors of closures, one row each; NaN without a reference."""
 
-    ends: Rows
-    """Rows of the reference poses that a closure was compared with, shape (K, 2); -1 without a reference."""
     translation_m: FloatArray
     """Shape (K,)."""
     rotation_deg: FloatArray
@@ -124,20 +44,6 @@ class ClosureErrors:
     def correct(self) -> Mask:
         """Covered closures that are not wrong, shape (K,)."""
         return (self.translation_m <= WRONG_M) & (self.rotation_deg <= WRONG_DEG)
-
-
-def closure_errors(pairs: Rows, T_i_j: FloatArray, run: PoseTable, reference: Reference) -> ClosureErrors:
-    """Errors of closures ``T_i_j`` (K, 3), metres and radians, between rows ``pairs`` (K, 2) of ``run``."""
-    ends = np.full((len(pairs), 2), -1, dtype=np.int64)
-    true = np.full((len(pairs), 3), np.nan)
-    for k, (i, j) in enumerate(pairs.tolist()):
-        motion = reference.motion(i, j) if min(i, j) >= 0 else None
-        if motion is not None:
-            ends[k] = motion.a, motion.b
-            T_i_a = se2.between(run.T_map_base[i], run.T_map_base[motion.a])
-            T_b_j = se2.between(run.T_map_base[motion.b], run.T_map_base[j])
-            true[k] = se2.compose(se2.compose(T_i_a, motion.T_a_b), T_b_j)
-    return ClosureErrors(frozen(ends, np.int64), *motion_errors(true, T_i_j))
 
 
 @dataclass(frozen=True, slots=True)

@@ -183,21 +183,17 @@ class Missions:
         """
         if self.folder(name).store.exists():
             raise ServiceError(f"mission '{name}' exists; open it or choose another name")
-        self.open(name, create=True)
+        self._switch(name)
 
-    def open(self, name: str, create: bool = False) -> None:
+    def open(self, name: str) -> None:
         """Open a mission: robots' packets go to it from now on. The mission that was open is closed.
 
         Raises:
             ServiceError: there is none of this name.
         """
-        if not create and not self.folder(name).store.exists():
+        if not self.folder(name).store.exists():
             raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
-        if name == self.open_mission.folder.name:
-            return
-        before = self.open_mission
-        self.open_mission = self._opened(name)
-        before.close()
+        self._switch(name)
 
     def result(self, name: str, number: int) -> Path | None:
         """The run folder of a result of a mission; None if there is none.
@@ -249,6 +245,13 @@ class Missions:
     @property
     def _open_file(self) -> Path:
         return self.root / "open"
+
+    def _switch(self, name: str) -> None:
+        if name == self.open_mission.folder.name:
+            return
+        before = self.open_mission
+        self.open_mission = self._opened(name)
+        before.close()
 
     def _opened(self, name: str) -> OpenMission:
         folder = self.folder(name)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.lab.evaluation.places.features import choose_features, describe_sets
-from fcslam.lab.evaluation.places.vocabulary_growth import (
+from benchmarks.vocabulary_growth import (
     BATCH,
     MEASURES,
     ahead_of,
@@ -13,6 +12,7 @@ from fcslam.lab.evaluation.places.vocabulary_growth import (
     group_measures,
     grow_vocabulary,
 )
+from fcslam.lab.evaluation.places.features import choose_features, describe_sets
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from tests.lab.evaluation import place_folders

@@ -2,7 +2,6 @@
 
 import typer
 
-from fcslam.cli.evaluate.closures import closures
 from fcslam.cli.evaluate.fleet import fleet
 from fcslam.cli.evaluate.homography import homography
 from fcslam.cli.evaluate.places import places
@@ -26,7 +25,6 @@ app.command(epilog=examples(_RELATIONS, "fcslam evaluate relations runs/intel-3 
     relations
 )
 app.command(epilog=examples("fcslam evaluate quality fleet/run --truth fleet"))(quality)
-app.command(epilog=examples("fcslam evaluate closures runs/intel-3 intel.relations.gz"))(closures)
 app.command(
     epilog=examples(
         "fcslam evaluate homography hpatches --detector onnx --detector orb",

@@ -9,7 +9,6 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, ray_caster
-from fcslam.lab.simulation.tags import FAMILY
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, frozen
 from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
@@ -41,7 +40,7 @@ class HasTruePoses(Protocol):
 
 
 def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
-    """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``, and ``tags.yaml`` with tags.
+    """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``.
 
     True poses are in each robot's recording. The relations measure a map without a common coordinate frame.
 
@@ -54,13 +53,6 @@ def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Gener
     seen = true_map(fleet)
     write_file(place / "map.pgm", pgm_bytes(seen))
     write_file(place / "map.yaml", map_yaml(seen, "map.pgm"))
-    if fleet.tags:
-        lines = [
-            f"  {tag.number}: {{x: {x:.4f}, y: {y:.4f}, yaw: {yaw:.6f}}}"
-            for tag in fleet.tags
-            for x, y, yaw in (tag.T_building_tag,)
-        ]
-        write_file(place / "tags.yaml", "\n".join((f"family: {FAMILY}", "tags:", *lines, "")).encode())
 
 
 def true_relations(robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000) -> Relations:

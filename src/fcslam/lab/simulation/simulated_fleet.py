@@ -26,7 +26,6 @@ from fcslam.lab.simulation.outdoor_rays import OutdoorRayCaster
 from fcslam.lab.simulation.route import TURN_RATE_RAD_S, Schedule, draw_goals, plan_route, schedule
 from fcslam.lab.simulation.scene import bare_model, furnished_model
 from fcslam.lab.simulation.sensors import Camera, RayCaster
-from fcslam.lab.simulation.tags import WallTag, draw_tags, hang_tags
 from fcslam.lab.simulation.terrain import SLOPE
 from fcslam.lab.simulation.walk import draw_starts, plan_walk
 from fcslam.lab.simulation.yard import draw_yard, move_cars
@@ -121,9 +120,6 @@ class SimulationSettings(Settings):
         default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: there is none"
     )
     camera: CameraSettings | None = CameraSettings()
-    tags: int = Field(
-        default=0, ge=0, le=587, description="AprilTags 36h11, 0.3 m wide, on walls of a building; cameras see them"
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +144,6 @@ class SimulatedRobot:
     lighting: Lighting
     settings: SimulationSettings
     decoration: Decoration | None
-    tags: tuple[WallTag, ...]
     route: Schedule
     first_stamp: float
     seed: int
@@ -220,7 +215,6 @@ class SimulatedRobot:
             for k in range(len(self.image_stamps)):
                 noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
                 picture = camera.take(poses[k]).astype(np.float32)
-                draw_tags(picture, self.camera, poses[k], self.tags, self.plan.segments)
                 encoded = _jpeg(picture + settings.noise * noise, settings.jpeg_quality)
                 T_odom_base = None if odometry is None else odometry[k]
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
@@ -242,7 +236,6 @@ class _RandomStream(IntEnum):
     SCANS = 5
     IMAGES = 6
     DOORS = 7
-    TAGS = 8
 
 
 def _generator(seed: int, purpose: _RandomStream, robot: int = 0, record: int = 0) -> np.random.Generator:
@@ -255,7 +248,6 @@ class SimulatedFleet:
 
     plan: FloorPlan
     robots: tuple[SimulatedRobot, ...]
-    tags: tuple[WallTag, ...] = ()
 
 
 def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
@@ -271,8 +263,6 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
         raise SimulationError(
             f"a {settings.building} is simulated for LiDARs only; leave the cameras off (--no-camera)"
         )
-    if settings.tags and (outdoors or not settings.camera):
-        raise SimulationError("tags are on walls, for cameras; leave tags out, or simulate cameras in a building")
     building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
     plan = draw_yard(building, settings.slope) if outdoors else draw_floor_plan(building, settings.building)
     _check_room(plan, settings)
@@ -281,20 +271,19 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     else:
         goals = draw_goals(plan, settings.robots, settings.path_length_m, goals_rng)
     decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
-    tags = hang_tags(plan, settings.tags, _generator(seed, _RandomStream.TAGS))
     robots: list[SimulatedRobot] = []
     left, closed = plan, frozenset[int]()
     for number in range(settings.robots):
         rng = _generator(seed, _RandomStream.ROBOTS, number)
         found = _moved(left, goals[number], settings, rng) if number else plan
-        robot = _robot(found, decoration, tags, number, goals[number], settings, seed, rng)
+        robot = _robot(found, decoration, number, goals[number], settings, seed, rng)
         if settings.closed_doors:
             doors_rng, route = _generator(seed, _RandomStream.DOORS, number), robot.T_building_base[:, :2]
             closed = doors_after(found, closed, settings.closed_doors, route, doors_rng)
             robot = replace(robot, plan=with_closed_doors(found, closed))
         robots.append(robot)
         left = found if settings.lasting_changes else plan
-    return SimulatedFleet(plan, tuple(robots), tags)
+    return SimulatedFleet(plan, tuple(robots))
 
 
 def _moved(plan: FloorPlan, goals: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
@@ -317,7 +306,6 @@ def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
 def _robot(
     plan: FloorPlan,
     decoration: Decoration | None,
-    tags: tuple[WallTag, ...],
     number: int,
     goals: FloatArray,
     settings: SimulationSettings,
@@ -347,7 +335,6 @@ def _robot(
         lighting=settings.lighting[number % len(settings.lighting)],
         settings=settings,
         decoration=decoration,
-        tags=tags,
         route=route,
         first_stamp=first_stamp,
         seed=seed,

@@ -6,19 +6,18 @@ from types import MappingProxyType
 
 import numpy as np
 
+from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureScope, closure_rows, closure_sets
 from fcslam.lab.evaluation.fleet.ground_truth import KnownPoses
 from fcslam.metrics.closures import (
     ClosureErrors,
     Mask,
-    PoseReference,
     Precision,
     Recall,
     Rows,
-    closure_errors,
     precision,
 )
-from fcslam.metrics.relations import PoseTable
+from fcslam.metrics.relations import PoseTable, motion_errors
 from fcslam.metrics.revisits import Revisits, find_revisits
 from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus, FloatArray
 from fcslam.runs import Run
@@ -106,13 +105,13 @@ def _judge(run: Run, known: KnownPoses) -> _Judged:
     truth = known.truth
     pairs = closure_rows(run, truth)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
-    every_row, one_frame = np.arange(len(truth.stamps)), np.zeros(len(truth.stamps), dtype=np.int64)
-    # The truth is known at the stamps of the closures, so the run's trajectory does not bridge any gap.
-    reference = PoseReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
+    true, is_known = np.full_like(T_i_j, np.nan), (pairs >= 0).all(axis=1)
+    first, second = pairs[is_known].T
+    true[is_known] = se2.between(truth.T_map_base[first], truth.T_map_base[second])
     return _Judged(
         truth,
         pairs,
-        closure_errors(pairs, T_i_j, truth, reference),
+        ClosureErrors(*motion_errors(true, T_i_j)),
         np.array([closure.similarity for closure in run.closures]),
         {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in PLACE_CHANNELS},
     )

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fcslam.lab.evaluation.federated.pairs import MEASURES
-from fcslam.lab.evaluation.federated.study import ALONE, CENTRAL, LOCAL, StudyResults
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
+
+from .pairs import MEASURES
+from .study import ALONE, CENTRAL, LOCAL, StudyResults
 
 
 @dataclass(frozen=True, slots=True)

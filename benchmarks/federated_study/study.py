@@ -18,15 +18,6 @@ import torch
 
 from fcslam.config import parse
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.lab.evaluation.federated.pairs import (
-    MEASURES,
-    MOST_POINTS,
-    DetectedFeatures,
-    detect_features,
-    held_out_pairs,
-    measure_pair,
-)
-from fcslam.lab.evaluation.federated.poison import Poison, PoisonedClient
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient
@@ -44,6 +35,16 @@ from fcslam.learning.stages import TrainingImages, keypoint_response, read_label
 from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 from fcslam.records import FloatArray
 from fcslam.untrusted import read_arrays
+
+from .pairs import (
+    MEASURES,
+    MOST_POINTS,
+    DetectedFeatures,
+    detect_features,
+    held_out_pairs,
+    measure_pair,
+)
+from .poison import Poison, PoisonedClient
 
 START: Final = "start"
 """The initial weights without training."""
