@@ -17,6 +17,7 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.certificate import MappedPath, certificate_json, certificate_png, certify
 from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
+from fcslam.processes import trim_memory
 from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import QUALITY, ClosureRow, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
@@ -74,6 +75,9 @@ def run_of(
     }
     fused = dict(fused_maps(result, grid))
     certificates = _certificates(result, fused) if with_certificates else {}
+    trim_memory()  # dense covariances and pictures are large, and need not be there at the same time
+    map_files = _map_files(result, trajectories, fused)
+    trim_memory()
     if with_local_maps and 0 in certificates:  # a live run has it by turns
         metrics = [*metrics, Metric("map_error_95", certificates[0]["error_95"], "m")]
     return Run(
@@ -82,7 +86,7 @@ def run_of(
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
-        map_files=_map_files(result, trajectories, fused),
+        map_files=map_files,
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
         quality=_quality_files(certificates, fused),
     )

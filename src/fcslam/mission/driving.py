@@ -10,13 +10,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError
-from fcslam.processes import needing_semaphores, obey_parent, start_method
+from fcslam.processes import needing_semaphores, obey_parent, start_method, trim_memory
 from fcslam.records import Keyscan, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
@@ -26,6 +27,8 @@ from fcslam.wire.messages import Hello
 from fcslam.wire.packets import SizedPacket, decode, measure, readdress
 
 SCANS_PER_LEG: Final = 50
+LEGS_PER_TRIM: Final = 4
+"""Legs after which freed memory goes back to the system: the arrays of a submap leave gaps that others do not fill."""
 _POLL_S: Final = 1.0
 """Interval at which the cloud's process looks whether one that owes it something still runs."""
 
@@ -95,6 +98,7 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     """Drive one robot over its whole recording."""
     packets: list[SizedPacket] = []
     stamps: list[float] = []
+    turns = cycle(range(LEGS_PER_TRIM))
     for record in source.records():
         packets += map(measure, robot.process(record))
         if isinstance(record, LaserScan):
@@ -102,6 +106,8 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
         if len(stamps) == SCANS_PER_LEG:
             yield Leg(robot.robot, tuple(packets), tuple(stamps))
             packets, stamps = [], []
+            if next(turns) == 0:
+                trim_memory()
     packets += map(measure, robot.finish())
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}

@@ -31,6 +31,7 @@ from fcslam.mission.driving import Drive, Leg, continued, on_floor, one_by_one
 from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
 from fcslam.mission.mission_store import StoredPacket
 from fcslam.places.matcher import MatchDecision
+from fcslam.processes import trim_memory
 from fcslam.records import Channel, Edit, Placement, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.words import Sends
@@ -251,7 +252,9 @@ class MissionCloud:
             scans: number of scans.
             recorded_s: length of the recordings together, seconds.
         """
+        trim_memory()  # the robots have ended, and each step below needs much for a moment
         result = self._cloud.finalize()
+        trim_memory()
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
         mapped = {robot.robot for robot in result.robots}
         tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}

@@ -9,9 +9,9 @@ from fcslam.geometry.beams import beam_step
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors
 from fcslam.lidar.scan import rays_of
-from fcslam.records import Beams, LaserModel, LaserScan, Ranges, Sweep
+from fcslam.records import Beams, LaserModel, LaserScan, Sweep
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
-from fcslam.wire.quantisation import dequantise, quantise
+from fcslam.wire.quantisation import rounded
 
 
 class MappedScans:
@@ -35,15 +35,15 @@ class MappedScans:
         index = self._lasers.index(scan.laser)
         step = beam_step(self._lasers.known[index].beams)
         laser = _mapped_laser(scan.laser, step)
-        returns = _returns(scan.ranges_m[::step], laser.max_range_m)
+        ranges_m = scan.ranges_m[::step]
         if self._ignore:
-            returns = np.where(is_in_sectors(laser, self._ignore), np.float32(0.0), returns)
+            ranges_m = np.where(is_in_sectors(laser, self._ignore), np.float32(0.0), ranges_m)
         if self._footprint:
             rays = rays_of(laser)  # the body moves with the laser
-            points = rays.origins + np.minimum(returns, laser.max_range_m)[:, None] * rays.directions
-            returns = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), returns)
+            points = rays.origins + np.minimum(ranges_m, laser.max_range_m)[:, None] * rays.directions
+            ranges_m = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), ranges_m)
         sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
-        return replace(scan, ranges_m=dequantise(quantise(returns)), laser=laser, sweep=sweep)
+        return replace(scan, ranges_m=rounded(ranges_m, laser.max_range_m), laser=laser, sweep=sweep)
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
@@ -60,13 +60,3 @@ def _mapped_sweep(sweep: Sweep, beam_count: int, step: int) -> Sweep:
     """The sweep of every ``step``-th beam from the first on."""
     share = (beam_count - 1) // step * step / (beam_count - 1)
     return sweep._replace(last_s=sweep.first_s + share * (sweep.last_s - sweep.first_s))
-
-
-def _returns(ranges_m: Ranges, max_range_m: float) -> Ranges:
-    """The ranges below the maximum, inf for no return, and 0 for the others, shape (N,), metres.
-
-    The maximum is rounded as the ranges are: 5.6 m in single precision is below 5.6 m, and it is not a return. It is
-    compared before the ranges are rounded to the steps of the wire, which may take it below the maximum as well.
-    """
-    is_known = (ranges_m < np.float32(max_range_m)) | np.isposinf(ranges_m)
-    return np.where(is_known, ranges_m, np.float32(0.0))

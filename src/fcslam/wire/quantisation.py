@@ -1,7 +1,6 @@
 """Quantisation of ranges, keypoints and information matrices to the precision of the wire.
 
-A robot maps with the ranges that it sends, ``dequantise(quantise(ranges))``, so that it and the cloud see the same
-numbers.
+A robot maps with the ranges that it sends, ``rounded``, so that it and the cloud see the same numbers.
 """
 
 from collections.abc import Sequence
@@ -40,12 +39,42 @@ def quantise(ranges_m: ArrayLike) -> RangeCodes:
 def _quantise(ranges):  # type: ignore[no-untyped-def]
     codes = np.zeros(len(ranges), np.uint16)
     for i in range(len(ranges)):
+        codes[i] = _code_of(ranges[i])
+    return codes
+
+
+@njit(allocates=False)
+def _code_of(r):  # type: ignore[no-untyped-def]
+    if r == np.inf:
+        return _NO_RETURN
+    if 0.0 < r < MAXIMUM_RANGE_M + RANGE_STEP_M / 2:  # false for NaN
+        return int(np.rint(r / RANGE_STEP_M))
+    return 0
+
+
+def rounded(ranges_m: ArrayLike, max_range_m: float) -> Ranges:
+    """Ranges (N,) in metres as a packet carries them, ``dequantise(quantise(ranges_m))``, read-only.
+
+    Those at the maximum or above are 0, but no return is inf. The maximum is rounded as the ranges are: 5.6 m in single
+    precision is below 5.6 m, and it is not a return. It is compared before the ranges are rounded to the steps of the
+    wire, which may take it below the maximum as well.
+    """
+    ranges = np.array(ranges_m, dtype=np.float64)  # as in ``quantise``
+    result: Ranges = _rounded(ranges, float(np.float32(max_range_m)))
+    result.setflags(write=False)
+    return result
+
+
+@njit
+def _rounded(ranges, limit):  # type: ignore[no-untyped-def]
+    result = np.zeros(len(ranges), np.float32)
+    for i in range(len(ranges)):
         r = ranges[i]
         if r == np.inf:
-            codes[i] = _NO_RETURN
-        elif 0.0 < r < MAXIMUM_RANGE_M + RANGE_STEP_M / 2:  # false for NaN
-            codes[i] = np.rint(r / RANGE_STEP_M)
-    return codes
+            result[i] = np.inf
+        elif r < limit:
+            result[i] = np.float32(RANGE_STEP_M * _code_of(r))
+    return result
 
 
 def dequantise(codes: RangeCodes) -> Ranges:

@@ -56,7 +56,7 @@ class TextLog:
         self._dialect = dialect
         self._audit = Audit()
         self._kept: list[NumberedLine] = []
-        """All lines, once a short log was read to its end."""
+        """All lines, once a short log was read to its end and until all its records were."""
 
     @property
     def faults(self) -> Faults:
@@ -98,6 +98,7 @@ class TextLog:
             scan = LaserScan(entry.line.stamp, ranges_m, model, T_odom_base)
             watch.add(number, scan)
             yield scan
+        self._kept = []  # whoever maps a recording reads its records once
 
     @cached_property
     def _reading(self) -> LogReading:
