@@ -8,6 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2
@@ -93,10 +94,11 @@ class KartoTracker(ScanTracker):
         match = match_in_buffer(_near(points), list(self._buffer), T_local_guess)
         if match.response == 0.0:
             return TrackingResult(by_odometry, *unmatched)
-        tracked = TrackedScan(match.T_local_base, np.linalg.inv(match.covariance), points, scan.sweep)
+        tracked = TrackedScan(match.T_local_base, np.asarray(np.linalg.inv(match.covariance)), points, scan.sweep)
         innovation = se2.between(T_local_guess, match.T_local_base)
         trust = self._trust.learn(innovation, odometry_error(moved_m, turned_rad, self._odometry))
-        accepted = match.response, 1.0, scan.T_odom_base, 0.0, 0.0, laser, trust, self._usual
+        # The grid knows surfaces, but no free space: what is off them lies in unknown area.
+        accepted = match.response, match.response, scan.T_odom_base, 0.0, 0.0, laser, trust, self._usual
         return TrackingResult(tracked, *accepted)
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
@@ -155,15 +157,15 @@ def match_in_buffer(points: FloatArray, buffer: list[BufferedScan], T_local_gues
 
 def _near(points: PointScan) -> FloatArray:
     """The returns within ``RANGE_M`` of the laser, shape (N, 2)."""
-    return points.points[np.hypot(*(points.points - points.origin).T) < RANGE_M]
+    return np.asarray(points.points[np.hypot(*(points.points - points.origin).T) < RANGE_M])
 
 
 def _offsets(half: int, step: float) -> FloatArray:
-    return step * np.arange(-half, half + 1)
+    return step * np.arange(-half, half + 1, dtype=np.float64)
 
 
 def _best(raw: FloatArray, cells: int, step_rad: float, from_guess: FloatArray) -> FloatArray:
-    """Offset of the best penalised response, shape (3,); the offsets begin ``from_guess``, shape (3,), off the guess."""
+    """Offset of the best penalised response, shape (3,); the search is centred ``from_guess``, shape (3,)."""
     turns, shifts = _offsets(raw.shape[0] // 2, step_rad), _offsets(raw.shape[1] // 2, cells * CELL_M)
     distance2 = (shifts[:, None] + from_guess[1]) ** 2 + (shifts + from_guess[0]) ** 2
     by_distance = np.maximum(LEAST_DISTANCE_PENALTY, 1.0 - PENALTY_GAIN * distance2 / DISTANCE_VARIANCE)
@@ -181,7 +183,7 @@ def _position_covariance(raw: FloatArray, best: FloatArray) -> FloatArray:
     y, x = shifts[:, None] - best[1], shifts - best[0]
     xx, xy, yy = (float((weight * m).sum() / weight.sum()) for m in (x * x, x * y, y * y))
     least = 0.1 * step_m**2
-    return np.array(((max(xx, least), xy), (xy, max(yy, least)))) / response.max()
+    return np.asarray(np.array(((max(xx, least), xy), (xy, max(yy, least)))) / response.max())
 
 
 def _heading_variance(raw: FloatArray, best_rad: float) -> float:
@@ -189,10 +191,10 @@ def _heading_variance(raw: FloatArray, best_rad: float) -> float:
     response = raw.max(axis=(1, 2))
     weight = np.where(response >= response.max() - NEAR_BEST, response, 0.0)
     moment = float((weight * (_offsets(FINE_TURNS, FINE_RAD) - best_rad) ** 2).sum())
-    return max(moment, FINE_RAD**2) / float(weight.sum())
+    return max(moment, float(FINE_RAD**2)) / float(weight.sum())
 
 
-def _kernel() -> np.ndarray:
+def _kernel() -> NDArray[np.uint8]:
     across = np.exp(-0.5 * (_offsets(round(2.0 * SMEAR_M / CELL_M), CELL_M) / SMEAR_M) ** 2)
     return (OCCUPIED * np.outer(across, across)).astype(np.uint8)
 
