@@ -31,9 +31,9 @@ def test_along_a_bare_wall_the_position_is_unsure():
     assert match.covariance[0, 0] > 5.0 * match.covariance[1, 1]
 
 
-def test_without_a_surface_in_reach_there_is_no_response():
-    points = room_scan()
-    match = match_in_buffer(points, [BufferedScan(points + 100.0, np.full(2, 100.0))], np.zeros(3))
+@pytest.mark.parametrize("points", [room_scan(), np.empty((0, 2))])
+def test_without_points_or_surfaces_in_reach_there_is_no_response(points):
+    match = match_in_buffer(points, [BufferedScan(room_scan() + 100.0, np.full(2, 100.0))], np.zeros(3))
     assert match.response == 0.0
     np.testing.assert_array_equal(match.T_local_base, np.zeros(3))
 

@@ -251,5 +251,5 @@ def _responses(grid, corner, points, pose, cells, half, step_rad, half_turns):  
                 total = 0
                 for i in range(len(points)):
                     total += flat[first[i] + shift]
-                responses[k, y, x] = total / (OCCUPIED * len(points))
+                responses[k, y, x] = total / (OCCUPIED * max(1, len(points)))
     return responses
