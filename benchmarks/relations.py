@@ -6,6 +6,10 @@ Each `fcslam map` is a process of its own. CPU seconds are user and system, all 
 numba's compiled code in its cache (a run before them is not counted), cold ones compile everything. Errors follow
 Kuemmerle et al. 2009 over all relations; "across robots" are those whose stamps belong to different robots and lie
 more than 20 s apart, and the run of one robot is measured by the very same ones.
+
+    FCSLAM_DATA=/path/to/data python benchmarks/relations.py --tracker karto
+
+This maps each log once, as one robot, with another scan matcher; the report is `relations_karto` and has errors alone.
 """
 
 import tempfile
@@ -14,6 +18,7 @@ from pathlib import Path
 import common
 
 from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lidar.frontend import Tracker
 from fcslam.metrics.relations import RelationErrors
 
 PEERS = (
@@ -49,8 +54,12 @@ def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--no-cold", action="store_true", help="leave out the runs that compile everything")
     parser.add_argument("--repeat", type=int, default=1, help="warm runs of each; the quickest counts")
+    parser.add_argument("--tracker", type=Tracker, choices=list(Tracker), default=Tracker.SURFELS, help="scan matcher")
     chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
+    if chosen.tracker is not Tracker.SURFELS:
+        report_tracker(chosen, folder)
+        return
     report = common.Report(__file__, __doc__, chosen)
     alone, together, across, closures = [], [], [], []
     with tempfile.TemporaryDirectory() as place:
@@ -72,6 +81,25 @@ def main() -> None:
     report.table("Across robots", {"log": "", "robots": "", **ACROSS}, across)
     names = [name.replace("_closures", "").replace("_", " ") for name in CLOSURES]
     report.table("Closures", {"log": "", "robots": "", **dict.fromkeys(names, ".0f")}, closures)
+    report.say(PEERS_SOURCE)
+    report.table("Peers", dict.fromkeys(("", *common.SPLITS), ""), PEERS)
+    report.write()
+
+
+def report_tracker(chosen, folder: Path) -> None:
+    """Errors of one robot with the scan matcher ``chosen.tracker``."""
+    report = common.Report(f"relations_{chosen.tracker}", __doc__, chosen)
+    rows = []
+    with tempfile.TemporaryDirectory() as place:
+        for name in common.SPLITS:
+            run = Path(place) / name
+            setting = f"robot.lidar.tracker={chosen.tracker}"
+            common.run_fcslam("map", common.log_path(folder, name), "--output", run, "--config", setting)
+            errors = evaluate_relations(run, common.relations_path(folder, name), RelationsQuestion())
+            counts = common.metrics(run)
+            rows.append((name, used(errors), *six(errors), counts["intra_robot_closures_accepted"]))
+    columns = {"log": "", "relations used": "", **ERRORS, "closures accepted": ".0f"}
+    report.table(f"One robot, tracker {chosen.tracker}", columns, rows)
     report.say(PEERS_SOURCE)
     report.table("Peers", dict.fromkeys(("", *common.SPLITS), ""), PEERS)
     report.write()

@@ -6,6 +6,7 @@ It works in the smooth local frame of the tracker and never reads the pose graph
 
 from collections import deque
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +14,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
+from fcslam.lidar.karto import KartoTracker
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.own_body import Polygon, Sectors
@@ -51,6 +53,15 @@ FLOOR_SIGMA_RAD, FLOOR_SIGMA_PER_TURN = 0.001, 0.01
 """The same for the heading, in radians and per radian of turn."""
 
 
+class Tracker(StrEnum):
+    """How scans are matched."""
+
+    SURFELS = "surfels"
+    """Every scan, by Gauss-Newton on surfels."""
+    KARTO = "karto"
+    """As Karto: scans that moved on enough, by exhaustive search on a likelihood grid."""
+
+
 class KeyscanConfig(Settings):
     """Which scans become keyscans, and the size of submaps."""
 
@@ -82,6 +93,11 @@ class LidarConfig(Settings):
         default=(),
         description="corners [[x, y], ...] of the robot's body in base, as the parameter `footprint` of Nav2; returns "
         "within it are left out [m]",
+    )
+    tracker: Tracker = Field(
+        default=Tracker.SURFELS,
+        description="how scans are matched: `surfels`, every scan by Gauss-Newton; `karto`, as the paper's robots do, "
+        "each scan that may become a keyscan by exhaustive search on a grid",
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
@@ -129,7 +145,7 @@ class LidarFrontend:
         self.robot = robot
         self.config = config
         self.odometry = odometry
-        self._tracker = ScanTracker(odometry)
+        self._tracker = _tracker(config, odometry)
         self._lasers = Lasers()
         self._count = 0
         self._newest: MappedKeyscan | None = None
@@ -252,6 +268,13 @@ class LidarFrontend:
         )
         progress = float(np.hypot(motion[0], motion[1])) + TURN_AS_TRAVEL_M * abs(float(motion[2]))
         return constraint, self._newest.travel_m + progress
+
+
+def _tracker(config: LidarConfig, odometry: OdometryModel) -> ScanTracker:
+    if config.tracker is Tracker.SURFELS:
+        return ScanTracker(odometry)
+    gate = config.keyscans
+    return KartoTracker(odometry, gate.minimum_travel_distance_m, gate.minimum_travel_heading_rad)
 
 
 def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryModel) -> FloatArray:
