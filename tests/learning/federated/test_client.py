@@ -10,6 +10,7 @@ import pytest
 from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.learning.arrays import write_arrays  # noqa: E402
@@ -169,6 +170,19 @@ def test_frozen_statistics_stay_and_averaged_ones_move(folder, start, tmp_path):
     for normalisation, stay in (("frozen", True), ("averaged", False)):
         learned = robot(folder, tmp_path).train(start, 0, "run", settings(normalisation=normalisation))
         assert all(np.array_equal(learned.weights[name], start[name]) for name in statistics) is stay
+
+
+def test_private_layers_continue_from_the_robots_own_last_round(folder, start, tmp_path):
+    private = settings(private=["body.point_head"])
+    names = [name for name in start if name.startswith("body.point_head.")]
+    client = robot(folder, tmp_path)
+    first = client.train(start, 0, "run", private)
+    again = client.train(start, 1, "run", private)
+    assert names
+    assert not same({name: first.weights[name] for name in names}, start)
+    own = start | {name: first.weights[name] for name in names}
+    assert same(client.train(own, 1, "run", settings()).weights, again.weights)
+    assert not same(client.train(start, 1, "run", settings()).weights, again.weights)
 
 
 def test_robots_and_seeds_draw_differently():

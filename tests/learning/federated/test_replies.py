@@ -8,8 +8,11 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
+from fcslam.errors import TrainingError
+from fcslam.learning.federated.codec import record_to_weights, weights_to_record
 from fcslam.learning.federated.flower import Array, ArrayRecord, Error, Message, MessageType, MetricRecord
 from fcslam.learning.federated.history import ROUNDS_FILE, read_rows
+from fcslam.learning.federated.messages import ARRAYS_KEY
 from fcslam.learning.federated.replies import MAX_REASON_LENGTH, RoundReplies
 from tests.learning.federated.fakes import START, Fake, grid_of, run, settings, shifted
 
@@ -167,3 +170,37 @@ def test_statistics_that_were_to_stay_are_refused_where_they_moved(tmp_path):
     state, reports = run(robots, tmp_path, settings(normalisation="frozen"))
     assert all("were to stay" in report.left_out["bad"] for report in reports)
     assert np.array_equal(state.weights["a.running_var"], START["a.running_var"])
+
+
+def test_private_layers_are_in_no_reply_and_stay_as_they_are_on_the_server(tmp_path):
+    sent = []
+    grid = twisted_grid(
+        robots := [Fake("a"), Fake("b", 0.3), Fake("c", 0.2)],
+        MessageType.TRAIN,
+        lambda content: sent.append(record_to_weights(content[ARRAYS_KEY])),
+    )
+    state, reports = run(robots, tmp_path, settings(private=["b"]), grid)
+    assert [set(arrays) for arrays in sent] == [{"a.weight", "a.running_var"}] * 2
+    assert list(state.weights) == list(START)
+    assert np.array_equal(state.weights["b.weight"], START["b.weight"])
+    assert np.allclose(state.weights["a.weight"], shifted(START, 0.4)["a.weight"])
+    shared = sum(START[name].nbytes for name in ("a.weight", "a.running_var"))
+    _, whole = run(robots, tmp_path / "all")
+    assert [report.bytes_up < other.bytes_up for report, other in zip(reports, whole, strict=True)] == [True] * 2
+    assert reports[0].bytes_up >= 3 * shared
+
+
+def test_a_reply_with_private_layers_is_refused(tmp_path):
+    def add(content):
+        content[ARRAYS_KEY] = weights_to_record(START)
+
+    robots = [Fake("bad"), Fake("good")]
+    grid = twisted_grid(robots, MessageType.TRAIN, add)
+    _, reports = run(robots, tmp_path, settings(private=["b"]), grid)
+    assert all("other arrays than asked for (b.weight)" in report.left_out["bad"] for report in reports)
+
+
+@pytest.mark.parametrize(("private", "said"), [(["c"], "no layer c; it has a"), (["a", "b"], "no layer is left")])
+def test_private_layers_must_be_some_of_the_network(private, said, tmp_path):
+    with pytest.raises(TrainingError, match=said):
+        run([Fake("a")], tmp_path, settings(private=private))

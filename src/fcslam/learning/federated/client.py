@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from fcslam.learning.code_training import CodeInputs, train_codes
-from fcslam.learning.federated.client_state import legacy_weights, load_optimiser_state, save_optimiser_state
+from fcslam.learning.federated.client_state import legacy_weights, load_robot_state, save_robot_state
 from fcslam.learning.federated.evaluation import SCORE_METRICS
 from fcslam.learning.federated.held_out import HeldOutPairs, Judgement, judge
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network
 from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.learning.federated.weights import Weights
+from fcslam.learning.federated.weights import Weights, shared_weights
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
 from fcslam.learning.revisit_batches import RevisitExamples
@@ -31,6 +31,7 @@ class ClientUpdate(NamedTuple):
     """The result of a client's training in a round."""
 
     weights: dict[str, NDArray[np.float32]]
+    """Of all layers; those of private layers are not sent."""
     losses: dict[str, float]
     """Means over the steps."""
 
@@ -65,7 +66,9 @@ class RobotClient:
     folder: Path
     """Contains the images."""
     cache: Path
-    """Folder for what must survive a round: labels, the optimiser's state, and the weights of the legacy detector."""
+    """Folder for what must survive a round: labels, the optimiser's state, private layers, and the weights of the
+    legacy detector.
+    """
     device: str = "cpu"
     on_step: Callable[[str, int], None] = lambda _robot, _steps: None
     """Called with the name and the number of steps done in a round."""
@@ -96,6 +99,9 @@ class RobotClient:
                 or the cache cannot be used.
         """
         encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
+        moments, own = load_robot_state(self.cache, run_id, round_number)
+        shared = shared_weights(weights, settings.private)
+        weights = {name: shared[name] if name in shared else own.get(name, array) for name, array in weights.items()}
         start = weights_to_network(weights, encoder).state_dict()
         plan = LocalTrainingPlan(
             first_step=round_number * settings.local_steps,
@@ -108,7 +114,6 @@ class RobotClient:
         former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
         legacy = None if former is None else weights_to_network(former, encoder).state_dict()
         device, on_step = torch.device(self.device), partial(self.on_step, self.name)
-        moments = load_optimiser_state(self.cache, run_id, round_number)
         if settings.on_revisits:
             trained = train_codes(
                 start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
@@ -116,8 +121,10 @@ class RobotClient:
         else:
             images = self._labelled_images(weights, settings).train
             trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)
-        save_optimiser_state(self.cache, run_id, round_number, trained.optimiser_state)
-        return ClientUpdate(network_to_weights(trained.network), trained.losses)
+        found = network_to_weights(trained.network)
+        own = {name: array for name, array in found.items() if name not in shared}
+        save_robot_state(self.cache, run_id, round_number, trained.optimiser_state, own)
+        return ClientUpdate(found, trained.losses)
 
     def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
         """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out.

@@ -8,6 +8,7 @@ from fcslam.learning.federated.client import FederatedClient, JudgingClient
 from fcslam.learning.federated.codec import weights_to_record
 from fcslam.learning.federated.flower import ClientApp, Context, Error, InProcessGrid, Message
 from fcslam.learning.federated.messages import PAIRS_KEY, client_reply, read_request
+from fcslam.learning.federated.weights import shared_weights
 
 CLIENT_ERROR: Final = 1000
 """Code of an error that a client explains; Flower's own codes are smaller."""
@@ -41,7 +42,7 @@ def build_client_app(client: FederatedClient) -> ClientApp:
 def _train(message: Message, client: FederatedClient) -> Message:
     request = read_request(message.content)
     update = client.train(request.weights, request.round_number, request.run_id, request.settings)
-    arrays = weights_to_record(update.weights)
+    arrays = weights_to_record(shared_weights(update.weights, request.settings.private))
     return Message(client_reply(client.name, request.version, update.losses, arrays), reply_to=message)
 
 

@@ -1,4 +1,4 @@
-"""State of a robot from round to round: the weights of the legacy detector and the state of its optimiser.
+"""State of a robot from round to round: weights of the legacy detector, state of its optimiser, private layers.
 
 File names contain a checksum of the run's number and nothing else that a server sends. So no server can make a robot
 write outside its folder.
@@ -9,14 +9,20 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Final
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from fcslam.errors import TrainingError
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.federated.weights import Weights
 from fcslam.untrusted import read_arrays
+
+_PRIVATE: Final = "private/"
+"""Prefix of the private layers among the arrays of the optimiser."""
 
 
 def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights) -> Weights:
@@ -32,29 +38,39 @@ def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights
         return read_arrays(path)
 
 
-def load_optimiser_state(cache: Path, run_id: str, round_number: int) -> dict[str, Tensor] | None:
-    """The optimiser's state after the latest earlier round in which the robot trained; None if there is none.
+def load_robot_state(
+    cache: Path, run_id: str, round_number: int
+) -> tuple[dict[str, Tensor] | None, dict[str, NDArray[np.float32]]]:
+    """The optimiser's state and the private layers after the latest earlier round in which the robot trained.
+
+    Without such a round these are None and no layers.
 
     Raises:
         TrainingError: the file cannot be read.
     """
     earlier = [each for each in _saved_rounds(cache, run_id) if each < round_number]
     if not earlier:
-        return None
+        return None, {}
     path = _state_path(cache, run_id, max(earlier))
     with translate_errors(path, "the optimiser's state cannot be read"):
-        return {name: torch.from_numpy(array) for name, array in read_arrays(path).items()}
+        arrays = read_arrays(path)
+        moments = {name: torch.from_numpy(array) for name, array in arrays.items() if not name.startswith(_PRIVATE)}
+        own = {name.removeprefix(_PRIVATE): array for name, array in arrays.items() if name.startswith(_PRIVATE)}
+        return moments, own
 
 
-def save_optimiser_state(cache: Path, run_id: str, round_number: int, state: Mapping[str, Tensor]) -> None:
-    """Save the state after a round, and keep the one before: a server that was killed may repeat the round.
+def save_robot_state(cache: Path, run_id: str, round_number: int, moments: Mapping[str, Tensor], own: Weights) -> None:
+    """Save the optimiser's state and the private layers after a round, and keep those of the round before.
+
+    A server that was killed may repeat the round.
 
     Raises:
         TrainingError: the file cannot be written.
     """
     path = _state_path(cache, run_id, round_number)
     with translate_errors(path, "the optimiser's state cannot be kept"):
-        write_arrays(path, {name: value.cpu().numpy() for name, value in state.items()})
+        kept = {f"{_PRIVATE}{name}": array for name, array in own.items()}
+        write_arrays(path, {name: value.cpu().numpy() for name, value in moments.items()} | kept)
         before = [each for each in _saved_rounds(cache, run_id) if each < round_number]
         for each in _saved_rounds(cache, run_id):
             if each != round_number and each != max(before, default=None):

@@ -42,7 +42,7 @@ from fcslam.learning.federated.replies import RoundReplies, printable_line, read
 from fcslam.learning.federated.screening import screen, update_length
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.strategies import Aggregator, StrategyFactory
-from fcslam.learning.federated.weights import Weights, interpolate_weights
+from fcslam.learning.federated.weights import Weights, check_private, interpolate_weights, shared_weights
 from fcslam.learning.training_step import learning_rate
 
 _Answer = TypeVar("_Answer")
@@ -89,6 +89,7 @@ class Coordinator:
     def __init__(
         self, grid: RobotGrid, settings: FederatedSettings, initial: Weights, folder: Path, hooks: CoordinatorHooks
     ) -> None:
+        check_private(initial, settings.private)
         self._grid, self._settings, self._folder, self._hooks = grid, settings, folder, hooks
         self._initial = self._model(initial)
         self._run_id = run_id(settings, self._initial.version)
@@ -136,7 +137,7 @@ class Coordinator:
         comparison = self._evaluate(candidate, state, replies)
         decision = self._decide(comparison, state)
 
-        length = update_length(replies.weights, sent.weights)
+        length = update_length(replies.weights, self._shared(sent.weights))
         following = self._next_state(trained, weights, candidate.weights, comparison, decision, length)
         report = RoundReport(
             round_number=following.rounds_done,
@@ -180,7 +181,8 @@ class Coordinator:
         messages = self._grid.send_and_receive(requests, timeout=self._settings.deadline_s)
         replies = read_replies(messages, {connected[robot]: robot for robot in chosen}, model)
         frozen = self._settings.normalisation == "frozen"
-        refused = screen(replies.weights, model.weights, self._settings.screening, frozen, state.update_length)
+        sent = self._shared(model.weights)
+        refused = screen(replies.weights, sent, self._settings.screening, frozen, state.update_length)
         for robot, reason in refused.items():
             replies.leave_out(robot, reason)
         return replies, state
@@ -188,7 +190,12 @@ class Coordinator:
     def _aggregate(self, replies: RoundReplies, state: CoordinatorState) -> Weights:
         """The next weights. Updates are added in the order of the robots' names, as sums of floats depend on it."""
         updates = [(replies.messages[robot], replies.weights[robot]) for robot in sorted(replies.weights)]
-        return self._aggregator.aggregate(state.rounds_done + 1, updates, state.weights)
+        shared = self._aggregator.aggregate(state.rounds_done + 1, updates, self._shared(state.weights))
+        return {**state.weights, **shared}
+
+    def _shared(self, weights: Weights) -> Weights:
+        """The weights that robots send back."""
+        return shared_weights(weights, self._settings.private)
 
     def _average(self, weights: Weights, state: CoordinatorState) -> Weights:
         """The moving average of the rounds' weights, which is evaluated and released.

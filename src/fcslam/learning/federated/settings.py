@@ -95,6 +95,11 @@ class FederatedSettings(Settings):
         description="layers that robots train: all; or codes, those of the descriptors alone, so that keypoints stay "
         "as they are, on what a robot saw again, which needs frozen batch statistics",
     )
+    private: tuple[str, ...] = Field(
+        default=(),
+        description="layers that each robot trains for itself and never sends, such as body.point_head; the server "
+        "keeps their initial values",
+    )
     collapse: float = Field(
         default=0.15,
         gt=0.0,

@@ -5,6 +5,8 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.errors import TrainingError
+
 Weights = Mapping[str, NDArray[np.float32]]
 """Arrays by their names in the network, in the network's order; integer counters are left out."""
 FloatVector = NDArray[np.float64]
@@ -17,6 +19,29 @@ STATISTICS = (MEAN, VARIANCE)
 def trained_names(weights: Weights, frozen_statistics: bool) -> list[str]:
     """Names of the arrays that training changes: all, or all but the batch statistics if these are frozen."""
     return [name for name in weights if not (frozen_statistics and name.endswith(STATISTICS))]
+
+
+def shared_weights(weights: Weights, private: Collection[str]) -> dict[str, NDArray[np.float32]]:
+    """The weights without those of the private layers, which are named as in the settings."""
+    return {name: array for name, array in weights.items() if not _belongs(name, private)}
+
+
+def check_private(weights: Weights, private: Collection[str]) -> None:
+    """Check that each private layer is one of the network, and that others are left to share.
+
+    Raises:
+        TrainingError: it is not so.
+    """
+    for layer in private:
+        if not any(_belongs(name, [layer]) for name in weights):
+            layers = sorted({".".join(name.split(".")[:2]) for name in weights})
+            raise TrainingError(f"private: the network has no layer {layer}; it has {', '.join(layers)}")
+    if not shared_weights(weights, private):
+        raise TrainingError("private: no layer is left that robots share; name fewer layers")
+
+
+def _belongs(name: str, layers: Collection[str]) -> bool:
+    return any(name == layer or name.startswith(f"{layer}.") for layer in layers)
 
 
 def update_vector(new: Weights, old: Weights, names: Collection[str]) -> FloatVector:
