@@ -189,6 +189,7 @@ def test_a_clock_that_steps_back_once_is_kept_from_there(tmp_path):
     frontend = RobotFrontend("robot", RobotConfig())
     for record in scans:
         frontend.process(record)
+    frontend.finish()
     assert [len(track.stamps) for track in frontend.tracks] == [60, 51]
 
 

@@ -63,9 +63,6 @@ LEAST_GAP_M = 12.0
 SIGHT_M = 8.0
 """Largest distance between the anchors of two submaps that are compared, besides the drift allowance; farther ones
 overlap too little, metres."""
-SIGHT_SHARE = 2.0
-"""The same as a share of the median distance between the surfaces of the later submap and its anchor, if that is more:
-in a yard, robots see the same walls from farther apart."""
 MOST_CANDIDATES = 4
 """Largest number of earlier visits that a submap is compared with."""
 DRIFT_RAD_M = 0.006
@@ -233,7 +230,7 @@ class LoopCloser:
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
         drift = self._drift_allowance(paths)[:, 0]
-        near = (travel[later] - travel > LEAST_GAP_M) & (distance < _sight_m(self._held[later]) + drift)
+        near = (travel[later] - travel > LEAST_GAP_M) & (distance < SIGHT_M + drift)
         indices = np.flatnonzero(near & self._is_held())
         if not len(indices):
             return []
@@ -367,12 +364,6 @@ class LoopCloser:
             np.hypot(residual[0], residual[1]) < LOOP_M + LOOP_PER_M * path_m
             and abs(residual[2]) < LOOP_RAD + LOOP_RAD_PER_M * path_m
         )
-
-
-def _sight_m(submap: Submap) -> float:
-    """Largest distance to the anchor of a submap that this one is compared with, besides the drift allowance."""
-    points = submap.surface.points
-    return max(SIGHT_M, SIGHT_SHARE * float(np.median(np.hypot(*points.T)))) if len(points) else SIGHT_M
 
 
 @njit

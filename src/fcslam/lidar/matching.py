@@ -21,7 +21,8 @@ NO_NORMAL_WEIGHT: Final = 0.5
 NEW_MOTION: Final = 1000
 """A surface is new until the robot has moved by so much since it was first seen, in mm, turns in mrad."""
 MOST_NEW: Final = 2.0
-"""Points on new surfaces count together as much as so many times the points on older ones, at most."""
+"""Points on new surfaces count together as much as so many times the points on older ones, at most, where that leaves
+each the least weight."""
 LEAST_NEW_WEIGHT: Final = 0.3
 """Least weight of a point on a new surface, as where hardly anything else is seen and odometry may slip."""
 ALONG_LIMIT2: Final = 9.0
