@@ -18,7 +18,7 @@ IDENTITY.setflags(write=False)
 
 
 def wrap_angle(angle_rad: ArrayLike) -> Any:
-    """Angle in [-pi, pi), the same direction as ``angle_rad``; shape kept."""
+    """Angle in [-pi, pi], the same direction as ``angle_rad``; shape kept."""
     return (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
 
 

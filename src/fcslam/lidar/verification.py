@@ -93,8 +93,8 @@ class Verification:
     information: FloatArray
     """Information of T_a_b in the tangent space at T_a_b (coordinates of b), shape (3, 3)."""
     worse: Agreement
-    """The worse of both directions in each measure; of the overlap the better one, as a small submap may lie within a
-    large one."""
+    """The direction whose explained share less violation is lower, with the worse violation and count of both, and the
+    better overlap: a small submap may lie within a large one."""
     strict: bool
     loose: bool
     partial: bool

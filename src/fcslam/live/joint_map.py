@@ -39,7 +39,12 @@ class _DrawnKeyscan(NamedTuple):
 
 
 _MADE_UP = (
-    LaserScan(0.0, frozen(np.ones(4), np.float32), LaserModel(4, -np.pi, 0.5 * np.pi, 2.0), se2.IDENTITY),
+    LaserScan(
+        stamp=0.0,
+        ranges_m=frozen(np.ones(4), np.float32),
+        laser=LaserModel(4, -np.pi, 0.5 * np.pi, 2.0),
+        T_odom_base=se2.IDENTITY,
+    ),
     se2.IDENTITY,
     se2.IDENTITY,
     np.zeros((1, 3)),
