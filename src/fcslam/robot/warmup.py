@@ -10,7 +10,7 @@ from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.lost import FEWEST_SCANS, is_lost
 from fcslam.records import FloatArray, LaserModel, LaserScan, Ranges, Sweep, frozen
 from fcslam.robot.frontend import RobotConfig
-from fcslam.wire.quantisation import dequantise, quantise
+from fcslam.wire.quantisation import rounded
 
 MADE_UP_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
 _WALLS = np.array(
@@ -71,7 +71,7 @@ def made_up_ranges(pose: FloatArray, walls: FloatArray = _WALLS) -> Ranges:
         facing = _cross(beams, along)
         distance, share = _cross(starts, along) / facing, _cross(starts, beams) / facing
     hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
-    return dequantise(quantise(np.where(hit, distance, np.inf).min(axis=1)))
+    return rounded(np.where(hit, distance, np.inf).min(axis=1), MADE_UP_LASER.max_range_m)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
