@@ -141,12 +141,12 @@ def cloud_page() -> str:
 
 def robot_page() -> str:
     """The settings of the robots, without those of LiDAR SLAM."""
-    return "\n".join([ROBOT, *tables(MissionConfig().robot, "robot.", documented=(LidarConfig,))])
+    return "\n".join([ROBOT, *tables(MissionConfig().robot, "robot.", documented=(LidarConfig,), heading="##")])
 
 
 def lidar_page() -> str:
     """The settings of LiDAR SLAM on a robot."""
-    return "\n".join([LIDAR, *tables(MissionConfig().robot.lidar, "robot.lidar.")])
+    return "\n".join([LIDAR, *tables(MissionConfig().robot.lidar, "robot.lidar.", heading="##")])
 
 
 def training_page() -> str:
@@ -173,7 +173,9 @@ PAGES: dict[Path, Callable[[], str]] = {
 }
 
 
-def tables(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> Iterator[str]:
+def tables(
+    settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = (), heading: str = "###"
+) -> Iterator[str]:
     """One table of the plain keys of ``settings``, and after it those of the settings nested in it."""
     rows, nested = [], []
     for key, field in type(settings).model_fields.items():
@@ -185,8 +187,8 @@ def tables(settings: Settings, path: str = "", documented: tuple[type[Settings],
     if rows:
         yield "\n".join(["| key | default | unit | allowed | effect |", "|---|---|---|---|---|", *rows, ""])
     for key, field, value in nested:
-        yield f"### `{path}{key}`\n\n{sentence(field.description)}\n"
-        yield from tables(value, f"{path}{key}.", documented)
+        yield f"{heading} `{path}{key}`\n\n{sentence(field.description)}\n"
+        yield from tables(value, f"{path}{key}.", documented, heading)
 
 
 def row(path: str, field: FieldInfo, value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: files that pages link to, and the sources of the figures on the pages of results.
+"""Hooks of MkDocs: files that pages link to, the sources of the figures on the pages of results, and breaks in code.
 
 Pages and pictures outside of ``docs/`` that a page links to become part of the site.
 
@@ -19,6 +19,9 @@ ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"(?<=\]\()([^)\s#]+)(?=[)#])")
 FOLDER = "files"
 SCRIPT = re.compile(r"python (benchmarks/\w+\.py)")
+INLINE = re.compile(r"(?<!<pre>)(?<!</span>)<code>[^<]*</code>")
+WORD = re.compile(r"(?<![^\s>])[^\s<>]+")
+LONGEST_WORD = 20
 COMMIT = re.compile(r"\(([0-9a-f]{7,})")
 
 
@@ -76,3 +79,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     if page.file.src_uri.startswith(f"{FOLDER}/"):
         return markdown  # as in the repository: its folders are below FOLDER
     return LINK.sub(rewritten, with_reports(markdown, page.file.src_uri))
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
+    """Let code in the text break where a reader expects it."""
+    return INLINE.sub(lambda code: WORD.sub(breakable, code[0].replace("\\|", "|")), html)
+
+
+def breakable(word: re.Match[str]) -> str:
+    """A word of code in HTML: left alone, a browser breaks ``--option`` behind its hyphens, and a long path nowhere."""
+    if len(word[0]) > LONGEST_WORD and not word[0].startswith("-"):
+        return re.sub(r"[/_.](?=\w)", r"\g<0><wbr>", word[0])
+    return f'<span class="word">{word[0]}</span>' if "-" in word[0] else word[0]

@@ -147,7 +147,7 @@ def localize(
 
     Returns:
         A run whose trajectory holds the poses that the robot believed; ``localized`` has every scan with standard
-        deviations and quality.
+            deviations and quality.
 
     Raises:
         InputError: the recording, the map, the configuration or the output folder cannot be used.

@@ -165,10 +165,11 @@ function besideEachOther({ map, beside }) {
 // ---- Evidence ----
 
 const residual = (c) => { if (c.map === null) return null; const [dx, dy, angle] = between(c.T_i_j, between(...c.ends)); return [Math.hypot(dx, dy), Math.abs(angle)]; };
+const offBy = (length) => (length < 0.001 ? "under 1 mm" : length < 0.1 ? `${(1000 * length).toFixed(0)} mm` : metres(length));
 const time = (stamp) => moment(stamp, firstStamp());
 const COLUMNS = [
   ["Robot", (c) => c.robot_i], ["and robot", (c) => c.robot_j], ["First seen", (c) => Math.min(c.stamp_i, c.stamp_j), time], ["Again", (c) => Math.max(c.stamp_i, c.stamp_j), time],
-  ["Seen by", sensorOf], ["Off by", (c) => residual(c)?.[0] ?? Infinity, (value) => (value === Infinity ? "two maps" : value < 0.001 ? "under 1 mm" : value < 0.1 ? `${(1000 * value).toFixed(0)} mm` : metres(value))],
+  ["Seen by", sensorOf], ["Off by", (c) => residual(c)?.[0] ?? Infinity, (value) => (value === Infinity ? "two maps" : offBy(value))],
 ];
 let sorting = { column: 3, down: true }, listedNow = [];
 export async function showEvidence() {
@@ -214,7 +215,7 @@ function supporting(c) {
 function showClosure() {
   const c = chart.closure, rows = [["Decision", decisionOf(c)], ["Why", c.explanation], ["When", `${time(c.stamp_i)} and ${time(c.stamp_j)}`], ["Stamps", `${c.stamp_i.toFixed(2)} s and ${c.stamp_j.toFixed(2)} s`]], off = residual(c);
   if (!off) rows.push(["Off by", "its ends are on two maps"]);
-  else rows.push(["Off by", `${(1000 * off[0]).toFixed(0)} mm and ${(Math.abs(turned(off[1])) * 180 / Math.PI).toFixed(1)}° from the map`], ["Supported", `by ${count(supporting(c), "pair")} within ${NEAR_M} m`]);
+  else rows.push(["Off by", `${offBy(off[0])} and ${(Math.abs(turned(off[1])) * 180 / Math.PI).toFixed(1)}° from the map`], ["Supported", `by ${count(supporting(c), "pair")} within ${NEAR_M} m`]);
   if (c.similarity > 0.0005) rows.push(["Looks alike", `${(100 * c.similarity).toFixed(0)} % of the features`]);
   fill(at("sides"), [c.robot_i, c.robot_j, colourOf(c.robot_i), colourOf(c.robot_j)], () => c.robot_i === c.robot_j ? [swatch(colourOf(c.robot_i)), `${c.robot_i}, earlier and later`] : [swatch(colourOf(c.robot_i)), c.robot_i, " laid on ", swatch(colourOf(c.robot_j)), c.robot_j]);
   at("facts-of-closure").replaceChildren(...rows.map((cells) => row(...cells)));
