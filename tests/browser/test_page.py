@@ -458,6 +458,20 @@ def test_a_token_that_expires_is_asked_for_again_and_nothing_is_lost(page, packe
         assert page.get_by_role("button", name="robot_1").get_attribute("aria-pressed") == "true"
 
 
+def covered_controls(page):
+    """The buttons of the map that a finger cannot reach, while many messages wait for the map."""
+    return page.evaluate(
+        """() => {
+            document.getElementById("age").textContent = "Map drawn 12 min ago; 12,345 messages not in it yet. ";
+            return [...document.querySelectorAll("#controls button, #layers summary")].filter((button) => {
+                const { left, top, width, height } = button.getBoundingClientRect();
+                return width && [0.1, 0.9].some((y) => !button.contains(
+                    document.elementFromPoint(left + width / 2, top + y * height)));
+            }).map((button) => button.textContent);
+        }"""
+    )
+
+
 def test_the_page_fits_a_phone(browser, mapped):
     with closing(browser.new_page(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)) as phone:
         phone.goto(mapped.url)
@@ -465,6 +479,9 @@ def test_the_page_fits_a_phone(browser, mapped):
         for name in ("evidence", "edits", "files", "map"):
             view(phone, name)
             assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+        for name in ("fleet", "map"):
+            view(phone, name)
+            assert covered_controls(phone) == []
         box = phone.locator("#map").bounding_box()
         assert box["width"] == 390
         assert box["height"] > 300

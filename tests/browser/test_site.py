@@ -18,6 +18,10 @@ pytest.importorskip("mkdocstrings_handlers.python", reason="no mkdocstrings: mak
 ROOT = Path(__file__).parents[2]
 PAGES = ("index", "start/first-map", "concepts/places", "troubleshooting", "reference/commands", "results/mapping")
 
+CUT_WORDS = """() => [...document.querySelectorAll("article code .word")]
+    .filter((word) => word.getClientRects().length > 1).map((word) => word.textContent)"""
+"""Options of which a part stands on the next line."""
+
 
 class Quiet(SimpleHTTPRequestHandler):
     def log_message(self, *arguments):
@@ -48,6 +52,7 @@ def test_pages_fit_and_ask_no_other_host(site, browser, width, height):
         page.goto(f"{site}/{name}.html")
         assert page.locator("h1").is_visible()
         assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+        assert page.evaluate(CUT_WORDS) == [], name
     assert [url for url in asked if not url.startswith(site)] == []
     assert errors == []
     page.close()
@@ -59,4 +64,12 @@ def test_search_finds_a_setting(site, browser):
     page.fill("input.md-search__input", "minimum_evidence")
     page.locator(".md-search-result__item").first.wait_for(timeout=30_000)
     assert "Settings" in page.locator(".md-search-result__list").inner_text()
+    page.close()
+
+
+def test_tables_of_commands_show_a_choice_as_it_is_typed(site, browser):
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto(f"{site}/reference/commands.html")
+    names = page.locator("td:first-child > code").all_inner_texts()
+    assert "-c, --config FILE|KEY=VALUE" in names
     page.close()
