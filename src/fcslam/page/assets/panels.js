@@ -217,7 +217,7 @@ function showClosure() {
   if (!off) rows.push(["Off by", "its ends are on two maps"]);
   else rows.push(["Off by", `${offBy(off[0])} and ${(Math.abs(turned(off[1])) * 180 / Math.PI).toFixed(1)}° from the map`], ["Supported", `by ${count(supporting(c), "pair")} within ${NEAR_M} m`]);
   if (c.similarity > 0.0005) rows.push(["Looks alike", `${(100 * c.similarity).toFixed(0)} % of the features`]);
-  fill(at("sides"), [c.robot_i, c.robot_j, colourOf(c.robot_i), colourOf(c.robot_j)], () => c.robot_i === c.robot_j ? [swatch(colourOf(c.robot_i)), `${c.robot_i}, earlier and later`] : [swatch(colourOf(c.robot_i)), c.robot_i, " laid on ", swatch(colourOf(c.robot_j)), c.robot_j]);
+  fill(at("sides"), [c.robot_i, c.robot_j, colourOf(c.robot_i), colourOf(c.robot_j)], () => c.robot_i === c.robot_j ? [swatch(colourOf(c.robot_i)), `${c.robot_i}, earlier and later`] : [swatch(colourOf(c.robot_i)), c.robot_i, " and ", swatch(colourOf(c.robot_j)), c.robot_j]);
   at("facts-of-closure").replaceChildren(...rows.map((cells) => row(...cells)));
   at("closure").hidden = false;
   mark();
