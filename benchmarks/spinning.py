@@ -9,12 +9,8 @@ error is that of the positions at all scans after a rigid alignment.
 
 Three logs of the SLAM benchmark are mapped without their odometry. Errors follow Kuemmerle et al. 2009 over all
 relations.
-
-What the correction costs is the CPU time of front and back end for a scan, spinning against all beams at once: the
-same drive, beams, rate and noise, runs in turn in one process.
 """
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -34,18 +30,14 @@ from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSett
 from fcslam.metrics.relations import read_relations, relation_errors
 from fcslam.metrics.trajectory import PositionErrors, align, position_errors
 from fcslam.mission.mission import MissionConfig, run_mission
-from fcslam.records import LaserScan, SensorRecord, frozen
+from fcslam.records import LaserScan, frozen
 from fcslam.robot.calibrating import calibrated
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import Source, open_source
 from fcslam.sources.bags.writer import write_bag
 
-RUNS = 5
 SLOW_RAD_S, FAST_RAD_S = 0.9, 2.0
 COLUMNS = {"scanner": "", "turn rate, rad/s": ".1f", "odometry": "", "seed": "", "scans": "", "ATE (RMSE), m": ".4f",
            "max, m": ".3f"}  # fmt: skip
-COST_COLUMNS = {"scanner": "", "turn rate, rad/s": ".1f", "seed": "", "at once, ms a scan": ".3f",
-                "corrected, ms a scan": ".3f", "ratio": ".3f"}  # fmt: skip
 LOG_COLUMNS = {"log": "", "relations": "", "mean, m": ".4f", "max, m": ".3f", "mean, deg": ".3f"}
 
 
@@ -58,7 +50,6 @@ def main() -> None:
     folder = common.recordings(*common.slam_benchmark_files()) if chosen.logs else None
     report = common.Report(__file__, __doc__, chosen)
     report.table("Simulated scanners", COLUMNS, list(simulate(chosen.seeds, chosen.path_length)))
-    report.table("CPU time of the correction", COST_COLUMNS, list(correction_costs(chosen.seeds, chosen.path_length)))
     if chosen.logs:
         report.table("Logs without their odometry", LOG_COLUMNS, [without_odometry(folder, log) for log in chosen.logs])
     report.write()
@@ -75,28 +66,6 @@ def simulate(seeds: Sequence[int], path_m: float) -> Iterator[tuple[object, ...]
         found, truth = run.trajectories[robot.name], robot.T_building_base
         errors = PositionErrors.of(position_errors(align(truth, found.T_map_base), truth, found.T_map_base))
         yield scanner, turn_rate, kind, seed, len(truth), errors.rmse_m, errors.max_m
-
-
-def correction_costs(seeds: Sequence[int], path_m: float) -> Iterator[tuple[object, ...]]:
-    """CPU time of a scan, median of runs in turn, and the median ratio of the two runs of a turn."""
-    spinning = SCANNERS[Scanner.LD19]
-    for turn_rate, seed in product((SLOW_RAD_S, FAST_RAD_S), seeds):
-        arms = []
-        for lidar in (spinning.model_copy(update={"spin": 0}), spinning):
-            with recorded(drive(lidar, turn_rate, OdometryKind.GOOD, seed, path_m)) as source:
-                arms.append(list(source.records()))
-        times_ms = np.array([[cpu_of_scan_ms(records) for records in arms] for _ in range(1 + RUNS)])[1:]
-        at_once, corrected = np.median(times_ms, axis=0)
-        yield Scanner.LD19, turn_rate, seed, at_once, corrected, float(np.median(times_ms[:, 1] / times_ms[:, 0]))
-
-
-def cpu_of_scan_ms(records: Sequence[SensorRecord]) -> float:
-    frontend = RobotFrontend("robot", RobotConfig())
-    began = time.process_time()
-    for record in records:
-        frontend.process(record)
-    frontend.finish()
-    return 1e3 * (time.process_time() - began) / sum(isinstance(record, LaserScan) for record in records)
 
 
 def drive(lidar: LidarSettings, turn_rate: float, kind: OdometryKind, seed: int, path_m: float) -> SimulatedRobot:
