@@ -170,6 +170,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file(tmp_path):
         ({"recordings": ["LOG", "LOG"]}, fcslam.SourceError, "robot_1"),
         ({"recordings": ["LOG", "TWIN"], "split": 2}, fcslam.SourceError, "cuts one recording"),
         ({"split": 0}, fcslam.SourceError, "0 parts"),
+        ({"processes": 0}, fcslam.InputError, "give 1 or more"),
         ({"config": {"seed": -1}}, fcslam.ConfigError, "seed"),
         ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
         ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),

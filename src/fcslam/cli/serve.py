@@ -109,7 +109,7 @@ def serve(
     keep_memory_trimmed()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
-        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
+        authenticator, given = _authenticator(tokens, client_ca), mission_config(config).cloud
         if store is None:
             state = _state(data, authenticator, given, chosen)
         else:
@@ -220,10 +220,3 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", wo
     )
     audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, data / "learning")
-
-
-def _cloud_config(chosen: list[str] | None) -> "CloudConfig":
-    from fcslam.cloud.settings import CloudConfig
-
-    config = mission_config(chosen)
-    return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)
