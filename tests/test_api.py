@@ -193,6 +193,15 @@ def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, 
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("pose", "said"), [((1.0, 2.0), "give (x, y, theta)"), ((1e3, 0.0, 0.0), "is outside of the map")]
+)
+def test_a_start_that_no_map_has_is_refused_before_the_work(pose, said, logs, opened):
+    with pytest.raises(fcslam.InputError, match=re.escape(said)) as raised:
+        fcslam.localize(logs[0], opened.maps[0], initial_pose=pose, progress=lambda _: pytest.fail("worked"))
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize("place", ["nowhere", "."])
 def test_a_folder_that_holds_no_run_is_refused(place, tmp_path):
     with pytest.raises(fcslam.InputError, match="no run folder") as raised:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from numpy.typing import ArrayLike
+
 from fcslam import sources
 from fcslam.anchoring.anchors import Anchors
 from fcslam.config import load, parse
@@ -22,7 +24,7 @@ from fcslam.mission.mission import (
     run_mission,
 )
 from fcslam.mission.mission_file import EMPTY, SavedMission, read_mission
-from fcslam.records import FloatArray, Veto, frozen
+from fcslam.records import Veto
 from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
@@ -119,11 +121,11 @@ def localize(
     recording: StrPath | Source,
     map: StrPath | OccupancyMap,  # the word that users expect
     *,
-    initial_pose: tuple[float, float, float] | None = None,
+    initial_pose: ArrayLike | None = None,
     config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
     output: StrPath | None = None,
     bag_options: BagOptions | None = None,
-    progress: "Callable[[LocalizationProgress], None]" = lambda _: None,
+    progress: "Callable[[LocalizationProgress], None] | None" = None,
     force: bool = False,
     floor: str = "",
     update: bool = False,
@@ -150,9 +152,13 @@ def localize(
         deviations and quality.
 
     Raises:
-        InputError: the recording, the map, the configuration or the output folder cannot be used.
+        InputError: the recording, the map, the initial pose, the configuration or the output folder cannot be used.
     """
-    from fcslam.mission.localization import read_map, run_localization  # SciPy's images: mapping alone needs none
+    from fcslam.mission.localization import (  # SciPy's images: mapping alone needs none
+        pose_in_map,
+        read_map,
+        run_localization,
+    )
 
     if output is not None:
         prepare_output(Path(output), force)
@@ -160,8 +166,8 @@ def localize(
     occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
     if isinstance(recording, str | os.PathLike):
         recording = _checked(sources.open_source(Path(recording), bag_options))
-    initial: FloatArray | None = None if initial_pose is None else frozen(initial_pose)
-    run = run_localization(recording, occupancy, settings, initial, progress, update)
+    initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, occupancy)
+    run = run_localization(recording, occupancy, settings, initial, progress or (lambda _: None), update)
     if output is not None:
         run.save(output, force)
     return run

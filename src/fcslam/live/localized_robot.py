@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 from fcslam.api import StrPath, settings_of
 from fcslam.errors import InputError
 from fcslam.geometry import se2
-from fcslam.live.inputs import Lasers, checked_pose
+from fcslam.live.inputs import Lasers
 from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
-from fcslam.mission.localization import LocalizedDrive, read_map
+from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
@@ -83,7 +83,7 @@ class LocalizedRobot(LiveTracker):
         """
         super().__init__(name, laser, settings_of(config), on_event)
         self._map = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
-        initial = None if initial_pose is None else self._checked("initial_pose", initial_pose)
+        initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, self._map)
         self._drive = LocalizedDrive()
         self._was_localized = False
         robot = self._config.robot
@@ -112,7 +112,7 @@ class LocalizedRobot(LiveTracker):
         Raises:
             InputError: it is not a pose, or outside of the map.
         """
-        T_map_base = self._checked("pose", pose)
+        T_map_base = pose_in_map("pose", pose, self._map)
         with self._lock:
             newest = self._frontend.newest
             here = np.zeros(3) if newest is None else self._frontend.scan_poses.in_odom(newest.pose)
@@ -184,18 +184,6 @@ class LocalizedRobot(LiveTracker):
             run = self._drive.run(self.name, self._map, self._config, state.fixes, state.losses)
         run.save(folder, force)
         return run
-
-    def _checked(self, name: str, given: ArrayLike) -> FloatArray:
-        """A pose within the map, shape (3,)."""
-        pose = checked_pose(name, given)
-        low = np.array(self._map.origin_xy)
-        high = low + self._map.resolution_m * np.array(self._map.cells.shape[::-1])
-        if not ((low <= pose[:2]) & (pose[:2] <= high)).all():
-            raise InputError(
-                f"{name}: ({pose[0]:.6g} m, {pose[1]:.6g} m) is outside of the map, which extends from "
-                f"({low[0]:.1f} m, {low[1]:.1f} m) to ({high[0]:.1f} m, {high[1]:.1f} m)"
-            )
-        return pose
 
     def _estimate(self) -> MapEstimate | None:
         """Where the present session's ``odom`` lies in the map."""

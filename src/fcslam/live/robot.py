@@ -25,7 +25,6 @@ from fcslam.live.inputs import (
     Lasers,
     checked_camera,
     checked_image,
-    checked_pose,
     checked_stamp,
 )
 from fcslam.live.joint_map import JointMap
@@ -42,6 +41,7 @@ from fcslam.records import (
     Keyscan,
     LaserScan,
     SensorRecord,
+    checked_pose,
     frozen,
 )
 from fcslam.robot.backend_runner import WorkerBackend
