@@ -24,7 +24,7 @@ from fcslam.mission.mission import (
     run_mission,
 )
 from fcslam.mission.mission_file import EMPTY, SavedMission, read_mission
-from fcslam.records import Veto
+from fcslam.records import StrPath, Veto
 from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from fcslam.maps.changes import Changes
     from fcslam.mission.localization import LocalizationProgress
 
-StrPath = str | os.PathLike[str]
 Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
 
 _log = logging.getLogger(__name__)

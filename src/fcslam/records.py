@@ -4,6 +4,7 @@ Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b 
 REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
 """
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fcslam.errors import InputError
+
+StrPath = str | os.PathLike[str]
 
 FloatArray = NDArray[np.float64]
 Ranges = NDArray[np.float32]

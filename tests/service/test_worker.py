@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from fcslam.cloud import report
-from fcslam.cloud.settings import CloudConfig
 from fcslam.maps.certificate import certify
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket

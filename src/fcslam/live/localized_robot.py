@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fcslam.api import StrPath, settings_of
+from fcslam.api import settings_of
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.live.inputs import Lasers
@@ -21,10 +21,9 @@ from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotSt
 from fcslam.live.tracker import LiveTracker
 from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray, StrPath, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate
-from fcslam.robot.outbox import WaitingPackets
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.robot.worker_localizer import WorkerLocalizer
 from fcslam.runs import RobotTrajectory, Run, prepare_output
@@ -119,24 +118,16 @@ class LocalizedRobot(LiveTracker):
             self._localizer.suggest(se2.compose(T_map_base, se2.inverse(here)))
 
     def status(self) -> RobotStatus:
-        """Return the state of the robot: its pose, its connection, and counts since its start."""
+        """Return the state of the robot: whether it knows its pose, and counts since its start."""
         estimate, failure = self._estimate(), self._frontend.backend_failure
         broken = f"not localised any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
             scans=self._scans,
             keyscans=self._localizer.keyscans,
-            waiting=WaitingPackets(0, 0),
-            confirmed=0,
-            sent_bytes=0,
-            left_out=0,
-            refused=0,
             map_index=0,
-            correction_age_s=None,
             times_lost=self._localizer.state.losses,
             quality=0.0 if estimate is None else estimate.quality,
-            trouble=None,
-            catching_up=False,
             notices=tuple(filter(None, (broken, jumps))),
             is_localized=estimate is not None,
         )
