@@ -23,7 +23,7 @@ from fcslam.mission.mission import (
     continued_config,
     run_mission,
 )
-from fcslam.mission.mission_file import EMPTY, SavedMission, read_mission
+from fcslam.mission.mission_file import EMPTY, read_mission
 from fcslam.records import StrPath, Veto
 from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
@@ -49,7 +49,7 @@ def map_recordings(
     progress: Watch | None = None,
     force: bool = False,
     processes: int = 1,
-    onto: StrPath | SavedMission | None = None,
+    onto: StrPath | None = None,
     floors: str | Mapping[str, str] = "",
     anchors: Anchors = Anchors(),  # noqa: B008
 ) -> Run:
@@ -77,7 +77,7 @@ def map_recordings(
             the cloud. Without recordings it is mapped again, with the edits that it has.
         floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
             floors are never compared, so each floor has maps of its own.
-        anchors: what is known about the building, such as its floor plan.
+        anchors: what is known about the building, such as its floor plan, from ``read_anchors``.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -85,7 +85,7 @@ def map_recordings(
     """
     if output is not None:
         prepare_output(Path(output), force)
-    earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto or EMPTY
+    earlier = EMPTY if onto is None else read_mission(Path(onto))
     settings = settings_of(continued_config(earlier) if config is None else config)
     opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
