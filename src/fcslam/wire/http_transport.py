@@ -342,13 +342,14 @@ def _check_url(url: str, token: str | None, own: tuple[StrPath, StrPath] | None)
         is_address = False
     if not is_address or not parts.hostname:
         raise CloudError(f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443")
-    if token and parts.scheme == "http" and not _is_loopback(parts.hostname):
+    if token and parts.scheme == "http" and not is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be sent unencrypted; use https")
     if own and parts.scheme == "http":
         raise CloudError(f"{url}: certificates need https")
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a host."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
