@@ -9,28 +9,27 @@ from collections.abc import Iterator
 import numpy as np
 
 import fcslam
-from fcslam.records import LaserScan
-from fcslam.sources import WHOLE, Faults, ScanRange, Survey
 
+WHOLE = fcslam.ScanRange()
 LASER = fcslam.LaserModel(beam_count=360, angle_min_rad=-3.14, angle_increment_rad=np.pi / 180, max_range_m=12.0)
 
 
 class Room:
     """A robot that circles in a room of 8 m x 6 m. Replace the content of `records` by your reader."""
 
-    name, faults = "mine", Faults({})
+    name, faults = "mine", fcslam.Faults({})
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        return Survey(len(range(200)[slice(*scans)]), 40.0, 8.0, (LASER,), self.faults)
+    def survey(self, scans: fcslam.ScanRange = WHOLE) -> fcslam.Survey:
+        return fcslam.Survey(len(range(200)[slice(*scans)]), 40.0, 8.0, (LASER,), self.faults)
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[LaserScan]:
+    def records(self, scans: fcslam.ScanRange = WHOLE) -> Iterator[fcslam.LaserScan]:
         for number in range(200)[slice(*scans)]:
             heading = 0.04 * number
             pose = np.array([np.sin(heading), 1.0 - np.cos(heading), np.arctan2(np.sin(heading), np.cos(heading))])
             beam = LASER.angles_rad() + heading
             x_m = np.where(np.cos(beam) > 0, 4.0 - pose[0], 4.0 + pose[0]) / np.abs(np.cos(beam))
             y_m = np.where(np.sin(beam) > 0, 4.0 - pose[1], 2.0 + pose[1]) / np.abs(np.sin(beam))
-            yield LaserScan(0.2 * number, np.minimum(x_m, y_m).astype(np.float32), LASER, pose)
+            yield fcslam.LaserScan(0.2 * number, np.minimum(x_m, y_m).astype(np.float32), LASER, pose)
 
 
 if __name__ == "__main__":

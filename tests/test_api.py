@@ -7,6 +7,8 @@ import io
 import re
 import subprocess
 import sys
+import typing
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +60,49 @@ def test_all_holds_every_exception():
     tree = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
     assert tree <= set(fcslam.__all__)
     assert tree | set(fcslam._LAZY) | {"__version__"} == set(fcslam.__all__)
+
+
+def test_the_reference_lists_every_public_name():
+    page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    listed = {path.rpartition(".")[2] for path in re.findall(r"^::: (\S+)", page, re.MULTILINE)}
+    assert listed == {"errors", *fcslam._LAZY}
+
+
+def types_in(annotation):
+    """The classes of fcslam that an annotation names."""
+    if inspect.isclass(annotation) and annotation.__module__.startswith("fcslam."):
+        return {annotation.__name__}
+    parts = annotation if isinstance(annotation, list) else typing.get_args(annotation)
+    return {name for part in parts for name in types_in(part)}
+
+
+def annotated(value):
+    """A public function, or a class with its public methods and properties."""
+    if inspect.isclass(value):
+        members = (member for name, member in inspect.getmembers(value) if name[0] != "_" or name == "__init__")
+        yield from annotated_functions(getattr(member, "fget", member) for member in members)
+        yield value
+    yield from annotated_functions([value])
+
+
+def annotated_functions(values):
+    return (value for value in values if inspect.isfunction(value) and value.__module__.startswith("fcslam."))
+
+
+def test_every_type_of_a_public_signature_or_record_is_public():
+    late = {name: getattr(fcslam, name) for name in fcslam.__all__} | {"Callable": Callable}
+    hints = [
+        hint
+        for value in [getattr(fcslam, name) for name in fcslam.__all__]
+        for one in annotated(value)
+        for name, hint in typing.get_type_hints(one, localns=late).items()
+        if name[0] != "_"
+    ]
+    named = set().union(*map(types_in, hints))
+    sections = {"FleetConfig", "JumpLimits", "OccupancyConfig", "RobotConfig", "CloudConfig"}
+    filled_in = {"BagCorrection", "BuildingPlan", "Tag", "Wiring"}  # by fcslam itself
+    assert named - sections - filled_in <= set(fcslam.__all__)
+    assert {"Source", "LaserScan", "Anchors"} <= named
 
 
 def test_names_load_their_modules_at_the_first_use():
@@ -170,6 +215,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file(tmp_path):
         ({"recordings": ["LOG", "LOG"]}, fcslam.SourceError, "robot_1"),
         ({"recordings": ["LOG", "TWIN"], "split": 2}, fcslam.SourceError, "cuts one recording"),
         ({"split": 0}, fcslam.SourceError, "0 parts"),
+        ({"processes": 0}, fcslam.InputError, "give 1 or more"),
         ({"config": {"seed": -1}}, fcslam.ConfigError, "seed"),
         ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
         ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),
@@ -189,6 +235,15 @@ def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, 
             **{name: filled(value) for name, value in given.items()}, progress=lambda _: pytest.fail("worked")
         )
     assert raised.type is kind
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"), [((1.0, 2.0), "give (x, y, theta)"), ((1e3, 0.0, 0.0), "is outside of the map")]
+)
+def test_a_start_that_no_map_has_is_refused_before_the_work(pose, said, logs, opened):
+    with pytest.raises(fcslam.InputError, match=re.escape(said)) as raised:
+        fcslam.localize(logs[0], opened.maps[0], initial_pose=pose, progress=lambda _: pytest.fail("worked"))
     assert "\n" not in str(raised.value)
 
 

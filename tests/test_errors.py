@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.errors import ConfigError, UnavailableError
+from fcslam.errors import ConfigError, PacketConflictError, UnavailableError
 
 
 @pytest.mark.parametrize(
@@ -21,6 +21,9 @@ def test_a_system_error_stands_without_number_and_without_a_second_file_name(mes
     assert str(ConfigError(message.format(caught.value))) == readable
 
 
-def test_an_error_crosses_processes():
-    error = UnavailableError("http://cloud:8340: [Errno 111] Connection refused")
-    assert str(pickle.loads(pickle.dumps(error))) == str(error) == "http://cloud:8340: Connection refused"
+@pytest.mark.parametrize(
+    "error", [UnavailableError("http://cloud:8340: [Errno 111] Connection refused", 3.0), PacketConflictError("two", 7)]
+)
+def test_an_error_crosses_processes_with_all_that_it_says(error):
+    copy = pickle.loads(pickle.dumps(error))
+    assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))

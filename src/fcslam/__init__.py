@@ -35,12 +35,31 @@ from fcslam.errors import (
 )
 
 if TYPE_CHECKING:
+    from fcslam.anchoring.anchors import Anchors, read_anchors
     from fcslam.api import changes, localize, map_recordings
     from fcslam.live.localized_robot import LocalizedRobot
-    from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
+    from fcslam.live.records import EventKind, LocalizationState, RobotEvent, RobotPose, RobotStatus
     from fcslam.live.robot import Robot
+    from fcslam.maps.changes import ChangedRegion, Changes
+    from fcslam.mission.localization import LocalizationProgress
     from fcslam.mission.mission import MissionConfig, Progress
-    from fcslam.records import CameraModel, Channel, ClosureStatus, LaserModel, Transform, Veto
+    from fcslam.records import (
+        Beams,
+        CameraImage,
+        CameraModel,
+        Channel,
+        ClosureStatus,
+        GnssFix,
+        LaserModel,
+        LaserScan,
+        Odometry,
+        Reason,
+        ReasonCode,
+        Sweep,
+        Transform,
+        Veto,
+    )
+    from fcslam.robot.outbox import WaitingPackets
     from fcslam.runs import (
         ClosureRow,
         LocalizedPoses,
@@ -52,27 +71,41 @@ if TYPE_CHECKING:
         Run,
         open_run,
     )
-    from fcslam.sources import BagOptions
+    from fcslam.sources import BagOptions, Fault, FaultCount, Faults, ScanRange, Source, Survey
+    from fcslam.sources.point_clouds import CloudBand
     from fcslam.wire.http_transport import Server
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Anchors",
     "BagOptions",
+    "Beams",
+    "CameraImage",
     "CameraModel",
+    "ChangedRegion",
+    "Changes",
     "Channel",
     "ClosureRow",
     "ClosureStatus",
+    "CloudBand",
     "CloudError",
     "ConfigError",
     "EditError",
     "EvaluationError",
     "EventKind",
+    "Fault",
+    "FaultCount",
+    "Faults",
     "FcslamError",
     "FeatureError",
+    "GnssFix",
     "InputError",
     "LaserModel",
+    "LaserScan",
     "LocalMap",
+    "LocalizationProgress",
+    "LocalizationState",
     "LocalizedPoses",
     "LocalizedRobot",
     "Metric",
@@ -80,63 +113,94 @@ __all__ = [
     "NetworkError",
     "Occupancy",
     "OccupancyMap",
+    "Odometry",
     "OutputError",
     "OversizeError",
     "PacketConflictError",
     "PacketError",
     "Progress",
+    "Reason",
+    "ReasonCode",
     "Robot",
     "RobotEvent",
     "RobotPose",
     "RobotStatus",
     "RobotTrajectory",
     "Run",
+    "ScanRange",
     "Server",
     "ServiceError",
     "SimulationError",
+    "Source",
     "SourceError",
     "StateError",
     "StoreError",
+    "Survey",
+    "Sweep",
     "TrainingError",
     "Transform",
     "UnavailableError",
     "Veto",
+    "WaitingPackets",
     "__version__",
     "changes",
     "localize",
     "map_recordings",
     "open_run",
+    "read_anchors",
 ]
 
 _LAZY: Final = {
+    "Anchors": "fcslam.anchoring.anchors",
     "BagOptions": "fcslam.sources",
+    "Beams": "fcslam.records",
+    "CameraImage": "fcslam.records",
     "CameraModel": "fcslam.records",
+    "ChangedRegion": "fcslam.maps.changes",
+    "Changes": "fcslam.maps.changes",
     "Channel": "fcslam.records",
     "ClosureRow": "fcslam.runs",
     "ClosureStatus": "fcslam.records",
+    "CloudBand": "fcslam.sources.point_clouds",
     "EventKind": "fcslam.live.records",
+    "Fault": "fcslam.sources",
+    "FaultCount": "fcslam.sources",
+    "Faults": "fcslam.sources",
+    "GnssFix": "fcslam.records",
     "LaserModel": "fcslam.records",
+    "LaserScan": "fcslam.records",
     "LocalMap": "fcslam.runs",
+    "LocalizationProgress": "fcslam.mission.localization",
+    "LocalizationState": "fcslam.live.records",
     "LocalizedPoses": "fcslam.runs",
     "LocalizedRobot": "fcslam.live.localized_robot",
     "Metric": "fcslam.runs",
     "MissionConfig": "fcslam.mission.mission",
     "Occupancy": "fcslam.runs",
     "OccupancyMap": "fcslam.runs",
+    "Odometry": "fcslam.records",
     "Progress": "fcslam.mission.mission",
+    "Reason": "fcslam.records",
+    "ReasonCode": "fcslam.records",
     "Robot": "fcslam.live.robot",
     "RobotEvent": "fcslam.live.records",
     "RobotPose": "fcslam.live.records",
     "RobotStatus": "fcslam.live.records",
     "RobotTrajectory": "fcslam.runs",
     "Run": "fcslam.runs",
+    "ScanRange": "fcslam.sources",
     "Server": "fcslam.wire.http_transport",
+    "Source": "fcslam.sources",
+    "Survey": "fcslam.sources",
+    "Sweep": "fcslam.records",
     "Transform": "fcslam.records",
     "Veto": "fcslam.records",
+    "WaitingPackets": "fcslam.robot.outbox",
     "changes": "fcslam.api",
     "localize": "fcslam.api",
     "map_recordings": "fcslam.api",
     "open_run": "fcslam.runs",
+    "read_anchors": "fcslam.anchoring.anchors",
 }
 """Where each name is that is imported at its first use."""
 

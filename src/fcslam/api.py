@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from numpy.typing import ArrayLike
+
 from fcslam import sources
 from fcslam.anchoring.anchors import Anchors
 from fcslam.config import load, parse
@@ -21,8 +23,8 @@ from fcslam.mission.mission import (
     continued_config,
     run_mission,
 )
-from fcslam.mission.mission_file import EMPTY, SavedMission, read_mission
-from fcslam.records import FloatArray, Veto, frozen
+from fcslam.mission.mission_file import EMPTY, read_mission
+from fcslam.records import StrPath, Veto
 from fcslam.robot.calibrating import calibrated
 from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from fcslam.maps.changes import Changes
     from fcslam.mission.localization import LocalizationProgress
 
-StrPath = str | os.PathLike[str]
 Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
 
 _log = logging.getLogger(__name__)
@@ -48,7 +49,7 @@ def map_recordings(
     progress: Watch | None = None,
     force: bool = False,
     processes: int = 1,
-    onto: StrPath | SavedMission | None = None,
+    onto: StrPath | None = None,
     floors: str | Mapping[str, str] = "",
     anchors: Anchors = Anchors(),  # noqa: B008
 ) -> Run:
@@ -76,7 +77,7 @@ def map_recordings(
             the cloud. Without recordings it is mapped again, with the edits that it has.
         floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
             floors are never compared, so each floor has maps of its own.
-        anchors: what is known about the building, such as its floor plan.
+        anchors: what is known about the building, such as its floor plan, from ``read_anchors``.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -84,7 +85,7 @@ def map_recordings(
     """
     if output is not None:
         prepare_output(Path(output), force)
-    earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto or EMPTY
+    earlier = EMPTY if onto is None else read_mission(Path(onto))
     settings = settings_of(continued_config(earlier) if config is None else config)
     opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
@@ -119,11 +120,11 @@ def localize(
     recording: StrPath | Source,
     map: StrPath | OccupancyMap,  # the word that users expect
     *,
-    initial_pose: tuple[float, float, float] | None = None,
+    initial_pose: ArrayLike | None = None,
     config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
     output: StrPath | None = None,
     bag_options: BagOptions | None = None,
-    progress: "Callable[[LocalizationProgress], None]" = lambda _: None,
+    progress: "Callable[[LocalizationProgress], None] | None" = None,
     force: bool = False,
     floor: str = "",
     update: bool = False,
@@ -150,9 +151,13 @@ def localize(
             deviations and quality.
 
     Raises:
-        InputError: the recording, the map, the configuration or the output folder cannot be used.
+        InputError: the recording, the map, the initial pose, the configuration or the output folder cannot be used.
     """
-    from fcslam.mission.localization import read_map, run_localization  # SciPy's images: mapping alone needs none
+    from fcslam.mission.localization import (  # SciPy's images: mapping alone needs none
+        pose_in_map,
+        read_map,
+        run_localization,
+    )
 
     if output is not None:
         prepare_output(Path(output), force)
@@ -160,8 +165,8 @@ def localize(
     occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
     if isinstance(recording, str | os.PathLike):
         recording = _checked(sources.open_source(Path(recording), bag_options))
-    initial: FloatArray | None = None if initial_pose is None else frozen(initial_pose)
-    run = run_localization(recording, occupancy, settings, initial, progress, update)
+    initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, occupancy)
+    run = run_localization(recording, occupancy, settings, initial, progress or (lambda _: None), update)
     if output is not None:
         run.save(output, force)
     return run

@@ -22,6 +22,7 @@ FcslamError
 """
 
 import re
+from typing import Any
 
 _SYSTEM_ERROR = re.compile(r"\[Errno -?\d+\] ([^:()]+)(?:: '([^']*)')?")
 """How Python writes an error of the operating system: its number, its text, and often the file."""
@@ -37,6 +38,10 @@ class FcslamError(Exception):
     def __init__(self, message: str) -> None:
         super().__init__(_SYSTEM_ERROR.sub(lambda found: _readable(found, message), message))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """With all attributes, whatever the arguments of the class are: errors cross processes."""
+        return _restored, (type(self), str(self)), vars(self)
+
 
 def printable(text: str) -> str:
     """The text without the line breaks and control characters that a terminal would obey: recordings hold any names."""
@@ -46,6 +51,12 @@ def printable(text: str) -> str:
 def _readable(system_error: re.Match[str], message: str) -> str:
     text, file = system_error.groups()
     return text if file is None or message.startswith(file) else f"{text}: '{file}'"
+
+
+def _restored(kind: type[FcslamError], message: str) -> FcslamError:
+    error = kind.__new__(kind)
+    error.args = (message,)
+    return error
 
 
 class InputError(FcslamError):

@@ -4,6 +4,7 @@ Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b 
 REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
 """
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,10 @@ from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from fcslam.errors import InputError
+
+StrPath = str | os.PathLike[str]
 
 FloatArray = NDArray[np.float64]
 Ranges = NDArray[np.float32]
@@ -39,6 +44,21 @@ def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar
         result = result.copy()
         result.setflags(write=False)
     return result
+
+
+def checked_pose(name: str, given: ArrayLike) -> FloatArray:
+    """A pose, shape (3,); ``name`` is what messages call it.
+
+    Raises:
+        InputError: it has another shape, or a number is not finite.
+    """
+    try:
+        pose: FloatArray = frozen(given)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not a pose ({error}); give (x, y, theta)") from error
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise InputError(f"{name}: {given!r} is not a pose; give (x, y, theta) in metres and radians")
+    return pose
 
 
 class Beams(NamedTuple):

@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.anchoring.anchors import Anchors, anchored
+from fcslam.anchoring.anchors import Anchors, anchored, read_anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
-from fcslam.cli.map import _anchors
 from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -177,8 +176,8 @@ def test_a_plan_with_more_walls_than_a_field_holds_gets_one_line(tmp_path):
     pixels[::25, 50:-50] = 0
     cv2.imwrite(str(tmp_path / "hatched.png"), pixels)
     with pytest.raises(SourceError, match=r"hatched.png: has too many walls; at most 1.6 km can be used; crop it"):
-        _anchors(tmp_path / "hatched.png", 0.02, None)
-    assert _anchors(picture(tmp_path), 0.02, None).plan is not None
+        read_anchors(tmp_path / "hatched.png", 0.02)
+    assert read_anchors(picture(tmp_path), 0.02).plan is not None
 
 
 def test_a_map_with_more_walls_than_a_field_holds_is_not_aligned(monkeypatch):

@@ -11,7 +11,6 @@ import typer
 
 from fcslam.cli import EXAMPLES, app, main
 from tests.test_docs import complaint
-from tests.test_imports import HEAVY
 
 
 def tree(command, path=()):
@@ -22,6 +21,8 @@ def tree(command, path=()):
 
 
 COMMANDS = dict(tree(typer.main.get_command(app)))
+HEAVY = ["numpy", "pydantic", "fastapi", "httpx"]
+"""Each command that works imports one of them."""
 every_command = pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 
 

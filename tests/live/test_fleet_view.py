@@ -25,8 +25,8 @@ def client(desk, robot):
     return FleetClient(str(desk.client.base_url), f"token of {robot}")
 
 
-def view(desk, robot, pose=None, limit_kbps=None):
-    return FleetView([client(desk, robot)], robot, lambda: pose, limit_kbps, clock=lambda: 0.0)
+def view(desk, robot, pose=None, limit_kBps=None):
+    return FleetView([client(desk, robot)], robot, lambda: pose, limit_kBps, clock=lambda: 0.0)
 
 
 def follow(fleet):
@@ -85,7 +85,7 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
         follow(first)
         alone = known(first.joint_map)
         desk.send("b", B)
-        with closing(view(desk, "b", limit_kbps=0.5)) as second:
+        with closing(view(desk, "b", limit_kBps=0.5)) as second:
             follow(first), follow(second)
             assert known(first.joint_map) == known(second.joint_map) != alone
             assert [mate.robot for mate in first.robots()] == ["a", "b"]
@@ -103,13 +103,13 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
 
 def test_a_new_frame_shows_no_map_before_all_its_tiles_came(desk):
     desk.send("a", A)
-    with closing(view(desk, "a", limit_kbps=0.1)) as fleet:
+    with closing(view(desk, "a", limit_kBps=0.1)) as fleet:
         fleet.step()
         assert fleet.version == 1
         assert fleet.joint_map is None
         assert fleet.map_index == 0
         follow(fleet)
-        with closing(view(desk, "a", limit_kbps=1e6)) as at_once:
+        with closing(view(desk, "a", limit_kBps=1e6)) as at_once:
             at_once.step()
             assert known(fleet.joint_map) == known(at_once.joint_map)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.errors import CloudError, StateError
+from fcslam.errors import CloudError, InputError, StateError
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
 from fcslam.live.playback import PlaybackPace, play
@@ -17,6 +17,7 @@ from fcslam.records import Channel, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.runs import Occupancy
+from fcslam.wire.http_transport import Server
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
@@ -27,6 +28,13 @@ from tests.robot.kidnapping import kidnapping
 from tests.wire.examples import CORRECTION
 
 AS_FAST_AS_POSSIBLE = PlaybackPace(None, lambda: 0.0, lambda _: None)
+
+
+def test_a_server_hides_its_token_and_has_a_budget_above_zero():
+    assert "secret" not in repr(Server("https://cloud", "secret"))
+    for budget_kBps in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="above 0"):
+            Server("https://cloud", budget_kBps=budget_kBps)
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +63,10 @@ class Clock:
 def drive(tmp_path, network, records, resume=False, watch=lambda _: None, recording="r"):
     pause = threading.Event()
     robot = Robot(
-        "alice", server=network, state=tmp_path, own_map=False,
-        wiring=Wiring(SameThread(), Clock(), lambda _: pause.wait(0.001), Playback(recording, resume)),
+        "alice", state=tmp_path, own_map=False,
+        wiring=Wiring(
+            SameThread(), Clock(), lambda _: pause.wait(0.001), Playback(recording, resume), transport=network
+        ),
     )  # fmt: skip
     with closing(robot):
         play(robot, records, AS_FAST_AS_POSSIBLE, watch)
@@ -82,7 +92,7 @@ def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     assert list(cloud.stored) == [(0, k) for k in range(len(alone))]
     now = robot.status()
     assert (now.scans, now.waiting.packets, now.confirmed, now.trouble) == (len(scans), 0, len(alone), None)
-    assert (now.map_index, now.left_out, now.refused, now.catching_up) == (CORRECTION.map_index, 0, 0, False)
+    assert (now.map_index, now.left_out, now.refused, now.is_catching_up) == (CORRECTION.map_index, 0, 0, False)
     assert now.sent_bytes == sum(map(len, cloud.stored.values()))
     path = robot.trajectory()
     stamps, poses = path.stamps, path.T_map_base
@@ -116,7 +126,9 @@ def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_pa
     with pytest.raises(KeyboardInterrupt):
         drive(tmp_path, Network(cloud, ["request lost"] * 2), stop_after(scans, stop))
     seen = []
-    drive(tmp_path, Network(cloud, ["answer lost"]), scans, resume=True, watch=lambda now: seen.append(now.catching_up))
+    drive(
+        tmp_path, Network(cloud, ["answer lost"]), scans, resume=True, watch=lambda now: seen.append(now.is_catching_up)
+    )
     assert list(cloud.stored) == [(0, k) for k in range(len(alone))]
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
     assert seen[-1] is False
@@ -217,8 +229,8 @@ def test_a_robot_on_another_floor_was_not_lost(scans, tmp_path):
     cloud, events, pause = FakeCloud(), [], threading.Event()
     half = len(scans) // 2
     robot = Robot(
-        "alice", server=Network(cloud), state=tmp_path, own_map=False, floor="1", on_event=events.append,
-        wiring=Wiring(SameThread(), Clock(), lambda _: pause.wait(0.001)),
+        "alice", state=tmp_path, own_map=False, floor="1", on_event=events.append,
+        wiring=Wiring(SameThread(), Clock(), lambda _: pause.wait(0.001), transport=Network(cloud)),
     )  # fmt: skip
     with closing(robot):
         for scan in scans[:half]:
@@ -312,7 +324,7 @@ def test_a_recording_is_played_by_its_own_clock():
 
 def test_the_own_map_lies_where_the_server_puts_it(scans):
     cloud = FakeCloud(correction=CORRECTION.version)
-    with Robot("alice", scans[0].laser, server=Network(cloud), wiring=Wiring(SameThread())) as robot:
+    with Robot("alice", scans[0].laser, wiring=Wiring(SameThread(), transport=Network(cloud))) as robot:
         for scan in scans:
             pose = robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
         before = robot.map()
@@ -357,8 +369,8 @@ def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_pa
             return "none" if back.is_set() else "request lost"
 
     network, pause = Away(FakeCloud()), threading.Event()
-    wiring = Wiring(SameThread(), Clock())
-    with Robot("alice", scans[0].laser, server=network, state=tmp_path, own_map=False, wiring=wiring,
+    wiring = Wiring(SameThread(), Clock(), transport=network)
+    with Robot("alice", scans[0].laser, state=tmp_path, own_map=False, wiring=wiring,
                on_event=events.append) as robot:  # fmt: skip
         for scan in scans[:20]:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
@@ -367,7 +379,8 @@ def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_pa
         assert not robot.finish(timeout_s=5.0)
     assert [event.kind for event in events] == [EventKind.OFFLINE]
     back.set()
-    with Robot("alice", state=tmp_path, server=network, own_map=False, wiring=Wiring(SameThread())) as robot:
+    wiring = Wiring(SameThread(), transport=network)
+    with Robot("alice", state=tmp_path, own_map=False, wiring=wiring) as robot:
         robot.finish()
     assert {epoch for epoch, _ in network.cloud.stored} == {0}
 
@@ -378,8 +391,8 @@ def test_a_server_that_turns_the_robot_away_stops_no_scan(scans, tmp_path):
             raise CloudError("no token")
 
     events, pause = [], threading.Event()
-    wiring = Wiring(SameThread(), Clock())
-    with Robot("alice", scans[0].laser, server=Closed(FakeCloud()), state=tmp_path, wiring=wiring,
+    wiring = Wiring(SameThread(), Clock(), transport=Closed(FakeCloud()))
+    with Robot("alice", scans[0].laser, state=tmp_path, wiring=wiring,
                on_event=events.append) as robot:  # fmt: skip
         while not robot._uplink.failure:
             pause.wait(0.001)

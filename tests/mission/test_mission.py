@@ -1,6 +1,7 @@
 """Recordings in, one run out, and what the run says adds up."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import yaml
 
 from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import mission
-from fcslam.mission.mission import Beginning, MissionConfig, run_mission
+from fcslam.mission.mission import Beginning, MissionConfig, continued_config, run_mission
+from fcslam.mission.mission_file import EMPTY
 from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.sources import open_source, write_carmen
 from fcslam.sources.faults import Faults
@@ -138,6 +140,12 @@ def holds_setting(name):
 
 def test_the_run_carries_its_configuration(run):
     assert MissionConfig.model_validate(yaml.safe_load(run.config_yaml)) == MissionConfig(seed=3)
+
+
+def test_the_settings_of_the_cloud_go_into_a_mission_and_out_of_it():
+    given = MissionConfig.model_validate({"seed": 3, "fleet": {"sight_m": 5.0}, "map": {"resolution_m": 0.1}})
+    kept = replace(EMPTY, config=given.cloud)
+    assert continued_config(kept) == given
 
 
 def test_progress_goes_forward_to_the_end(watched, drawn):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from fcslam.cloud import report
-from fcslam.cloud.settings import CloudConfig
 from fcslam.maps.certificate import certify
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
@@ -100,7 +99,7 @@ def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_pat
     config = MissionConfig(seed=3)
     packets = in_order(packet for log in logs[:2] for packet in sent(open_source(log), config.robot))
     expected = run_mission([open_source(log) for log in logs[:2]], config)
-    cloud = Cloud(tmp_path / "mission", CloudConfig(seed=3, fleet=config.fleet, map=config.map))
+    cloud = Cloud(tmp_path / "mission", config.cloud)
     for batch in rng_order(packets):
         cloud.put(batch)
         cloud.worker.step()

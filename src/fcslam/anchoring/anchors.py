@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,17 +12,19 @@ from fcslam.anchoring.alignment import PlanAlignment, align_to_plan
 from fcslam.anchoring.deviations import Comparison, compare_with_plan
 from fcslam.anchoring.gnss import Georeference, georeferenced
 from fcslam.anchoring.plan import BuildingPlan
+from fcslam.anchoring.plan_files import read_plan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
-from fcslam.anchoring.tags import MapTags, Survey, placed_by_tags, tag_lines
+from fcslam.anchoring.tags import MapTags, Survey, placed_by_tags, read_survey, tag_lines
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.result import FleetResult, MappedRobot
+from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
 from fcslam.maps.exports import outlines
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray, StrPath, frozen
 from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
@@ -41,6 +44,30 @@ class Anchors:
     """Turn maps that nothing else places, so that their walls run along x and y."""
     survey: Survey | None = None
     """Positions of tags."""
+
+
+def read_anchors(
+    plan: StrPath | None = None, plan_scale: float | None = None, to_walls: bool = False, tags: StrPath | None = None
+) -> Anchors:
+    """Read what is known about the building, for ``map_recordings``.
+
+    Args:
+        plan: floor plan: a PNG drawing, a DXF drawing, or the YAML file of a ROS map.
+        plan_scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
+        to_walls: turn maps that nothing else places, so that their walls run along x and y.
+        tags: YAML file with the positions of surveyed tags.
+
+    Raises:
+        InputError: a file cannot be read or used, or the scale has no plan.
+    """
+    if plan is None and plan_scale is not None:
+        raise InputError(
+            "--plan-scale (in Python plan_scale=) belongs to --plan; name the plan, or leave the scale out"
+        )
+    building = None if plan is None else BuildingPlan(read_plan(Path(plan), plan_scale))
+    if building is not None and building.submap.field.is_full:
+        raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
+    return Anchors(building, to_walls, None if tags is None else read_survey(Path(tags)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

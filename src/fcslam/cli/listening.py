@@ -1,6 +1,5 @@
 """Ports on which commands listen, and their certificates."""
 
-import ipaddress
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -26,14 +25,6 @@ def listen(host: str, port: int) -> "socket.socket":
         return socket.create_server(address[:2], family=family, backlog=512)
     except (OSError, UnicodeError) as error:
         raise ServiceError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a host."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 Credentials = Annotated[

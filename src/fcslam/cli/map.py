@@ -32,7 +32,6 @@ from fcslam.cli.warm_up import compiled, cores
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.anchoring.anchors import Anchors
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission.mission import Beginning, MissionConfig, Progress
     from fcslam.mission.mission_file import SavedMission
@@ -113,6 +112,7 @@ def map_recordings(
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
+        from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import split_recordings
         from fcslam.cluster.verifying import verifying
         from fcslam.cluster.workers import Workers
@@ -126,7 +126,7 @@ def map_recordings(
         prepare_output(output, force)
         earlier = EMPTY if onto is None else read_mission(onto)
         settings = with_starts(mission_config(config, continued_config(earlier)), start)
-        anchors = _anchors(plan, plan_scale, align, tags)
+        anchors = read_anchors(plan, plan_scale, align is AlignTo.WALLS, tags)
         options = bag_options(sensors)
         if not logs and onto is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
@@ -191,22 +191,6 @@ def map_sources(
     print_faults(console, faults)
     _report(answers(), run, time.perf_counter() - began, output, settings, beginning.onto)
     return run
-
-
-def _anchors(plan: Path | None, scale: float | None, align: AlignTo | None, tags: Path | None = None) -> "Anchors":
-    from fcslam.anchoring.anchors import Anchors
-    from fcslam.anchoring.plan import BuildingPlan
-    from fcslam.anchoring.plan_files import read_plan
-    from fcslam.anchoring.tags import read_survey
-    from fcslam.errors import InputError, SourceError
-    from fcslam.lidar.field import TOO_MANY_WALLS
-
-    if plan is None and scale is not None:
-        raise InputError("--plan-scale belongs to --plan; name the plan, or leave the scale out")
-    building = None if plan is None else BuildingPlan(read_plan(plan, scale))
-    if building is not None and building.submap.field.is_full:
-        raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
-    return Anchors(building, align is AlignTo.WALLS, None if tags is None else read_survey(tags))
 
 
 @contextmanager

@@ -40,7 +40,7 @@ def play(
     *,
     server: ServerUrl = None,
     credentials: Credentials = None,
-    budget_kbps: Budget = None,
+    budget_kBps: Budget = None,
     state: Annotated[
         Path,
         typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
@@ -70,7 +70,7 @@ def play(
     keep_private()
     if is_live(recording):
         raise InputError(f"{recording}: is a live robot; `fcslam robot {recording}` maps it")
-    settings, cloud = mission_config(config), access(server, credentials, budget_kbps)
+    settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = _speed(speed)
@@ -80,7 +80,7 @@ def play(
     console = notices(quiet)
     print_notes(console, survey.notes)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
-    fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kbps, floor)
+    fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
     live = Robot(
         opened.name,
         server=cloud,
@@ -180,7 +180,7 @@ def _check_name(name: str) -> None:
         raise SourceError(f"robot: {name!r} is how a later start of {stem!r} is called; give another one: NAME=LOG")
 
 
-def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None, floor: str) -> str:
+def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kBps: float | None, floor: str) -> str:
     """A digest of the inputs that determine the packets; digests of the packets themselves reveal other changes."""
     import hashlib
 
@@ -188,7 +188,7 @@ def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kb
     from fcslam.config import dump
 
     length = survey.scan_count, survey.duration_s, survey.path_length_m
-    inputs = (fcslam.__version__, name, *length, survey.lasers, budget_kbps, floor)
+    inputs = (fcslam.__version__, name, *length, survey.lasers, budget_kBps, floor)
     return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
 
 
@@ -250,7 +250,7 @@ def _localisation(now: "RobotStatus", times_lost_before: int) -> str:
 
 def _details(now: "RobotStatus", is_complete: bool) -> str:
     """The state of robot, connection, packets and map, the most important first: a narrow terminal cuts the end."""
-    stage = "catching up" if now.catching_up else "sending" if is_complete else str(now.localization)
+    stage = "catching up" if now.is_catching_up else "sending" if is_complete else str(now.localization)
     details = [stage, "offline" if now.trouble else "online", f"{now.waiting.packets} waiting"]
     details += [f"{now.refused} refused"] if now.refused else []
     if now.map_index is None:

@@ -27,7 +27,7 @@ def robot(
     *,
     server: ServerUrl = None,
     credentials: Credentials = None,
-    budget_kbps: Budget = None,
+    budget_kBps: Budget = None,
     state: Annotated[
         Path | None,
         typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
@@ -55,7 +55,7 @@ def robot(
             "service"
         )
     live = live_source(address, sensors, ros_parameters, use_sim_time)
-    settings, cloud = mission_config(config), access(server, credentials, budget_kbps)
+    settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     start = partial(
         Robot,
         server=cloud,

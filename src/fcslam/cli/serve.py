@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.listening import Credentials, check_tls, find_files, is_loopback, listen
+from fcslam.cli.listening import Credentials, check_tls, find_files, listen
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
@@ -81,7 +81,6 @@ def serve(
     from fcslam.cli.shared_service import shared_state
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
-    from fcslam.errors import ServiceError
     from fcslam.page.routes import page_router, report_router
     from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.app import create_app
@@ -90,15 +89,9 @@ def serve(
     from fcslam.storage.files import keep_private
 
     tokens, certificate, key = find_files(credentials)
-    is_open = tokens is None and client_ca is None and not insecure
-    if is_open and not is_loopback(host):
-        raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
     check_tls(certificate, key, client_ca)
-    if is_open and credentials is not None:
-        raise ServiceError(
-            f"{credentials}: holds no tokens.yaml, so everybody could send and read; `fcslam tools certificates` adds "
-            "it; or give --client-ca or --insecure"
-        )
+    if tokens is None and client_ca is None and not insecure:
+        _check_open(host, credentials)
     chosen = Workers(workers)
     chosen.check()
     if chosen.is_cluster:
@@ -109,7 +102,7 @@ def serve(
     keep_memory_trimmed()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
-        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
+        authenticator, given = _authenticator(tokens, client_ca), mission_config(config).cloud
         if store is None:
             state = _state(data, authenticator, given, chosen)
         else:
@@ -133,6 +126,24 @@ def serve(
             f"fcslam serves mission '{state.mission.folder.name}' at {scheme}://{shown}:{number}; Ctrl-C stops it"
         )
         server.run(sockets=[listening])
+
+
+def _check_open(host: str, credentials: Path | None) -> None:
+    """Check that a service may go without authentication.
+
+    Raises:
+        ServiceError: others reach it, or credentials are given in vain.
+    """
+    from fcslam.errors import ServiceError
+    from fcslam.wire.http_transport import is_loopback
+
+    if not is_loopback(host):
+        raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
+    if credentials is not None:
+        raise ServiceError(
+            f"{credentials}: holds no tokens.yaml, so everybody could send and read; `fcslam tools certificates` adds "
+            "it; or give --client-ca or --insecure"
+        )
 
 
 def _server(
@@ -220,10 +231,3 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", wo
     )
     audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, data / "learning")
-
-
-def _cloud_config(chosen: list[str] | None) -> "CloudConfig":
-    from fcslam.cloud.settings import CloudConfig
-
-    config = mission_config(chosen)
-    return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)

@@ -42,7 +42,7 @@ Budget = Annotated[
 ]
 
 
-def access(server: str | None, credentials: Path | None, budget_kbps: float | None = None) -> "Server | None":
+def access(server: str | None, credentials: Path | None, budget_kBps: float | None = None) -> "Server | None":
     """The service that a robot sends to; None if none is named.
 
     Raises:
@@ -55,4 +55,4 @@ def access(server: str | None, credentials: Path | None, budget_kbps: float | No
     if server is None:
         return None
     own = found.own if server.startswith("https:") else None  # a certificate is shown in TLS only
-    return Server(server, found.token, found.ca, own, budget_kbps)
+    return Server(server, found.token, found.ca, own, budget_kBps)

@@ -27,7 +27,7 @@ FRONTIERS_S: Final = 5.0
 """Time between two looks at the frontiers."""
 QUALITY_S: Final = 10.0
 """Time between two looks at how good the map is."""
-DOWNLINK_KBPS: Final = 15.0
+DOWNLINK_KB_PER_S: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
 STOP_TIMEOUT_S: Final = 2.0
 MOST_NEWS: Final = 1000
@@ -68,7 +68,7 @@ class FleetView:
         clients: Sequence[FleetClient],
         robot: str,
         own_pose: Callable[[], tuple[int, FloatArray] | None],
-        limit_kbps: float | None = None,
+        limit_kBps: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Follow nothing before ``start``.
@@ -77,12 +77,12 @@ class FleetView:
             clients: of the cloud's instances; if one does not answer, the next one is asked. ``close`` closes them.
             robot: its name.
             own_pose: index of its map and its pose there, if both are known.
-            limit_kbps: limit of the tiles, kB per second; None: ``DOWNLINK_KBPS``.
+            limit_kBps: limit of the tiles, kB per second; None: ``DOWNLINK_KB_PER_S``.
             clock: seconds.
         """
         self._clients, self._robot, self._own_pose, self.clock = clients, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments
-        self._limit_bytes = min(max(1, int(1e3 * POLL_S * (limit_kbps or DOWNLINK_KBPS))), LARGEST_ANSWER)
+        self._limit_bytes = min(max(1, int(1e3 * POLL_S * (limit_kBps or DOWNLINK_KB_PER_S))), LARGEST_ANSWER)
         self._tiled, self._etag = TiledMap(), ""
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
@@ -237,9 +237,9 @@ def following(
     clients: Sequence[FleetClient],
     robot: str,
     own_pose: Callable[[], tuple[int, FloatArray] | None],
-    limit_kbps: float | None,
+    limit_kBps: float | None,
 ) -> Iterator[FleetView]:
     """A view that follows its fleet in this block; arguments as for ``FleetView``."""
-    with closing(FleetView(clients, robot, own_pose, limit_kbps)) as view:
+    with closing(FleetView(clients, robot, own_pose, limit_kBps)) as view:
         view.start()
         yield view

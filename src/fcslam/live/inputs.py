@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from fcslam.cloud.sessions import check_robot
 from fcslam.errors import InputError, PacketError
 from fcslam.geometry.beams import is_field_of_view, misfit, spread
-from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan, frozen
+from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.wire.checks import check_name
@@ -146,18 +146,3 @@ def checked_stamp(stamp: float, newest_s: float) -> float:
             f"step back by {MAX_STEP_BACK_S:g} s at most; after a change of the clock, make a new Robot"
         )
     return float(stamp)
-
-
-def checked_pose(name: str, given: ArrayLike) -> FloatArray:
-    """A pose, shape (3,); ``name`` is what messages call it.
-
-    Raises:
-        InputError: it has another shape, or a number is not finite.
-    """
-    try:
-        pose: FloatArray = frozen(given)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: not a pose ({error}); give (x, y, theta)") from error
-    if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise InputError(f"{name}: {given!r} is not a pose; give (x, y, theta) in metres and radians")
-    return pose

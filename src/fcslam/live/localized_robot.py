@@ -13,18 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fcslam.api import StrPath, settings_of
+from fcslam.api import settings_of
 from fcslam.errors import InputError
 from fcslam.geometry import se2
-from fcslam.live.inputs import Lasers, checked_pose
+from fcslam.live.inputs import Lasers
 from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
-from fcslam.mission.localization import LocalizedDrive, read_map
+from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray, StrPath, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate
-from fcslam.robot.outbox import WaitingPackets
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.robot.worker_localizer import WorkerLocalizer
 from fcslam.runs import RobotTrajectory, Run, prepare_output
@@ -83,7 +82,7 @@ class LocalizedRobot(LiveTracker):
         """
         super().__init__(name, laser, settings_of(config), on_event)
         self._map = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
-        initial = None if initial_pose is None else self._checked("initial_pose", initial_pose)
+        initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, self._map)
         self._drive = LocalizedDrive()
         self._was_localized = False
         robot = self._config.robot
@@ -112,31 +111,23 @@ class LocalizedRobot(LiveTracker):
         Raises:
             InputError: it is not a pose, or outside of the map.
         """
-        T_map_base = self._checked("pose", pose)
+        T_map_base = pose_in_map("pose", pose, self._map)
         with self._lock:
             newest = self._frontend.newest
             here = np.zeros(3) if newest is None else self._frontend.scan_poses.in_odom(newest.pose)
             self._localizer.suggest(se2.compose(T_map_base, se2.inverse(here)))
 
     def status(self) -> RobotStatus:
-        """Return the state of the robot: its pose, its connection, and counts since its start."""
+        """Return the state of the robot: whether it knows its pose, and counts since its start."""
         estimate, failure = self._estimate(), self._frontend.backend_failure
         broken = f"not localised any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
             scans=self._scans,
             keyscans=self._localizer.keyscans,
-            waiting=WaitingPackets(0, 0),
-            confirmed=0,
-            sent_bytes=0,
-            left_out=0,
-            refused=0,
             map_index=0,
-            correction_age_s=None,
             times_lost=self._localizer.state.losses,
             quality=0.0 if estimate is None else estimate.quality,
-            trouble=None,
-            catching_up=False,
             notices=tuple(filter(None, (broken, jumps))),
             is_localized=estimate is not None,
         )
@@ -184,18 +175,6 @@ class LocalizedRobot(LiveTracker):
             run = self._drive.run(self.name, self._map, self._config, state.fixes, state.losses)
         run.save(folder, force)
         return run
-
-    def _checked(self, name: str, given: ArrayLike) -> FloatArray:
-        """A pose within the map, shape (3,)."""
-        pose = checked_pose(name, given)
-        low = np.array(self._map.origin_xy)
-        high = low + self._map.resolution_m * np.array(self._map.cells.shape[::-1])
-        if not ((low <= pose[:2]) & (pose[:2] <= high)).all():
-            raise InputError(
-                f"{name}: ({pose[0]:.6g} m, {pose[1]:.6g} m) is outside of the map, which extends from "
-                f"({low[0]:.1f} m, {low[1]:.1f} m) to ({high[0]:.1f} m, {high[1]:.1f} m)"
-            )
-        return pose
 
     def _estimate(self) -> MapEstimate | None:
         """Where the present session's ``odom`` lies in the map."""

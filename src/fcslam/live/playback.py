@@ -52,7 +52,7 @@ def play(
         SourceError: the recording cannot be read.
     """
     for record in records:
-        if isinstance(record, LaserScan) and not robot.status().catching_up:
+        if isinstance(record, LaserScan) and not robot.status().is_catching_up:
             pace.wait(record.stamp)
         robot.add(record)
         robot.wait_for_room(watch)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, NamedTuple
 
@@ -17,6 +17,7 @@ from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.outbox import WaitingPackets
+from fcslam.wire.http_transport import BatchTransport
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,31 +111,33 @@ class LocalizationState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """State of a robot: its pose, its connection, and counts since its start."""
+    """State of a robot: its place in the map, its connection, and counts since its start."""
 
     scans: int
     keyscans: int
-    waiting: WaitingPackets
+    waiting: WaitingPackets = field(default=WaitingPackets(0, 0))
     """Packets that the server has not confirmed."""
-    confirmed: int
+    confirmed: int = 0
     """Packets that the server has confirmed."""
-    sent_bytes: int
-    left_out: int
+    sent_bytes: int = 0
+    """Bytes of the packets that were sent, each time that they were."""
+    left_out: int = 0
     """Places that are not sent, because the state folder or the budget has no room for them."""
-    refused: int
+    refused: int = 0
     """Packets that the server will never store."""
-    map_index: int | None
+    map_index: int | None = None
     """Index of the robot's map; None before the first correction."""
-    correction_age_s: float | None
-    quality: float
+    correction_age_s: float | None = None
+    """Age of the newest correction; None before the first, and in a finished map."""
+    quality: float = 0.0
     """Quality of the newest correction, in [0, 1]: how well other sessions support the robot's place in the map."""
-    times_lost: int
+    times_lost: int = 0
     """Number of times the robot was lost since it started or came to its floor."""
-    trouble: str | None
+    trouble: str | None = None
     """Why packets do not arrive; None if they do, or if there is no server."""
-    catching_up: bool
+    is_catching_up: bool = False
     """Whether a resumed recording has not yet reached the point of interruption."""
-    notices: tuple[str, ...]
+    notices: tuple[str, ...] = ()
     """Messages about packets of another mission, refused packets, the last detector update, a failed back end, and
     jumps of the odometry, if there were any."""
     is_localized: bool | None = None
@@ -213,6 +216,8 @@ class Wiring(NamedTuple):
     keeps_keyframes: bool = False
     """Whether the keyframes of the camera stay in the state folder, for a process that learns from them; the next start
     removes them."""
+    transport: BatchTransport | None = None
+    """Connection to a cloud of a test. None: that to the robot's server, if it has one."""
 
     def started(self, stack: ExitStack) -> Executor:
         """The executor; a process of the robot's own ends with ``stack``."""

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fcslam.api import StrPath, settings_of
+from fcslam.api import settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
@@ -25,7 +26,6 @@ from fcslam.live.inputs import (
     Lasers,
     checked_camera,
     checked_image,
-    checked_pose,
     checked_stamp,
 )
 from fcslam.live.joint_map import JointMap
@@ -42,13 +42,15 @@ from fcslam.records import (
     Keyscan,
     LaserScan,
     SensorRecord,
+    StrPath,
+    checked_pose,
     frozen,
 )
 from fcslam.robot.backend_runner import WorkerBackend
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
-from fcslam.robot.outbox import Outbox, WaitingPackets
+from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import CONNECTING
 from fcslam.robot.uplink import Uplink
 from fcslam.robot.warmup import warm_up_tracking
@@ -56,7 +58,7 @@ from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesTransport, Server, addresses
+from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server, addresses
 from fcslam.wire.messages import Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
@@ -98,7 +100,7 @@ class Robot(LiveTracker):
         laser: Lasers | None = None,
         *,
         camera: CameraModel | None = None,
-        server: str | Server | BatchTransport | None = None,
+        server: str | Server | None = None,
         state: StrPath | None = None,
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         own_map: bool = True,
@@ -113,7 +115,7 @@ class Robot(LiveTracker):
             laser: its LiDAR, or several by name. None: only ``add`` is used.
             camera: its camera, if it has one.
             server: the `fcslam serve` of the robot's fleet: its address, or a ``Server`` with token, certificates and
-                limit, or a transport of your own. None: the robot maps alone.
+                limit. None: the robot maps alone.
             state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
                 With a server it holds the packets that the server has not confirmed. None: nothing is kept.
             config: as in ``map_recordings``.
@@ -151,20 +153,20 @@ class Robot(LiveTracker):
         """Changes of the fleet that were told."""
         with ExitStack() as stack:
             executor = wiring.started(stack)
-            folder = _state_folder(state, server is not None, stack)
+            outbox, transport = None, wiring.transport
             access = Server(server) if isinstance(server, str) else server
-            outbox, transport = None, None if isinstance(access, Server) else access
-            budget_kbps = access.budget_kbps if isinstance(access, Server) else None
+            folder = _state_folder(state, access is not None or transport is not None, stack)
+            budget_kBps = None if access is None else access.budget_kBps
             if folder is not None:
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, LARGEST_OUTBOX_BYTES)))
-            if isinstance(access, Server) and outbox is not None:
+            if access is not None and outbox is not None:
                 urls, shown = addresses(access.url), (access.token, access.ca, access.certificate)
                 transport = InstancesTransport(
                     [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, *shown))) for url in urls]
                 )
                 if own_map:
                     followed = [FleetClient(url, *shown) for url in urls]
-                    self.fleet = stack.enter_context(following(followed, name, self._place, budget_kbps))
+                    self.fleet = stack.enter_context(following(followed, name, self._place, budget_kBps))
                     self._joint = JointMap(self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)
             keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None
@@ -181,7 +183,7 @@ class Robot(LiveTracker):
                     self._clock,
                     self._map_poses.correct_by_server,
                     known,
-                    None if budget_kbps is None else Budget(1e3 * budget_kbps),
+                    None if budget_kBps is None else Budget(1e3 * budget_kBps),
                 )
                 stack.callback(self._uplink.close)
             warm_up_tracking(self._config.robot)
@@ -224,29 +226,32 @@ class Robot(LiveTracker):
                 self._floors[self._part] = floor
 
     def status(self) -> RobotStatus:
-        """Return the state of the robot: its pose, its connection, and counts since its start."""
+        """Return the state of the robot: its place in the map, its connection, and counts since its start."""
         uplink, localizer = self._uplink, self._map_poses.localizer(self._part)
         failure = self._frontend.backend_failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         notices = tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps)))
-        sent = (
-            (uplink.waiting, uplink.confirmed, uplink.sent_bytes, uplink.left_out, uplink.refused)
-            if uplink
-            else (WaitingPackets(0, 0), 0, 0, 0, 0)
+        status = RobotStatus(
+            scans=self._scans,
+            keyscans=self._keyscans,
+            map_index=localizer.map_index,
+            correction_age_s=localizer.age_s,
+            quality=localizer.quality,
+            times_lost=self._part - self._first_on_floor(self._part),
+            notices=notices,
         )
-        times_lost = self._part - self._first_on_floor(self._part)
-        return RobotStatus(
-            self._scans,
-            self._keyscans,
-            *sent,
-            localizer.map_index,
-            localizer.age_s,
-            localizer.quality,
-            times_lost,
-            uplink.trouble if uplink else None,
-            uplink is not None and uplink.is_catching_up,
-            notices,
+        if uplink is None:
+            return status
+        return replace(
+            status,
+            waiting=uplink.waiting,
+            confirmed=uplink.confirmed,
+            sent_bytes=uplink.sent_bytes,
+            left_out=uplink.left_out,
+            refused=uplink.refused,
+            trouble=uplink.trouble,
+            is_catching_up=uplink.is_catching_up,
         )
 
     def map(self) -> OccupancyMap:

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 
 from fcslam.errors import InputError
 from fcslam.lidar.facing import FacingWatch
-from fcslam.live.inputs import Lasers, checked_lasers, checked_pose, checked_robot, checked_scan, checked_stamp
+from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import FloatArray, LaserScan, SensorRecord, frozen
+from fcslam.records import FloatArray, LaserScan, SensorRecord, checked_pose, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.wire.messages import Packet
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
-from fcslam.errors import FcslamError
+from fcslam.errors import FcslamError, InputError
 from fcslam.processes import needing_semaphores, obey_parent, start_method, trim_memory
 from fcslam.records import Keyscan, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -65,11 +65,16 @@ def side_by_side(processes: int) -> Drive:
     """Drive every robot in a process of its own, ``processes`` at a time.
 
     One robot, or one process, needs none. A robot's error is raised where its legs are read.
+
+    Raises:
+        InputError: there is no process.
     """
+    if processes < 1:
+        raise InputError(f"processes={processes}: no robot can be mapped; give 1 or more")
 
     @contextmanager
     def drive(sources: Sequence[Source], config: RobotConfig) -> Iterator[Sequence[Iterator[Leg]]]:
-        if min(processes, len(sources)) == 1:
+        if min(processes, len(sources)) <= 1:
             with one_by_one(sources, config) as robots:
                 yield robots
             return

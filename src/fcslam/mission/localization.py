@@ -11,16 +11,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fcslam.config import dump, one_line, parse_yaml
-from fcslam.errors import EvaluationError, SourceError
+from fcslam.errors import EvaluationError, InputError, SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.maps.drawing import map_png
 from fcslam.mission.mission import Beginning, MissionConfig, continued_config, run_mission
 from fcslam.mission.mission_file import read_mission
-from fcslam.records import FloatArray, LaserScan, frozen
+from fcslam.records import FloatArray, LaserScan, checked_pose, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
@@ -72,6 +73,23 @@ def read_map(path: Path, floor: str = "") -> OccupancyMap:
     if floor:
         raise SourceError(f"{path}: only run folders and mission files know floors; leave the floor out")
     return _read_map_file(path / MAP_YAML if path.is_dir() else path)
+
+
+def pose_in_map(name: str, given: ArrayLike, occupancy: OccupancyMap) -> FloatArray:
+    """A pose (x, y, theta) within the map, metres and radians, shape (3,); ``name`` is what messages call it.
+
+    Raises:
+        InputError: it is not a pose, or outside of the map.
+    """
+    pose = checked_pose(name, given)
+    low = np.array(occupancy.origin_xy)
+    high = low + occupancy.resolution_m * np.array(occupancy.cells.shape[::-1])
+    if not ((low <= pose[:2]) & (pose[:2] <= high)).all():
+        raise InputError(
+            f"{name}: ({pose[0]:.6g} m, {pose[1]:.6g} m) is outside of the map, which extends from "
+            f"({low[0]:.1f} m, {low[1]:.1f} m) to ({high[0]:.1f} m, {high[1]:.1f} m)"
+        )
+    return pose
 
 
 def _floors(folder: Path) -> dict[int, str]:

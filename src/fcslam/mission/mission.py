@@ -68,6 +68,11 @@ class MissionConfig(Settings):
             )
         return self
 
+    @property
+    def cloud(self) -> CloudConfig:
+        """The part that a mission stores."""
+        return CloudConfig.model_validate({key: getattr(self, key) for key in CloudConfig.model_fields})
+
 
 @dataclass(frozen=True, slots=True)
 class Progress:
@@ -110,7 +115,7 @@ class Beginning:
 
 def continued_config(earlier: SavedMission) -> MissionConfig:
     """The default configuration, with the cloud's settings of an earlier mission."""
-    return MissionConfig(seed=earlier.config.seed, fleet=earlier.config.fleet, map=earlier.config.map)
+    return MissionConfig.model_validate(dict(earlier.config))
 
 
 def run_mission(
@@ -197,7 +202,7 @@ class MissionCloud:
         onto = self._beginning.onto
         packets = sorted(onto.stored, key=lambda packet: packet.order)
         is_later = not packets or first is None or first.packet.order > packets[-1].order
-        if onto.state is None or not is_later or self._edits != onto.edits or self._settings != onto.config:
+        if onto.state is None or not is_later or self._edits != onto.edits or self.config.cloud != onto.config:
             return False
         try:
             config, state = self.config, onto.state["cloud"]
@@ -260,7 +265,7 @@ class MissionCloud:
         tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
-        mission = mission_bytes(self._settings, self._edits, self._packets, self._refused, tracks)
+        mission = mission_bytes(self.config.cloud, self._edits, self._packets, self._refused, tracks)
         placing = self._placed(result)
         run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
         run = replace(run, map_files={**run.map_files, **placing.files})
@@ -273,10 +278,6 @@ class MissionCloud:
         by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
         return anchored(result, anchors, placed, lambda members: fuse_members(members, self.config.map))
-
-    @property
-    def _settings(self) -> CloudConfig:
-        return CloudConfig(seed=self.config.seed, fleet=self.config.fleet, map=self.config.map)
 
     def _state(self) -> State:
         ledger = self._traffic.ledger()

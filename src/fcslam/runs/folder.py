@@ -28,6 +28,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fcslam.errors import EvaluationError, OutputError
+from fcslam.records import StrPath
 from fcslam.runs.map_files import OccupancyMap, parse_map
 from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
@@ -98,7 +99,7 @@ class Run:
         """
         return dict(sorted(self._decoded_maps()))
 
-    def save(self, folder: str | os.PathLike[str], force: bool = False) -> None:
+    def save(self, folder: StrPath, force: bool = False) -> None:
         """Write the run folder, whole or not at all.
 
         Args:
@@ -172,7 +173,7 @@ def identity(folder: Path) -> tuple[int, int]:
     return found.st_ino, found.st_mtime_ns
 
 
-def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
+def open_run(folder: StrPath, maps: bool = True) -> Run:
     """Read a run folder back; files are read, never executed.
 
     Args:

@@ -5,12 +5,11 @@ import ssl
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from urllib.parse import quote, urlsplit
 
-from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
-from fcslam.records import Channel
+from fcslam.errors import CloudError, InputError, OversizeError, PacketError, UnavailableError
+from fcslam.records import Channel, StrPath
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
@@ -63,14 +62,18 @@ class Server:
 
     url: str
     """Address of the cloud, or those of its instances with commas between them."""
-    token: str | None = None
-    """The robot's bearer token."""
-    ca: Path | None = None
+    token: str | None = field(default=None, repr=False)
+    """The robot's bearer token; ``repr`` hides it."""
+    ca: StrPath | None = None
     """PEM file of the authority that signed the cloud's certificate; None: the authorities of the system."""
-    certificate: tuple[Path, Path] | None = None
+    certificate: tuple[StrPath, StrPath] | None = None
     """PEM files of the robot's certificate and key, which replace the token."""
-    budget_kbps: float | None = None
-    """Limit of the uplink, kB per second by the stamps; None: everything is sent."""
+    budget_kBps: float | None = None
+    """Limit of the uplink, kB per second by the stamps, above 0; None: everything is sent."""
+
+    def __post_init__(self) -> None:
+        if self.budget_kBps is not None and not self.budget_kBps > 0.0:
+            raise InputError(f"{self.url}: budget_kBps={self.budget_kBps}; give a number above 0, or None for no limit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +124,8 @@ class HttpClient:
         self,
         url: str,
         token: str | None = None,
-        ca: Path | None = None,
-        own: tuple[Path, Path] | None = None,
+        ca: StrPath | None = None,
+        own: tuple[StrPath, StrPath] | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> None:
         """Open a client.
@@ -232,8 +235,8 @@ class HttpTransport(HttpClient):
         robot: str,
         agent: str,
         token: str | None = None,
-        ca: Path | None = None,
-        own: tuple[Path, Path] | None = None,
+        ca: StrPath | None = None,
+        own: tuple[StrPath, StrPath] | None = None,
     ) -> None:
         """Open a client; raises as ``HttpClient``.
 
@@ -330,7 +333,7 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _check_url(url: str, token: str | None, own: tuple[Path, Path] | None) -> None:
+def _check_url(url: str, token: str | None, own: tuple[StrPath, StrPath] | None) -> None:
     try:
         parts = urlsplit(url)
         has_place = parts.hostname and parts.port != 0 and not any(map(str.isspace, url))
@@ -339,20 +342,21 @@ def _check_url(url: str, token: str | None, own: tuple[Path, Path] | None) -> No
         is_address = False
     if not is_address or not parts.hostname:
         raise CloudError(f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443")
-    if token and parts.scheme == "http" and not _is_loopback(parts.hostname):
+    if token and parts.scheme == "http" and not is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be sent unencrypted; use https")
     if own and parts.scheme == "http":
         raise CloudError(f"{url}: certificates need https")
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a host."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-def _trust(ca: Path | None, own: tuple[Path, Path] | None) -> ssl.SSLContext:
+def _trust(ca: StrPath | None, own: tuple[StrPath, StrPath] | None) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except (OSError, ssl.SSLError) as error:
