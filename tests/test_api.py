@@ -194,7 +194,7 @@ def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, 
 
 @pytest.mark.parametrize("place", ["nowhere", "."])
 def test_a_folder_that_holds_no_run_is_refused(place, tmp_path):
-    with pytest.raises(fcslam.InputError, match="no run folder") as raised:
+    with pytest.raises(fcslam.InputError, match="not a run folder") as raised:
         fcslam.open_run(tmp_path / place)
     assert "\n" not in str(raised.value)
 

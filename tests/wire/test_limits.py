@@ -271,7 +271,7 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("keyscan", {"stamp": -INF}, "stamp"),
         ("keyscan", {"stamp": 1e9}, "later"),
         ("keyscan", {"ranges": bytes(29)}, "29 bytes, at most 28"),
-        ("keyscan", {"ranges": b"\x01\x02\x03\x00"}, "cut off or goes on"),
+        ("keyscan", {"ranges": b"\x01\x02\x03\x00"}, "ends early or has bytes"),
         ("keyscan", {"count": 4097, "ranges": bytes(2 * 4097)}, "4097, at most 4096"),
         ("keyscan", {"count": 2**32 - 1}, "at most 4096"),
         ("keyscan", {"count": 0, "ranges": b""}, "version 2 of a packet of version 4"),
