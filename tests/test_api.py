@@ -249,7 +249,7 @@ def test_a_start_that_no_map_has_is_refused_before_the_work(pose, said, logs, op
 
 @pytest.mark.parametrize("place", ["nowhere", "."])
 def test_a_folder_that_holds_no_run_is_refused(place, tmp_path):
-    with pytest.raises(fcslam.InputError, match="no run folder") as raised:
+    with pytest.raises(fcslam.InputError, match="not a run folder") as raised:
         fcslam.open_run(tmp_path / place)
     assert "\n" not in str(raised.value)
 

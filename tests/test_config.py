@@ -96,7 +96,7 @@ def test_files_that_are_no_configuration(tmp_path, content):
 def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
     path = tmp_path / "c.yaml"
     path.write_text(content)
-    with pytest.raises(ConfigError, match=r"c\.yaml: not valid YAML \(the key '(seed|robot)' is there twice"):
+    with pytest.raises(ConfigError, match=r"c\.yaml: not valid YAML \(the key '(seed|robot)' occurs twice"):
         load(MissionConfig, path)
 
 

@@ -68,7 +68,7 @@ def test_a_session_stays_on_its_floor(alike):
     fleet = Fleet(FleetConfig(), 0)
     (hello,) = (packet for packet in alike[0] if isinstance(packet.body, Hello))
     fleet.apply(hello.on_floor("1"))
-    with pytest.raises(PacketError, match="another floor; that takes a new session"):
+    with pytest.raises(PacketError, match="another floor; a new floor needs a new session"):
         fleet.apply(replace(hello.on_floor("2"), sequence=1))
 
 
@@ -111,7 +111,7 @@ def test_a_robot_is_localised_in_the_map_of_its_floor(mapped):
     for place in (whole, whole / "mission.fcslam"):
         for floor, expected in zip("12", maps, strict=True):
             assert np.array_equal(read_map(place, floor).cells, expected.cells)
-        with pytest.raises(SourceError, match=r"has maps of several floors \(1, 2\); name that of the robot"):
+        with pytest.raises(SourceError, match=r"has maps of several floors \(1, 2\); name the robot's floor"):
             read_map(place)
         with pytest.raises(SourceError, match="has no map of floor '3'; its floors: 1, 2"):
             read_map(place, "3")

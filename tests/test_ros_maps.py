@@ -108,7 +108,7 @@ def test_the_image_may_lie_elsewhere(tmp_path):
     (tmp_path / "there" / "office.pgm").rename(tmp_path / "here" / "office.pgm")
     moved = save(tmp_path / "here", b"", image="/home/someone/office.pgm")
     assert np.array_equal(read_map(moved).cells, CELLS)
-    with pytest.raises(SourceError, match=r"/home/someone/other\.pgm: no map can be read"):
+    with pytest.raises(SourceError, match=r"/home/someone/other\.pgm: cannot be read as a map"):
         read_map(save(tmp_path / "here", b"", image="/home/someone/other.pgm"))
 
 

@@ -202,7 +202,7 @@ def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path, run):
 
 def test_what_is_no_run_folder_is_refused(tmp_path):
     for path in (tmp_path, tmp_path / "missing"):
-        with pytest.raises(EvaluationError, match="no run folder"):
+        with pytest.raises(EvaluationError, match="not a run folder"):
             open_run(path)
 
 

@@ -8,6 +8,7 @@ To correct a page, correct the help of the command or the docstring of the route
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +31,10 @@ COMMANDS = """\
 The command `fcslam` has the subcommands and options below. `make docs` writes the page from the code;
 the option `--help` of each command prints the same.
 """
+
+ROWS = ["| argument or option | default or range | meaning |", "|---|---|---|"]
+LONG = 25
+"""Words from which on a row that several commands share is written once."""
 
 REST = """\
 # REST interface
@@ -66,7 +71,28 @@ def cell(text: str) -> str:
 def commands_page() -> str:
     """The page of all commands."""
     command = cast(click.Group, typer.main.get_command(command_line))
-    return "\n".join([COMMANDS, *sections(command, click.Context(command, info_name="fcslam"))])
+    found = list(sections(command, click.Context(command, info_name="fcslam")))
+    shared = shared_rows("\n".join(found))
+    table = ["## Options of several commands", "", *ROWS, *shared, ""]
+    return "\n".join([COMMANDS, *table, *(refer(part, shared) for part in found)])
+
+
+def shared_rows(text: str) -> list[str]:
+    """Long rows of options that several commands have; of each name the most frequent one."""
+    counts = Counter(line for line in text.split("\n") if line.startswith("| `-") and len(line.split()) >= LONG)
+    by_name: dict[str, str] = {}
+    for line, count in counts.most_common():
+        if count > 1:
+            by_name.setdefault(line.partition(" | ")[0], line)
+    return list(by_name.values())
+
+
+def refer(text: str, shared: list[str]) -> str:
+    """A section in which shared rows lead to the table of all commands."""
+    for line in shared:
+        head = line.removesuffix(" |").rpartition(" | ")[0]
+        text = text.replace(line, f"{head} | [shared](#options-of-several-commands) |")
+    return text
 
 
 def sections(group: click.Group, context: click.Context) -> Iterator[str]:
@@ -88,7 +114,7 @@ def section(command: click.Command, context: click.Context) -> str:
     lines = [*head, "```text", f"Usage: {usage}", "```", ""]
     rows = [row(parameter, context) for parameter in command.params if not getattr(parameter, "hidden", False)]
     if rows and not isinstance(command, click.Group):
-        lines += ["| argument or option | default or range | meaning |", "|---|---|---|", *rows, ""]
+        lines += [*ROWS, *rows, ""]
     examples = [line for line in (command.epilog or "").split("\n") if line.startswith("fcslam ")]
     if examples:
         lines += ["```sh", *examples, "```", ""]

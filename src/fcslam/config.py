@@ -139,7 +139,7 @@ class _PlainLoader(yaml.SafeLoader):
         if any(tag == "tag:yaml.org,2002:merge" for tag, _ in keys):
             raise yaml.constructor.ConstructorError(None, None, "merge keys (<<) are not read", node.start_mark)
         if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"the key '{twice[1]}' is there twice", node.start_mark)
+            raise yaml.constructor.ConstructorError(None, None, f"the key '{twice[1]}' occurs twice", node.start_mark)
         return super().construct_mapping(node, deep)
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:

@@ -161,7 +161,7 @@ def test_a_plan_that_cannot_be_used_gets_one_line(tmp_path):
         (picture(tmp_path), -1.0, "above 0"),
         (picture(tmp_path), 10.0, "check the scale"),
         (blank, 0.02, "no lines"),
-        (tmp_path / "broken.png", 0.02, "no picture"),
+        (tmp_path / "broken.png", 0.02, "cannot be read as a picture"),
         (tmp_path / "missing.png", 0.02, "cannot be read"),
         (tmp_path / "missing.yaml", None, "cannot be read"),
     ]

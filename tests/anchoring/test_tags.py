@@ -129,7 +129,7 @@ def test_a_tag_seen_at_two_places_is_named():
     after = sightings(true, moved, rows=slice(middle, None))
     assert {1} <= {one.tag.number for one in before} & {one.tag.number for one in after}
     (line,) = lines(placed(result, (*before, *after)))
-    assert line.startswith("tag apriltag_36h11 1 was moved or is there twice")
+    assert line.startswith("tag apriltag_36h11 1 was moved or hangs twice")
     assert line.endswith("0.50 m apart")
 
 

@@ -82,10 +82,10 @@ def test_relations_across_robots_with_the_parts_of_another_run(run_and_relations
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["missing", "{relations}"], "missing: no run folder"),
+        (["missing", "{relations}"], "missing: not a run folder"),
         (["{run}", "missing"], "missing: cannot read the relations"),
         (["{run}", "{run}"], "cannot read the relations"),
-        (["{run}", "{relations}", "--parts", "missing"], "missing: no run folder"),
+        (["{run}", "{relations}", "--parts", "missing"], "missing: not a run folder"),
         (["{run}", "{relations}", "--csv", "missing/table.csv"], "cannot write the table"),
     ],
 )

@@ -42,11 +42,11 @@ def refused(capsys, *words):
 
 def test_what_is_no_run_is_told_in_one_line(run, tmp_path, capsys):
     (tmp_path / "text").write_text("no mission")
-    assert "no run folder" in refused(capsys, tmp_path)
-    assert "no run folder" in refused(capsys, tmp_path / "nothing")
+    assert "not a run folder" in refused(capsys, tmp_path)
+    assert "not a run folder" in refused(capsys, tmp_path / "nothing")
     assert "text" in refused(capsys, tmp_path / "text")
     (run / "closures.csv").write_text("damaged")
-    assert "broken run folder" in refused(capsys, run)
+    assert "damaged run folder" in refused(capsys, run)
 
 
 def test_a_damaged_map_is_told_in_one_line(run, capsys):

@@ -32,7 +32,7 @@ HOSTILE = {
     "motion of an unknown robot": (motion("x", 0, 1, STEP), "does not lead to a new keyscan"),
     "closure of an unknown robot": (motion("x", 0, 1, STEP, ConstraintKind.CLOSURE), "names keyscan 0"),
     "place of an unknown robot": (place("x", 0), "names keyscan 0"),
-    "another laser": (Hello("a", 0, (replace(LASER, max_range_m=9.0),), {}), "hello again with another laser"),
+    "another laser": (Hello("a", 0, (replace(LASER, max_range_m=9.0),), {}), "changes or lacks an announced laser"),
     "a laser that is not announced": (replace(keyscan("a", NUMBER, NOW), laser=1), "of laser 1, 1 announced"),
     "beams of another laser": (
         replace(keyscan("a", NUMBER, NOW, beams=4), beams=Beams(4, -np.pi, np.pi / 2)),
@@ -225,9 +225,9 @@ def test_a_further_laser_may_be_announced_later(scripted):
     varied = replace(keyscan("a", NUMBER, NOW, beams=9), laser=1, beams=Beams(9, -np.pi, 2.0 * np.pi / 9))
     versions = {Channel.LIDAR: "test-1"}
     sent = [
-        (Hello("a", 0, (rear,), versions), "another laser"),
+        (Hello("a", 0, (rear,), versions), "an announced laser"),
         (Hello("a", 0, (LASER, rear), versions), None),
-        (Hello("a", 0, (LASER,), versions), "another laser"),
+        (Hello("a", 0, (LASER,), versions), "an announced laser"),
         (varied, None),
     ]
     for after, (body, reason) in enumerate(sent):

@@ -35,7 +35,7 @@ def test_a_network_unlike_the_own_ones_is_refused(tmp_path, kind):
             graph.node.insert(0, helper.make_node("ConstantOfShape", ["shape"], ["zeros"]))
             graph.node[1].input[1] = "zeros"
             model.graph.node[1].op_type = "Add"
-            reason = "limits of|does not run|no ONNX"
+            reason = "limits of|does not run|not an ONNX"
         case "huge array":
             graph.initializer[0].dims[:] = [1 << 20, 1 << 20]
             reason = "the limit"

@@ -140,7 +140,7 @@ def test_networks_that_break_the_contract_are_refused(tmp_path, broken, message)
 
 def test_foreign_and_missing_files_are_refused(tmp_path):
     (tmp_path / "n.onnx").write_bytes(b"no network at all")
-    with pytest.raises(FeatureError, match="no ONNX network"):
+    with pytest.raises(FeatureError, match="not an ONNX network"):
         OnnxDetector(OnnxConfig(weights=tmp_path / "n.onnx"))
     with pytest.raises(FeatureError, match="cannot read the network weights"):
         OnnxDetector(OnnxConfig(weights=tmp_path / "missing.onnx"))

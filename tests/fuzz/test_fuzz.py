@@ -91,5 +91,5 @@ def test_yaml_that_its_parser_fails_on_is_refused_in_a_line(text):
 def test_the_image_of_a_map_in_the_home_of_nobody_is_one_line(tmp_path):
     """Found by coverage."""
     (tmp_path / "map.yaml").write_text("image: ~nobody-of-this-name/map.pgm\n")
-    with pytest.raises(SourceError, match="no map can be read"):
+    with pytest.raises(SourceError, match="cannot be read as a map"):
         read_map(tmp_path / "map.yaml")

@@ -130,8 +130,8 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_p
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
-    assert "no map can be read" in refusal(tmp_path / "missing")
-    assert "no mission file" in refusal(tmp_path / "missing.fcslam")
+    assert "cannot be read as a map" in refusal(tmp_path / "missing")
+    assert "not a mission file" in refusal(tmp_path / "missing.fcslam")
     (tmp_path / "empty.fcslam").write_bytes(b"")
     assert "empty.fcslam" in refusal(tmp_path / "empty.fcslam")
     bare = np.full((50, 50), fcslam.Occupancy.UNKNOWN, np.uint8)
@@ -145,7 +145,7 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_p
     assert "leave the floor out" in refusal(tmp_path / "wide.yaml", floor="2")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "robots.csv").write_text("robot,map,path_length_m,scans,floor\na,0,1,1,two words\n")
-    assert "broken run folder ('two words' is not a floor)" in refusal(tmp_path / "run", floor="2")
+    assert "damaged run folder ('two words' is not a floor)" in refusal(tmp_path / "run", floor="2")
 
 
 def test_a_mission_file_is_a_map(fleet, tmp_path):

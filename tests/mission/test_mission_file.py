@@ -208,7 +208,7 @@ def test_a_mission_file_survives_the_run_folder(begun, tmp_path):
 
 def test_what_is_no_mission_file_is_told_in_one_line(begun, tmp_path):
     whole = (begun / "mission.fcslam").read_bytes()
-    with pytest.raises(SourceError, match=r"nowhere: no mission file; `fcslam map` writes one"):
+    with pytest.raises(SourceError, match=r"nowhere: not a mission file; `fcslam map` writes one"):
         read_mission(tmp_path / "nowhere")
     for name, content in (("empty", b""), ("cut", whole[: len(whole) // 2]), ("text", b"hello\n" * 999)):
         path = tmp_path / name

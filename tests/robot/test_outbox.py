@@ -295,7 +295,7 @@ def test_an_outbox_of_another_version_is_told_as_such(path):
     with sqlite3.connect(path) as older:
         older.execute("CREATE TABLE sessions (epoch INTEGER PRIMARY KEY, recording TEXT NOT NULL)")
     older.close()
-    with pytest.raises(StateError, match="is of another version of fcslam; give another --state"):
+    with pytest.raises(StateError, match="comes from another version of fcslam; give another --state"):
         Outbox(path, "anna", LIMIT)
 
 

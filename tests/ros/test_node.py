@@ -160,7 +160,7 @@ def test_a_robot_of_the_same_name_that_comes_later_is_told_once(network, robot):
     network.others.append(offered("/robot1/map", "nav_msgs/OccupancyGrid", latched=True))
     for _ in range(2):
         node.watch_network()
-    assert said == ["another node publishes /robot1/map now, too; two robots must not have one name"]
+    assert said == ["another node publishes /robot1/map now, too; give each robot a name of its own"]
 
 
 def test_missing_topics_end_the_wait():

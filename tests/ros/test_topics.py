@@ -103,7 +103,7 @@ def test_addresses():
 
 @pytest.mark.parametrize("domain", [233, -1])
 def test_a_domain_out_of_range(domain):
-    with pytest.raises(NetworkError, match="is not a domain of ROS 2"):
+    with pytest.raises(NetworkError, match="is not a ROS 2 domain"):
         open_network(RosAddress("ros2", ""), domain, {})
 
 

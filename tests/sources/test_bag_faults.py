@@ -322,7 +322,7 @@ def test_a_range_max_that_is_none_is_unknown(tmp_path, range_max):
         ({"angle_increment": 0.0, "angle_max": 1.0}, "angle_increment is 0"),
         ({"angle_min": math.nan}, "an angle is not finite"),
         ({"ranges": ()}, "0 ranges"),
-        ({"payload": b"0"}, "the bytes are no message of this type"),
+        ({"payload": b"0"}, "the bytes are not a message of this type"),
         ({"frame": "x" * 300}, "the name of a frame is too long"),
     ],
 )
@@ -347,7 +347,7 @@ def test_odometry_without_an_orientation_is_read_from_tf(tmp_path):
     source = open_source(save(tmp_path / "run.bag", broken))
     wanted = scans_of(open_source(save(tmp_path / "good.bag", good)))
     assert all((a.T_odom_base == b.T_odom_base).all() for a, b in zip(scans_of(source), wanted, strict=True))
-    why = "/odom cannot be read (the orientation 0, 0, 0, 0 is no unit quaternion), so it is not used"
+    why = "/odom cannot be read (the orientation 0, 0, 0, 0 is not a unit quaternion), so it is not used"
     assert why in " ".join(source.survey().notes)
     fleet = open_fleet([(tmp_path / "run.bag", "a"), (save(tmp_path / "other.bag", [*broken, text(101.0)]), "b")])
     assert all(len(scans_of(each)) == 30 for each in fleet)
@@ -356,7 +356,7 @@ def test_odometry_without_an_orientation_is_read_from_tf(tmp_path):
 def test_an_orientation_that_is_none_is_named(tmp_path):
     source = open_source(save(tmp_path / "run.bag", with_fields(drive(30), "/odom", rotation=NOT_A_ROTATION)))
     first, second = source.survey().notes
-    assert "/odom cannot be read (the orientation 0, 0, 0, 0 is no unit quaternion)" in first
+    assert "/odom cannot be read (the orientation 0, 0, 0, 0 is not a unit quaternion)" in first
     assert "no odometry" in second
     message = refusal(save(tmp_path / "tf.bag", with_fields(drive(30), "/tf_static", rotation=NOT_A_ROTATION)))
     assert "no transform from 'base_link' to 'laser' (/tf_static, message 1 of it: the orientation 0" in message

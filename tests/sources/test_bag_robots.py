@@ -173,7 +173,7 @@ def test_the_frames_on_one_topic_are_lasers_of_one_robot(tmp_path):
 
 def test_a_frame_that_tf_lacks_is_named(tmp_path):
     path = save(tmp_path / "run.mcap", two_frames(rear_in_tf=False))
-    assert "no transform from 'base_link' to 'rear', so it does not say where the laser of /scan in 'rear'" in refusal(
+    assert "no transform from 'base_link' to 'rear', so the pose of the laser of /scan in 'rear' is unknown" in refusal(
         path
     )
     assert "for the lasers /scan in 'front', /scan in 'rear'" in refusal(path, BagOptions(laser_poses=((0, 0, 0),)))
@@ -265,7 +265,7 @@ def test_a_robot_without_odometry_does_not_spoil_the_other(tmp_path):
     other = [each for each in robot(1, space="/robot2") if each.topic != "/robot2/odom"]
     (found,) = open_fleet([(save(tmp_path / "run.mcap", [*own, *other]), None)])
     assert same(found, open_source(save(tmp_path / "alone.mcap", own)))
-    assert any("on /robot2/scan are of no robot with odometry, unused" in note for note in found.survey().notes)
+    assert any("on /robot2/scan belong to no robot with odometry; not used" in note for note in found.survey().notes)
 
 
 def test_robots_without_namespaces_and_prefixes_are_named_by_their_frames(tmp_path):

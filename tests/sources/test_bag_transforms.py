@@ -76,7 +76,7 @@ def test_the_heading_is_that_of_the_x_axis_whatever_the_sign(yaw):
     ],
 )
 def test_what_is_no_transform(at, q):
-    with pytest.raises(ValueError, match=r"is no unit quaternion|is not finite"):
+    with pytest.raises(ValueError, match=r"is not a unit quaternion|is not finite"):
         transform_of(at, q)
 
 

@@ -384,7 +384,7 @@ ROBOTS = {
     "two publishers that agree": (lambda: with_odometry(lambda k, x, y, a: (x + 0.01 * (k % 2), y, a)), ""),
     "two publishers that differ": (
         lambda: with_odometry(lambda k, x, y, a: (x + 5.0 * (k % 2), y, a)),
-        "as that of two publishers",
+        "as if there were two publishers",
     ),
     "odometry in millimetres": (
         lambda: with_odometry(lambda _, x, y, a: (1000.0 * x, 1000.0 * y, a)),

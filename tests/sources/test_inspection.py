@@ -38,7 +38,7 @@ def test_a_bag_names_its_topics_rates_and_frames(tmp_path, suffix):
 def test_a_bag_that_cannot_be_mapped_is_shown_with_the_reason(tmp_path):
     path = save(tmp_path / "run.bag", without_tf(drive(40)))
     found = inspect(path)
-    assert "it does not say where the laser of /scan sits" in found.problem
+    assert "so the pose of the laser of /scan is unknown" in found.problem
     assert {topic.name for topic in found.bag.topics} == {"/odom", "/scan"}
     assert found.scans == 0
     assert inspect(path, BagOptions(laser_poses=((0.0, 0.0, 0.0),))).problem is None
@@ -74,7 +74,7 @@ def test_a_recording_folder_shows_its_camera(tmp_path):
 
 def test_what_is_no_recording_is_refused(tmp_path):
     (tmp_path / "letter.txt").write_text("dear reader\n")
-    with pytest.raises(SourceError, match="no recording of a known format"):
+    with pytest.raises(SourceError, match="not a recording of a known format"):
         inspect(tmp_path / "letter.txt")
     with pytest.raises(SourceError):
         inspect(tmp_path / "nowhere.bag")

@@ -213,7 +213,7 @@ HOSTILE = {
     "an offset outside": ({"fields": ("y", "offset", 20)}, "field y at offset 20 is outside of point_step 22"),
     "a huge offset": ({"fields": ("x", "offset", 2**32 - 1)}, "field x at offset 4294967295 is outside"),
     "an unknown type": ({"fields": ("z", "datatype", 9)}, "field z has the datatype 9"),
-    "coordinates as integers": ({"fields": ("x", "datatype", 5)}, "field x is missing or no float"),
+    "coordinates as integers": ({"fields": ("x", "datatype", 5)}, "field x is missing or not a float"),
     "a missing axis": ({"fields": ("z", "name", "height")}, "field z is missing"),
     "a huge size": ({"width": 2**32 - 1, "height": 2**32 - 1}, "width 4294967295 and height 4294967295 are too large"),
     "too few bytes": ({"width": 10**6}, "633600 bytes of data do not hold 1 rows of 1000000 points"),
@@ -239,7 +239,7 @@ def test_an_invalid_cloud_is_refused_by_its_field(changes, said):
     ("attribute", "value", "said"),
     [
         ("encoding", "rgb8", "'rgb8' is not that of a depth image"),
-        ("width", 2**31, "those of no depth image"),
+        ("width", 2**31, "do not describe a depth image"),
         ("step", 1, "step 1"),
         ("height", 7, "do not fill"),
     ],

@@ -202,7 +202,7 @@ def test_a_laser_that_falls_silent_does_not_hold_up_the_other(tmp_path):
         (
             front_and_rear(rear_pose=False),
             BOTH,
-            "where the laser of /rear sits; say it by --sensors laser-pose=X,Y,THETA ",
+            "so the pose of the laser of /rear is unknown; give it with --sensors laser-pose=X,Y,THETA ",
         ),
         (
             front_and_rear(),

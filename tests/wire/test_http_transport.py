@@ -124,7 +124,7 @@ def test_an_answer_that_cannot_be_unpacked_is_none(cloud, transport):
 )
 def test_another_server_is_no_cloud(cloud, transport, body):
     cloud.canned.append((200, {}, body))
-    with pytest.raises(CloudError, match="not that of an fcslam cloud"):
+    with pytest.raises(CloudError, match="does not come from an fcslam cloud"):
         transport.state()
 
 

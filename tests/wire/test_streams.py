@@ -176,7 +176,7 @@ def test_streams_that_go_on_after_their_end_are_refused(what):
     }[what]
     assert len(packed) < 50 * PLAIN[what] - 3
     for broken in (packed + b"\x00", packed + b"\x00\x00\x01", packed + bytes(3)):
-        with pytest.raises(PacketError, match=f"{what}: the stream is cut off or goes on"):
+        with pytest.raises(PacketError, match=f"{what}: the stream ends early or has bytes"):
             unpack_any(what, broken, 50)
     with pytest.raises(PacketError, match=f"at most {50 * PLAIN[what]}"):
         unpack_any(what, bytes(50 * PLAIN[what] + 1), 50)

@@ -76,14 +76,14 @@ def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
 
 def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
     if scale is not None:
-        raise SourceError(f"{path}: a map of ROS has its own resolution; leave --plan-scale out")
+        raise SourceError(f"{path}: a ROS map has its own resolution; leave --plan-scale out")
     try:
         description = read_text(path, most=MOST_TEXT_BYTES)
         content = parse_yaml(description)
     except ValueError:
         content = None
     if not isinstance(content, dict) or not isinstance(content.get("image"), str):
-        raise SourceError(f"{path}: no map of map_server; it names no image")
+        raise SourceError(f"{path}: not a map for ROS map_server; it names no image")
     plan = parse_ros_map(str(path), read_bytes(path.parent / content["image"]), description)
     cells = np.where(plan.cells == Occupancy.OCCUPIED, plan.cells, Occupancy.FREE).astype(np.uint8)
     return OccupancyMap(cells, plan.resolution_m, plan.origin_xy)
@@ -101,7 +101,7 @@ def _drawn_plan(path: Path, scale: float | None) -> OccupancyMap:
     finally:
         cv2.utils.logging.setLogLevel(before)
     if pixels is None:
-        raise SourceError(f"{path}: no picture that can be read; save the plan as PNG, DXF or a ROS map (YAML)")
+        raise SourceError(f"{path}: cannot be read as a picture; save the plan as PNG, DXF or a ROS map (YAML)")
     if pixels.shape[0] * pixels.shape[1] > MOST_PIXELS:
         raise SourceError(f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} pixels; make it smaller or crop it")
     cells = np.where(_lines(_colours(pixels)), Occupancy.OCCUPIED, Occupancy.FREE).astype(np.uint8)
@@ -161,7 +161,7 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
     try:
         drawing: Any = ezdxf.readfile(path)
     except (ezdxf.DXFError, UnicodeDecodeError, ValueError) as error:
-        raise SourceError(f"{path}: no DXF drawing that can be read ({error}); save it as DXF again") from error
+        raise SourceError(f"{path}: cannot be read as a DXF drawing ({error}); save it as DXF again") from error
     if scale is None and not drawing.units:
         raise SourceError(
             f"{path}: the drawing does not name its unit; give metres per unit: --plan-scale 0.001 for millimetres"

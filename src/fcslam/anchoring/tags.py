@@ -341,7 +341,7 @@ def tag_lines(report: Mapping[str, Any]) -> Iterator[str]:
             places = [f"{', '.join(at['robots'])} at ({at['x']:.2f}, {at['y']:.2f})" for at in row["places"]]
             gap_m = max(float(np.hypot(a["x"] - b["x"], a["y"] - b["y"])) for a, b in combinations(row["places"], 2))
             yield (
-                f"tag {row['family']} {row['number']} was moved or is there twice: seen by {' and by '.join(places)}, "
+                f"tag {row['family']} {row['number']} was moved or hangs twice: seen by {' and by '.join(places)}, "
                 f"{gap_m:.2f} m apart"
             )
     for robot, scale in report["distances"].items():

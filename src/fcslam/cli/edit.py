@@ -40,7 +40,7 @@ Session = Annotated[str, typer.Argument(help="Session, such as anna or anna+1.")
 SessionI = Annotated[str, typer.Argument(metavar="SESSION_I", help="One session, such as anna or anna+1.")]
 SessionJ = Annotated[str, typer.Argument(metavar="SESSION_J", help="The other session.")]
 StampI = Annotated[float, typer.Argument(metavar="STAMP_I", help="Seconds, as in closures.csv.")]
-StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="The same of the other session.")]
+StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="Seconds, of the other session.")]
 
 
 @app.command("list", epilog=examples("fcslam edit list runs/building"))
@@ -65,7 +65,7 @@ def list_edits(mission: Mission) -> None:
 
 @app.command(epilog=examples("fcslam edit undo runs/building 2"))
 def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of the edit.")]) -> None:
-    """Undo an edit. The map is then what it would have been without it."""
+    """Undo an edit. The map is then as if the edit had never been made."""
     from fcslam.records import Undo
 
     _append(mission, Undo(number))
@@ -120,7 +120,7 @@ def close(
         str, typer.Option(metavar="M,RAD", help="Standard deviations of the pose (metres, radians).")
     ] = "0.2,0.1",
 ) -> None:
-    """Add a closure: where session J was at a time, seen from session I at another. It joins maps."""
+    """Add a closure: the pose of session J at one time, as seen from session I at another time. It joins maps."""
     from fcslam.cli.recordings import pose as read_pose
     from fcslam.errors import InputError
     from fcslam.records import ManualClosure
@@ -164,7 +164,7 @@ def floor(
     session: Session,
     name: Annotated[str, typer.Argument(metavar="FLOOR", help="1 to 16 letters, digits and . _ + -")],
 ) -> None:
-    """Say which floor a session is on, whatever it named. It leaves the maps of other floors."""
+    """Set the floor of a session. The session leaves the maps of other floors."""
     from fcslam.records import FloorLabel
 
     _append(mission, FloorLabel(session, name))
@@ -235,7 +235,7 @@ def place(
     ] = None,
     match: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y=U,V", help="A point of the map and where it shall be (metres); give two or more."),
+        typer.Option(metavar="X,Y=U,V", help="A point of the map and its target (metres); give two or more."),
     ] = None,
     map_index: MapIndex = 0,
 ) -> None:

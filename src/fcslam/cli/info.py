@@ -39,7 +39,7 @@ def info(
     ] = False,
     sensors: Sensors = None,
 ) -> None:
-    """Say what is in a recording, and whether it can be mapped; if not, why, and the exit code is 1."""
+    """List what is in a recording, and whether it can be mapped. If not, say why and exit with code 1."""
     from fcslam.sources.inspection import inspect
 
     options = bag_options(sensors)

@@ -60,8 +60,8 @@ def localize(
         bool,
         typer.Option(
             "--update",
-            help="Draw what changed since into the map of the run folder, where at least three scans show it. The "
-            "map before stays beside it as map_before.",
+            help="Update the map of the run folder where at least three scans show a change. The previous map stays "
+            "beside it as map_before.",
         ),
     ] = False,
     config: ConfigFiles = None,
@@ -73,7 +73,7 @@ def localize(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find a robot in a finished map and follow it; the map that is given does not change.
+    """Find a robot in a finished map and follow it. The map does not change.
 
     The run folder holds the poses that the robot believed, and for every scan its standard deviations and quality.
     """

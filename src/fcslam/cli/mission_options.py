@@ -30,7 +30,7 @@ ConfigFiles = Annotated[
 SettingsFiles = Annotated[
     list[str] | None,
     typer.Option(
-        "--config", "-c", metavar="FILE|KEY=VALUE", help="File of settings (YAML), or one of its keys. Can be repeated."
+        "--config", "-c", metavar="FILE|KEY=VALUE", help="Settings file (YAML), or one of its keys. Can be repeated."
     ),
 ]
 NO_FILES: Mapping[str, Path] = {}

@@ -177,7 +177,7 @@ def _check_name(name: str) -> None:
         raise SourceError(f"{error}; give another one: NAME=LOG") from error
     stem, plus, number = name.rpartition("+")
     if plus and number.isdigit():
-        raise SourceError(f"robot: {name!r} is how a later start of {stem!r} is called; give another one: NAME=LOG")
+        raise SourceError(f"robot: {name!r} is the name of a later session of {stem!r}; give another one: NAME=LOG")
 
 
 def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kBps: float | None, floor: str) -> str:

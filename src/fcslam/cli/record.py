@@ -142,7 +142,7 @@ def _prepare(output: Path, force: bool) -> None:
         if output.exists() and not force:
             raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
         if output.is_dir() and (mark is None or not (output / mark).is_file()):
-            raise OutputError(f"{output}: is a folder and no recording; choose another name")
+            raise OutputError(f"{output}: is a folder, not a recording; choose another name")
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
 

@@ -26,7 +26,8 @@ Sensors = Annotated[
     list[str] | None,
     typer.Option(
         metavar="KEY=VALUE",
-        help="What to read of ROS topics in place of what fcslam chooses; repeat it for each key. scan-topic (one for "
+        help="ROS topics and frames to read instead of those that fcslam chooses; repeat it for each key. scan-topic "
+        "(one for "
         "each laser), odom-topic (/tf: from tf; none), camera-topic; odom-frame and base-frame of the odometry in tf; "
         "laser-pose=X,Y,THETA[,upside-down] in the base frame (one for each scan-topic); cloud-band=LOW,HIGH[,BODY], "
         "the heights of a 3D LiDAR or depth camera that count, and the radius of the robot. Metres, radians.",

@@ -51,7 +51,8 @@ def robot(
     keep_private()
     if not is_live(address):
         raise InputError(
-            f"{address}: is not the address of a live robot, as ros2:/robot1 is; `fcslam play` plays a recording to a "
+            f"{address}: is not the address of a live robot, such as ros2:/robot1; `fcslam play` plays a "
+            "recording to a "
             "service"
         )
     live = live_source(address, sensors, ros_parameters, use_sim_time)

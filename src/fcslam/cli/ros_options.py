@@ -20,11 +20,11 @@ RosParameters = Annotated[
     typer.Option(
         metavar="FILE",
         rich_help_panel=_ROS,
-        help="Parameters (YAML), as of a ROS 2 node; those of slam_toolbox that mean the same have its names.",
+        help="Parameters (YAML) of a ROS 2 node, with the names of slam_toolbox where they mean the same.",
     ),
 ]
 UseSimTime = Annotated[
-    bool, typer.Option("--use-sim-time", help="Time is what /clock says, as in a simulator.", rich_help_panel=_ROS)
+    bool, typer.Option("--use-sim-time", help="Take the time from /clock, as with a simulator.", rich_help_panel=_ROS)
 ]
 
 

@@ -17,8 +17,8 @@ ServerUrl = Annotated[
         "--server",
         metavar="URL",
         rich_help_panel=NETWORK,
-        help="Address of the cloud, as in https://cloud.example:8443, or those of its instances with commas "
-        "between them.",
+        help="Address of the cloud, as in https://cloud.example:8443. Separate the addresses of several instances by "
+        "commas.",
     ),
 ]
 Credentials = Annotated[

@@ -50,7 +50,7 @@ def shared_state(
     name = f"{socket.gethostname()[:LONGEST_HOST]}-{port}"
     admission = Admission(_limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS), _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS))
     if not is_server(store):
-        raise ServiceError("--store: this is not an address of a database; write postgresql://USER@HOST:PORT/DATABASE")
+        raise ServiceError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(store)
     with ExitStack() as opened:
         server = opened.enter_context(closing(Postgres(url, name)))

@@ -36,7 +36,7 @@ def show(
     ],
     *,
     html: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the page as one file to send, and serve nothing.")
+        Path | None, typer.Option(metavar="FILE", help="Write the page as one file, and serve nothing.")
     ] = None,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")

@@ -19,7 +19,7 @@ Start = Annotated[
         show_default="training on synthetic shapes",
     ),
 ]
-Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to see that everything works.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to check that everything works.")]
 
 QUICK_IMAGES = 4
 """Images of a robot: labelling one takes vgg some seconds."""

@@ -15,7 +15,7 @@ FIRST_SCANS_S, EVERYTHING_S = 10, 45
 
 
 def warm_up() -> None:
-    """Compile the code of robots and cloud ahead, on all cores, so that the first run does not have to."""
+    """Compile the code of robots and cloud now, on all cores, so that the first run starts at once."""
     from fcslam.service.warmup import WARM_UPS, compiling
 
     console = notices()

@@ -155,9 +155,11 @@ def read_edit(kind: str, content: str) -> Change | Undo:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise EditError(f"no edit of kind '{kind}' ({where}: {first['msg']})") from error
+        raise EditError(f"not a valid edit of kind '{kind}' ({where}: {first['msg']})") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise EditError(f"no edit of kind '{kind}' ({type(error).__name__}: {one_line(str(error))})") from error
+        raise EditError(
+            f"not a valid edit of kind '{kind}' ({type(error).__name__}: {one_line(str(error))})"
+        ) from error
     check_edit(edit)
     return edit
 
@@ -175,7 +177,7 @@ def check_edit(content: Change | Undo) -> None:
         raise EditError(f"'{unnamed[:LONGEST_NAME]}' is not a name of a session")
     match content:
         case Removal() if not 0 <= (content.epoch or 0) <= MAXIMUM_EPOCH:
-            raise EditError(f"epoch {content.epoch}: it is from 0 to {MAXIMUM_EPOCH}")
+            raise EditError(f"epoch {content.epoch}: it must be from 0 to {MAXIMUM_EPOCH}")
         case Cut() if content.last_s <= content.first_s:
             raise EditError(f"the stretch ends at {content.last_s:.3f} s, before it begins at {content.first_s:.3f} s")
         case ManualClosure():

@@ -88,9 +88,9 @@ class SessionStore:
         """
         before = self._hellos.get(hello.robot)
         if before is not None and before.floor != hello.floor:
-            raise PacketError(f"{hello.robot}: says hello again on another floor; that takes a new session")
+            raise PacketError(f"{hello.robot}: its new hello names another floor; a new floor needs a new session")
         if before is not None and before.lasers != hello.lasers[: len(before.lasers)]:
-            raise PacketError(f"{hello.robot}: says hello again with another laser")
+            raise PacketError(f"{hello.robot}: its new hello changes or lacks an announced laser")
         self._hellos[hello.robot] = hello
         self._hello_sequences[hello.robot] = sequence
         self._announced.setdefault(hello.robot, set()).update(hello.detector_versions.items())

@@ -55,8 +55,8 @@ class FleetConfig(Settings):
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     vocabularies: tuple[Path, ...] = Field(
         default=(),
-        description="files of the vocabularies that robots may send words of, as `fcslam tools vocabulary` writes "
-        "them; others are refused",
+        description="vocabulary files, as `fcslam tools vocabulary` writes them, whose words robots may send; other "
+        "words are refused",
     )
     consistency: ConsistencySettings = Field(
         default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"

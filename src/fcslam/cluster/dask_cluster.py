@@ -93,7 +93,7 @@ class DaskCluster:
     async def _compute(self, address: str, function: Callable[..., T], arguments: Sequence[Any]) -> T:
         client = self._client
         if client is None:
-            raise ConnectionError("the cluster is gone")
+            raise ConnectionError("the cluster does not answer any more")
         # Not pure: Dask would look for a result of the same arguments, and hash all of them.
         future = client.submit(function, *arguments, workers=[address], pure=False)
         try:

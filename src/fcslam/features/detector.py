@@ -233,7 +233,7 @@ def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has no common exception
-        raise FeatureError(f"{path}: no ONNX network ({error}); give weights of an fcslam detector") from error
+        raise FeatureError(f"{path}: not an ONNX network ({error}); give weights of an fcslam detector") from error
     return session, dict(session.get_modelmeta().custom_metadata_map)
 
 

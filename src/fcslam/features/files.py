@@ -35,7 +35,7 @@ def read_grey(path: Path) -> GreyImage:
         raise FeatureError(f"{path}: an image has at most {MAX_SIDE_PX} pixels a side")
     image = decode_grey(encoded)
     if image is None or not image.size:
-        raise FeatureError(f"{path}: no image that can be read; give JPEG, PNG, PPM or TIFF")
+        raise FeatureError(f"{path}: cannot be read as an image; give JPEG, PNG, PPM or TIFF")
     return image
 
 

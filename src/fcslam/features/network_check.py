@@ -94,7 +94,7 @@ def check_network(path: Path) -> None:
         content = read_bytes(path, most=MOST_FILE_BYTES)
         model = _model().FromString(content)
     except (OSError, DecodeError) as error:
-        raise FeatureError(f"{path}: no ONNX network ({error}); give weights of an fcslam detector") from error
+        raise FeatureError(f"{path}: not an ONNX network ({error}); give weights of an fcslam detector") from error
     nodes, reason = 0, "it has functions" if model.functions else ""
     graphs = list(model.graph)
     while graphs and not reason:
@@ -108,7 +108,9 @@ def check_network(path: Path) -> None:
         tensors = [*graph.initializer, *(t for attribute in attributes for t in (*attribute.t, *attribute.tensors))]
         reason = _reason(graph, attributes, tensors)
     if reason:
-        raise FeatureError(f"{path}: is not like the networks of fcslam ({reason}); give weights of an fcslam detector")
+        raise FeatureError(
+            f"{path}: differs from the networks of fcslam ({reason}); give weights of an fcslam detector"
+        )
     _try(path)
 
 

@@ -39,7 +39,7 @@ class EvidenceSettings(Settings):
     lead: float = Field(
         default=2.0,
         ge=1.0,
-        description="least ratio of the size of the largest cluster to that of the largest one that contradicts it",
+        description="least ratio of sizes, of the largest cluster to the largest one that contradicts it",
     )
 
 

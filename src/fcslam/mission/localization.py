@@ -97,7 +97,7 @@ def _floors(folder: Path) -> dict[int, str]:
     try:
         return dict(read_robots(folder / ROBOTS).values())
     except (OSError, ValueError, csv.Error) as error:
-        raise SourceError(f"{folder}: a broken run folder ({one_line(str(error))})") from error
+        raise SourceError(f"{folder}: a damaged run folder ({one_line(str(error))})") from error
 
 
 def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str]:
@@ -105,7 +105,7 @@ def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str
     known = set(floors.values())
     listed = ", ".join(its or "one without a name" for its in sorted(known))
     if not floor and len(known) > 1:
-        raise SourceError(f"{path}: has maps of several floors ({listed}); name that of the robot (--floor)")
+        raise SourceError(f"{path}: has maps of several floors ({listed}); name the robot's floor (--floor)")
     if floor and floor not in known:
         raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {listed}")
     number = min((k for k, its in floors.items() if its == floor or not floor), default=0)
@@ -121,7 +121,8 @@ def _read_map_file(description: Path) -> OccupancyMap:
         return parse_ros_map(str(description), _content(_image_of(description, image)), text)
     except OSError as error:
         raise SourceError(
-            f"{one_line(str(error.filename))}: no map can be read ({error.strerror}); give a run folder or a map.yaml"
+            f"{one_line(str(error.filename))}: cannot be read as a map ({error.strerror}); give a run folder or "
+            "a map.yaml"
         ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{description}: names no image; give a run folder or the YAML file of a map") from error

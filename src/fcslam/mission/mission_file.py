@@ -246,7 +246,7 @@ def mission_path(path: Path) -> Path:
     """
     path = path / MISSION if path.is_dir() else path
     if not path.is_file():
-        raise SourceError(f"{path}: no mission file; `fcslam map` writes one into each run folder")
+        raise SourceError(f"{path}: not a mission file; `fcslam map` writes one into each run folder")
     return path
 
 

@@ -191,7 +191,9 @@ class RobotBackend:
 
     def _set_detector(self, file: DetectorFile, path: Path) -> None:
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
-            raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
+            raise FeatureError(
+                f"{file.version}: describes {file.channel} places; this robot does not use detectors of that channel"
+            )
         if self._words is not None:
             self._words.check({file.channel: file.version})
         if file.version != self._view_extractor.detector_version:

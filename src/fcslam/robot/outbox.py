@@ -108,8 +108,8 @@ class Outbox:
         for epoch, part, ordinal, sequence, digest, data in self._rows(question):
             if not _is_whole(data, part, ordinal, digest):
                 raise StateError(
-                    f"{self._path}: packet {sequence} of epoch {epoch} is damaged; the cloud has what was sent before "
-                    "it, and what waits after it needs it: give another --state"
+                    f"{self._path}: packet {sequence} of epoch {epoch} is damaged, and later packets depend on "
+                    "it; give another --state"
                 )
 
     def close(self) -> None:
@@ -362,7 +362,7 @@ class Outbox:
             yield
         except StoreError as error:
             if error.__cause__ is None:
-                raise StateError(f"{self._path}: is of another version of fcslam; give another --state") from error
+                raise StateError(f"{self._path}: comes from another version of fcslam; give another --state") from error
             reason = " ".join(str(error.__cause__).split())
             reason = "another process runs on it" if reason == "database is locked" else reason
             raise StateError(f"{self._path}: cannot be used: {reason}; give another --state") from error

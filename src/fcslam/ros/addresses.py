@@ -62,7 +62,7 @@ def open_network(
         return Ros1Network()
     text = environment.get("ROS_DOMAIN_ID") or "0" if domain is None else str(domain)
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
-        raise NetworkError(f"{text!r} is not a domain of ROS 2; give a number from 0 to {_LARGEST_DOMAIN}")
+        raise NetworkError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")
     if address.network == "zenoh":
         from fcslam.ros.ros2_zenoh import ZenohNetwork
 

@@ -468,7 +468,7 @@ class RobotNode:
                     self._tell_once(_mismatch(mine, point))
         taken = resolved(self._namespace, MAP)
         if any(point.publishes and not point.own and point.topic == taken for point in endpoints):
-            self._tell_once(f"another node publishes {taken} now, too; two robots must not have one name")
+            self._tell_once(f"another node publishes {taken} now, too; give each robot a name of its own")
 
     def _tell_once(self, line: str) -> None:
         if line and line not in self._told and len(self._told) < _LINES_TOLD:

@@ -397,8 +397,8 @@ class LiveSensors:
         frames = [scan.frame for scan in first]
         if len(set(frames)) < len(frames):
             raise NetworkError(
-                f"the scans of {' and '.join(self._topics.scans)} have one frame, so tf cannot say where each laser "
-                "sits; say it by --sensors laser-pose=X,Y,THETA for each"
+                f"the scans of {' and '.join(self._topics.scans)} have one frame, so tf cannot give the pose of "
+                "each laser; give it with --sensors laser-pose=X,Y,THETA for each"
             )
         mountings = []
         for topic, scan in zip(self._topics.scans, first, strict=True):
@@ -408,7 +408,7 @@ class LiveSensors:
             except TiltedLaserError as error:
                 raise NetworkError(
                     f"the laser of {topic} is {error} and does not look along the floor; choose a level one by "
-                    "--sensors scan-topic, or say its pose by --sensors laser-pose"
+                    "--sensors scan-topic, or give its pose with --sensors laser-pose"
                 ) from error
         return mountings
 
@@ -508,6 +508,6 @@ class LiveSensors:
 
 def _missing_mounting(error: NoTransformError) -> str:
     return (
-        f"waits for tf: it has {error}, so it does not say where a laser sits; start robot_state_publisher or "
+        f"waits for tf: it has {error}, so the pose of a laser is unknown; start robot_state_publisher or "
         "static_transform_publisher, or give --sensors laser-pose=X,Y,THETA (metres, radians)"
     )

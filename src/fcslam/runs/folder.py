@@ -186,7 +186,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
     path = Path(folder)
     if not is_run_folder(path):
         raise EvaluationError(
-            f"{path}: no run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
+            f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
         )
     try:
         robots = read_robots(path / ROBOTS, path)
@@ -203,7 +203,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
             localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:
-        raise EvaluationError(f"{path}: a broken run folder ({error})") from error
+        raise EvaluationError(f"{path}: a damaged run folder ({error})") from error
 
 
 def _map_files(folder: Path) -> list[Path]:

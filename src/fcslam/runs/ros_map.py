@@ -48,7 +48,7 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
     try:
         return _map(image, description)
     except (OSError, ValueError, cv2.error) as error:
-        raise EvaluationError(f"{name}: no map of map_server: {one_line(str(error))}") from error
+        raise EvaluationError(f"{name}: not a map for ROS map_server: {one_line(str(error))}") from error
 
 
 def _map(image: bytes, description: str) -> OccupancyMap:

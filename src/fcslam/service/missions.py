@@ -127,7 +127,8 @@ def _check_file(folder: MissionFolder) -> None:
     """
     if folder.worker_lock.exists() and not (folder.store.exists() and folder.store.stat().st_size):
         raise StoreError(
-            f"{folder.store}: the mission's file is gone or empty; put its backup in its place, or move {folder.path} "
+            f"{folder.store}: the mission's file is missing or empty; put its backup in its place, or move "
+            f"{folder.path} "
             "away to begin a new mission"
         )
 

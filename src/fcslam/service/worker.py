@@ -292,7 +292,7 @@ class Worker:
                 read_hash = _chained(read_hash, data)
             edits = [edit for edit in self._store.edits() if edit.number <= state["edits"]]
             if read_hash.hex() != state["hash"] or state["edits"] > (edits[-1].number if edits else 0):
-                raise InputError(f"{self._folder.snapshot}: is of other packets")
+                raise InputError(f"{self._folder.snapshot}: belongs to other packets")
             fleet = Fleet.restored(
                 self._config.fleet, self._config.seed, state["fleet"], self._read, self._verify_pairs
             )

@@ -183,9 +183,9 @@ def format_of(path: Path) -> Format:
     *others, last = (kind.name for kind in FORMATS)
     known = f"{', '.join(others)} or {last}"
     if is_folder(path):
-        raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")
+        raise SourceError(f"{path}: is a folder, not a recording; give the file of a recording ({known})")
     if path.name == "metadata.yaml":
         raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")
     if content.startswith(ZSTD):
         raise SourceError(f"{path}: is compressed by zstd; give its folder, or unpack it by `zstd -d {path.name}`")
-    raise SourceError(f"{path}: no recording of a known format (it starts with {content[:16]!r}); give a {known}")
+    raise SourceError(f"{path}: not a recording of a known format (it starts with {content[:16]!r}); give a {known}")

@@ -84,7 +84,7 @@ def fault_of_odometry(poses: Iterable[Pose]) -> str | None:
         summary.add(0.0, pose)
         if summary.says_something:
             return None
-    return summary.fault if summary.count else "has no message that can be read"
+    return summary.fault if summary.count else "has no readable message"
 
 
 WITHOUT_ODOMETRY: Final = (

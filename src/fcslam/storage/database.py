@@ -194,7 +194,7 @@ def _check(path: Path, connection: sqlite3.Connection, schema: str, version: int
     if found[0] not in (0, version):
         raise StoreError(f"{path}: a file of version {found[0]}; this fcslam reads version {version}")
     if found != expected:
-        raise StoreError(f"{path}: no file of this kind, or its schema is damaged; put its backup in its place")
+        raise StoreError(f"{path}: not a file of this kind, or its schema is damaged; put its backup in its place")
     _check_content(connection)
 
 

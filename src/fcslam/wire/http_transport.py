@@ -167,7 +167,7 @@ class HttpClient:
         try:
             yield
         except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
+            raise CloudError(f"{self._url}: the reply does not come from an fcslam cloud; check the address") from error
 
     def _ask(
         self,

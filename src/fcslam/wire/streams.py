@@ -180,7 +180,7 @@ def _unpack(data: bytes, plain: int, what: str, code: Callable[..., Coder], *con
         raise PacketError(f"{what}: {len(data)} bytes, at most {plain}")
     stream = np.frombuffer(bytearray(data), np.uint8)
     if not is_at_end(code(reader(stream), stream, *content), stream):
-        raise PacketError(f"{what}: the stream is cut off or goes on after its end")
+        raise PacketError(f"{what}: the stream ends early or has bytes after its end")
 
 
 @njit(nogil=True)

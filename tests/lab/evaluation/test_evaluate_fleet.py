@@ -289,7 +289,7 @@ def test_bad_truth_is_one_line_and_exit_code_2(folder, capsys, spoil, message):
 def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
     RUN.save(folder)
     for arguments, message in (
-        ([str(tmp_path / "nothing")], "no run folder"),
+        ([str(tmp_path / "nothing")], "not a run folder"),
         ([str(folder), "--truth", str(tmp_path / "nowhere")], "nowhere: no folder with the truth"),
         ([str(folder), "--csv", str(tmp_path / "missing" / "table.csv")], "cannot write the table"),
     ):

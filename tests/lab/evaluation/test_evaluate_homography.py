@@ -250,7 +250,7 @@ def test_mistakes_are_told_in_one_line(scenes, tmp_path, capsys, arguments, mess
         ("H_1_2", "0 0 0 0 0 0 0 0 1", "can be inverted"),
         ("H_1_7", "1 0 0 0 1 0 0 0 1", "image 7 is missing"),
         ("H_1_x", "1 0 0 0 1 0 0 0 1", "what is H_1_x?"),
-        ("1.png", "no image", "no image that can be read"),
+        ("1.png", "no image", "cannot be read as an image"),
     ],
 )
 def test_broken_scenes_are_told(tmp_path, capsys, name, content, message):

@@ -19,7 +19,7 @@ def quality(
     ] = None,
     csv: Csv = None,
 ) -> None:
-    """Print how good the maps of a run are, what to drive again, and with --truth whether that is right."""
+    """Print how good the maps of a run are and what to drive again; with --truth, compare with the truth."""
     from rich.table import Table
 
     from fcslam.lab.evaluation.fleet.quality import certificates_of, evaluate_quality

@@ -311,7 +311,7 @@ class Coordinator:
                 if reply.has_error():
                     raise ValueError(reply.error.reason or f"error {reply.error.code}")
                 if reply_sender(reply.content) != (robot, model.version):
-                    raise ValueError("an answer to another question")
+                    raise ValueError("an answer to another request")
                 found[robot] = read(reply.content)
             except (ValueError, KeyError, TypeError) as error:
                 failed[robot] = printable_line(str(error))
@@ -342,7 +342,7 @@ def _metrics(content: RecordDict) -> Metrics:
     """The metrics of a robot's answer; ValueError: it has none that could be."""
     metrics = valid_metrics(reply_metrics(content))
     if not metrics:
-        raise ValueError("an answer without figures that could be")
+        raise ValueError("an answer with impossible metrics")
     return metrics
 
 

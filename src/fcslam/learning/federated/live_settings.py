@@ -42,7 +42,7 @@ class GateSettings(Settings):
         default=0.05,
         ge=0.0,
         le=1.0,
-        description="largest loss of places found again that the interval may leave possible, as a share",
+        description="largest loss of places found again that the lower end of the interval may allow, as a share",
     )
 
 
@@ -76,7 +76,7 @@ class LiveRounds(FederatedSettings):
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
     trained: TrainedLayers = Field(
         default="codes",
-        description="layers that robots train: codes, those of the descriptors",
+        description="layers that robots train: codes, the layers of the descriptors",
     )
     compatible: float = Field(
         default=4.0,

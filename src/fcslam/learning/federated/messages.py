@@ -100,7 +100,7 @@ def reply_metrics(content: RecordDict) -> dict[str, float]:
         raise ValueError(f"a {type(record).__name__} in place of a {MetricRecord.__name__}")
     metrics = {str(name): float(value) for name, value in record.items() if isinstance(value, int | float)}
     if len(metrics) > MAX_METRICS or not all(name.isidentifier() and len(name) <= MAX_NAME_LENGTH for name in metrics):
-        raise ValueError("figures that nobody asked for")
+        raise ValueError("metrics that the server did not request")
     odd = next((name for name, value in metrics.items() if not abs(value) <= LARGEST_METRIC), None)
     if odd is not None:
         raise ValueError(f"{odd} is {metrics[odd]:g}")

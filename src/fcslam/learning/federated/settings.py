@@ -92,8 +92,8 @@ class FederatedSettings(Settings):
     )
     trained: TrainedLayers = Field(
         default="all",
-        description="layers that robots train: all; or codes, those of the descriptors alone, so that keypoints stay "
-        "as they are, on what a robot saw again, which needs frozen batch statistics",
+        description="layers that robots train. all: every layer; codes: only those of the descriptors, on points that "
+        "a robot saw again, with frozen batch statistics",
     )
     private: tuple[str, ...] = Field(
         default=(),
@@ -104,7 +104,7 @@ class FederatedSettings(Settings):
         default=0.15,
         gt=0.0,
         le=1.0,
-        description="drop of the score below that of the best version from which training returns to the best one",
+        description="drop of the score below the best version at which training returns to that version",
     )
     screening: ScreeningSettings = Field(
         default_factory=ScreeningSettings, description="thresholds above which an update is refused"

@@ -249,7 +249,7 @@ _REFUSALS: dict[int, dict[str, Any]] = {
     },
     403: {"description": "it is another role's, or another robot's"},
     404: {"description": "it is not there"},
-    409: {"description": "it does not go together with what is there"},
+    409: {"description": "it contradicts what is stored"},
     413: {"description": "too long"},
     429: {"description": "too much at once", "headers": {"Retry-After": _SECONDS}},
     500: {"description": "the cloud failed on it"},

@@ -311,7 +311,7 @@ def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
     for c in run.closures:
         if named == (c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j):
             return c
-    raise HTTPException(404, "there is no such closure now")
+    raise HTTPException(404, "this closure does not exist at present")
 
 
 def _folder_of(state: ViewerState) -> Path:

@@ -151,7 +151,7 @@ class Instance:
                 is_gone = False
             except StoreError as error:
                 if not is_gone:
-                    _log.error("the store is gone, and this instance waits for it: %s", error)
+                    _log.error("the store does not answer; this instance waits for it: %s", error)
                 is_gone = True
                 self._claims_from = self._clock() + GRACE_S
             except Exception:

@@ -112,13 +112,13 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
         if name not in ("x", "y", "z", *_TIMES) or name in types:
             continue
         if not 0 < each.datatype < len(_TYPES):
-            raise ValueError(f"field {name} has the datatype {each.datatype}, which is none")
+            raise ValueError(f"field {name} has the datatype {each.datatype}, which does not exist")
         kind = np.dtype(order + _TYPES[each.datatype])
         if each.offset + kind.itemsize > step:
             raise ValueError(f"field {name} at offset {each.offset} is outside of point_step {step}")
         types[name] = kind, each.offset
     if missing := [name for name in "xyz" if name not in types or types[name][0].kind != "f"]:
-        raise ValueError(f"field {missing[0]} is missing or no float")
+        raise ValueError(f"field {missing[0]} is missing or not a float")
     layout = np.dtype(
         {
             "names": list(types),
@@ -163,7 +163,7 @@ def _depth_points(content: Any, calibration: Calibration | None) -> FloatArray:
     kind, unit_m = _DEPTHS[content.encoding]
     pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * pixel.itemsize):
-        raise ValueError(f"width {width}, height {height} and step {step} are those of no depth image")
+        raise ValueError(f"width {width}, height {height} and step {step} do not describe a depth image")
     if len(content.data) != step * height:
         raise ValueError("the pixels do not fill the image")
     rows = np.frombuffer(content.data, np.uint8).reshape(height, step)[:, : width * pixel.itemsize]

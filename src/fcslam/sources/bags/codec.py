@@ -67,7 +67,7 @@ class MessageCodec:
                 return self.store.deserialize_ros1(payload, name)
             return self.store.deserialize_cdr(payload, name)
         except Exception as error:  # generated code raises any exception on invalid bytes
-            raise ValueError("the bytes are no message of this type") from error
+            raise ValueError("the bytes are not a message of this type") from error
 
     def encode(self, message: Any, kind: str) -> bytes:
         """The message as bytes."""

@@ -191,12 +191,12 @@ class PartOrder:
         self._left_ns.setdefault((topic, before), before_ns)
         if time_ns - before_ns > _LONGEST_PAUSE_NS:
             raise SourceError(
-                f"{part}: begins {(time_ns - before_ns) / 1e9:.0f} s after {before} ends, so they are no parts of one "
-                "drive; give each as a recording of its own"
+                f"{part}: begins {(time_ns - before_ns) / 1e9:.0f} s after {before} ends, so they are not parts "
+                "of one drive; give each as a recording of its own"
             )
         if time_ns - self._left_ns.get((topic, part), time_ns) > _LONGEST_OVERLAP_NS:
             raise SourceError(
-                f"{part}: has scans in {topic} of the same time as {before}, so they are no parts of one drive; give "
+                f"{part}: has scans in {topic} of the same time as {before}, so they are not parts of one drive; give "
                 "each as a recording of its own, NAME=PATH"
             )
 

@@ -45,7 +45,7 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     if latitude == 0.0 == longitude:
         raise FixAtZeroError("latitude and longitude are 0")
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
-        raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are no position on the earth")
+        raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are not a position on the earth")
     stamp, frame = header_of(content.header, bag_time_ns)
     east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
     sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])

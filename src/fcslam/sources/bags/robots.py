@@ -243,7 +243,9 @@ def _lost_scans(bag: CountedBag, robots: Sequence[_Member], members: Sequence[_M
                         f"{listed(frames)}, and tf does not say which robot the last are of; record /tf and /tf_static "
                         "of all robots"
                     )
-            notes.append(f"{bag.path}: scans of {listed(frames)} on {topic.name} are of no robot with odometry, unused")
+            notes.append(
+                f"{bag.path}: scans of {listed(frames)} on {topic.name} belong to no robot with odometry; not used"
+            )
     return tuple(notes)
 
 

@@ -220,7 +220,7 @@ class RosBag:
         if radius_m <= band.body_radius_m:
             return []
         self.stream.cloud_band = band._replace(body_radius_m=radius_m + SAME_SURFACE_M)
-        return [f"{self.stream.path}: points up to {radius_m:.2f} m from the base are of the robot and left out"]
+        return [f"{self.stream.path}: points up to {radius_m:.2f} m from the base belong to the robot and are left out"]
 
     def _check_options(self, path: Path) -> None:
         topics, poses = self._options.scan_topics, self._options.laser_poses
@@ -245,8 +245,8 @@ class RosBag:
         jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
         if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
             raise SourceError(
-                f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as that of two publishers or in "
-                "another unit; choose another one by --sensors odom-topic, or none to map without"
+                f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
+                "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
             )
 
     def _first_errors(self) -> str:
@@ -267,7 +267,7 @@ class RosBag:
             if other != laser.topic.name:
                 raise SourceError(
                     f"{self.stream.path}: the scans of {other} and {laser.topic.name} have one frame, "
-                    f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --sensors "
+                    f"'{laser.first.frame}', so tf cannot give the pose of each laser; give it with --sensors "
                     "laser-pose=X,Y,THETA "
                     "for each"
                 )
@@ -318,15 +318,15 @@ class RosBag:
             return sensor_mounting(tree, base_frame, laser.first.frame, laser.topic.type)
         except NoTransformError as error:
             raise SourceError(
-                f"{self.stream.path}: tf has {error}{self._first_errors()}, so it does not say where the laser of "
-                f"{topic} sits; say it by "
-                f"--sensors laser-pose=X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
+                f"{self.stream.path}: tf has {error}{self._first_errors()}, so the pose of the laser of {topic} "
+                "is unknown; give it with --sensors laser-pose=X,Y,THETA (metres, "
+                f"radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
                 "if it is in another part of this recording, give both joined by a comma"
             ) from error
         except TiltedLaserError as error:
             raise SourceError(
                 f"{self.stream.path}: the laser of {topic} is {error} and does not look along the floor; choose a "
-                "level one by --sensors scan-topic, or say its pose by --sensors laser-pose"
+                "level one by --sensors scan-topic, or give its pose with --sensors laser-pose"
             ) from error
 
     def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:

@@ -462,8 +462,8 @@ class BagStream:
             return cloud_mounting(self.tree.fixed(self._base_frame_of(frame), frame))
         except NoTransformError as error:
             raise SourceError(
-                f"{self.path}: tf has {error}, so it does not say where the sensor of {topic.name} sits; say it by "
-                "--sensors laser-pose=X,Y,THETA (metres, radians)"
+                f"{self.path}: tf has {error}, so the pose of the sensor of {topic.name} is unknown; give it "
+                "with --sensors laser-pose=X,Y,THETA (metres, radians)"
             ) from error
 
     def _levelled(self, topic: Topic, frame: str, mounting: CloudMounting) -> CloudMounting:

@@ -45,7 +45,7 @@ def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
     x, y, z, w = rotation
     length = sqrt(x * x + y * y + z * z + w * w)
     if not abs(length - 1.0) < 0.1:
-        raise ValueError(f"the orientation {x:g}, {y:g}, {z:g}, {w:g} is no unit quaternion")
+        raise ValueError(f"the orientation {x:g}, {y:g}, {z:g}, {w:g} is not a unit quaternion")
     if not all(map(isfinite, translation_m)):
         raise ValueError("the translation is not finite")
     if abs(length - 1.0) < _ROUNDING:

@@ -145,7 +145,7 @@ class RecordingWriter:
             raise OutputError(f"{self._folder}: a record at {item.stamp} s has no finite stamp or pose; leave it out")
         if isinstance(item, LaserScan):
             if self._index(item.laser) is None:
-                what = f"a scan at {item.stamp} s is of no laser of the recording"
+                what = f"a scan at {item.stamp} s belongs to no laser of the recording"
                 raise OutputError(f"{self._folder}: {what}; use one each")
             try:
                 if item.sweep is not None:
