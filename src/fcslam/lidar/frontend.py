@@ -81,8 +81,8 @@ class LidarConfig(Settings):
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="time from the first beam of a scan, which its stamp is that of, to the last; for text logs and "
-        "programs, as bags and ROS messages say it; 0: all beams are measured at once [s]",
+        description="time from the first beam of a scan, to which its stamp belongs, to the last one; for text logs "
+        "and programs, because bags and ROS messages say it; 0: all beams are measured at once [s]",
     )
     ignore: Sectors = Field(
         default=(),
@@ -96,8 +96,8 @@ class LidarConfig(Settings):
     )
     tracker: Tracker = Field(
         default=Tracker.SURFELS,
-        description="how scans are matched: `surfels`, every scan by Gauss-Newton; `karto`, as the paper's robots do, "
-        "each scan that may become a keyscan by exhaustive search on a grid",
+        description="how scans are matched: `surfels`, every scan by Gauss-Newton; `karto`, each scan that may become "
+        "a keyscan by exhaustive search on a grid, as on the robots of the paper",
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
