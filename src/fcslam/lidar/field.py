@@ -85,7 +85,7 @@ class SurfelField:
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
         done = 0
-        x, y, turn = se2.between(T_field_base if self._T_field_last is None else self._T_field_last, T_field_base)
+        x, y, turn = se2.motion(T_field_base if self._T_field_last is None else self._T_field_last, T_field_base)
         self._T_field_last = T_field_base
         self.arrays.used[2] += round(1e3 * (math.hypot(x, y) + abs(turn)))
         while (done := _insert(scan.points, scan.normals, scan.solitary, T_field_base, done, self.arrays)) < len(scan):
