@@ -4,6 +4,7 @@ The field is drawn as a likelihood grid. Each level of a pyramid holds the maxim
 look-up bounds the score of a whole square of shifts. Squares whose bound is below the best score are pruned.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +81,7 @@ def likelihood_pyramid(
     Returns:
         The pyramid, shape (levels, H, W).
     """
-    size = int(np.ceil(2.0 * half_side_m / CELL_M)) + 1
+    size = math.ceil(2.0 * half_side_m / CELL_M) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
     surfels, count = field.arrays.surfels, int(field.arrays.used[1])
     viewpoint = np.array(T_field_guess[:2]) if visible_only else np.full(2, np.nan)
@@ -129,8 +130,8 @@ def search_pyramid(
     """As ``search``, on a pyramid that was built before; poses have shape (3,)."""
     reach = _quantile(np.hypot(*scan.points.T), REACH_QUANTILE) if len(scan) else 1.0
     step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
-    turns = int(np.ceil(window.angle_rad / step_rad))
-    shifts = int(np.ceil(window.radius_m / pyramid.cell_m))
+    turns = math.ceil(window.angle_rad / step_rad)
+    shifts = math.ceil(window.radius_m / pyramid.cell_m)
     guess = np.array(T_field_guess, dtype=np.float64)  # a writable copy: code is compiled once
     start = np.full(3, np.nan) if better_than is None else np.array(better_than)
     pose, score = _branch_and_bound(

@@ -59,7 +59,10 @@ class OdometryError(NamedTuple):
     @property
     def information(self) -> FloatArray:
         """Diagonal information matrix over (x, y, theta), shape (3, 3)."""
-        return np.diag((self.position_m**-2, self.position_m**-2, self.heading_rad**-2))
+        information = np.zeros((3, 3))
+        information[0, 0] = information[1, 1] = self.position_m**-2
+        information[2, 2] = self.heading_rad**-2
+        return information
 
     def mahalanobis2(self, innovation: Pose) -> float:
         """Squared Mahalanobis length of an innovation (x, y, theta), metres and radians."""
