@@ -1,17 +1,20 @@
 """The group SE(2) of rigid motions of the plane, on plain arrays.
 
 A pose is ``(x, y, theta)`` in metres and radians, shape (..., 3), float64. ``T_a_b`` takes coordinates in b to a,
-so ``compose(T_a_b, T_b_c)`` is ``T_a_c``. Every function broadcasts over the leading dimensions. Single poses, the
-common case in the hot loops, have their own code path: numpy's overhead is twenty times the arithmetic.
+so ``compose(T_a_b, T_b_c)`` is ``T_a_c``. Every function but ``motion`` broadcasts over the leading dimensions. Single
+poses, the common case in the hot loops, have their own code path: numpy's overhead is twenty times the arithmetic.
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
+"""A single pose as numbers."""
 
 IDENTITY: Array = np.zeros(3)
 IDENTITY.setflags(write=False)
@@ -26,7 +29,7 @@ def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
     """``T_a_c``, shape (..., 3)."""
     a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)
     if a.ndim == 1 and b.ndim == 1:
-        return _compose_one(a.tolist(), b.tolist())
+        return np.array(_compose_one(a.tolist(), b.tolist()))
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
     y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
@@ -48,8 +51,13 @@ def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
     """``T_b_c = T_a_b^-1 T_a_c``, shape (..., 3)."""
     a, c = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_a_c, dtype=np.float64)
     if a.ndim == 1 and c.ndim == 1:
-        return _compose_one(_inverse_one(a.tolist()), c.tolist())
+        return np.array(motion(a, c))
     return compose(inverse(T_a_b), T_a_c)
+
+
+def motion(T_a_b: Array, T_a_c: Array) -> Pose:
+    """``between`` of two single poses, shape (3,), as numbers."""
+    return _compose_one(_inverse_one(T_a_b.tolist()), T_a_c.tolist())
 
 
 def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
@@ -95,15 +103,16 @@ def relative(poses: ArrayLike) -> Array:
     return between(chain[:-1], chain[1:])
 
 
-def _compose_one(a: list[float], b: list[float]) -> Array:
-    cos, sin = math.cos(a[2]), math.sin(a[2])
-    x, y = a[0] + cos * b[0] - sin * b[1], a[1] + sin * b[0] + cos * b[1]
-    return np.array((x, y, _wrap_one(a[2] + b[2])))
+def _compose_one(T_a_b: Iterable[float], T_b_c: Iterable[float]) -> Pose:
+    (x, y, theta), (dx, dy, turn) = T_a_b, T_b_c
+    cos, sin = math.cos(theta), math.sin(theta)
+    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, _wrap_one(theta + turn)
 
 
-def _inverse_one(a: list[float]) -> list[float]:
-    cos, sin = math.cos(a[2]), math.sin(a[2])
-    return [-cos * a[0] - sin * a[1], sin * a[0] - cos * a[1], _wrap_one(-a[2])]
+def _inverse_one(T_a_b: Iterable[float]) -> Pose:
+    x, y, theta = T_a_b
+    cos, sin = math.cos(theta), math.sin(theta)
+    return -cos * x - sin * y, sin * x - cos * y, _wrap_one(-theta)
 
 
 def _wrap_one(angle_rad: float) -> float:

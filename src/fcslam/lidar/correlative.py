@@ -4,7 +4,9 @@ The field is drawn as a likelihood grid. Each level of a pyramid holds the maxim
 look-up bounds the score of a whole square of shifts. Squares whose bound is below the best score are pruned.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,8 @@ MOST_LEVELS = 6
 """Most levels of the pyramid; a step on the coarsest one of them is 2^5 cells."""
 MOST_POINTS = 120
 """Largest number of points that are scored."""
+CHECKED_AFTER: Final = 8
+"""Points after which the search looks whether the rest can still reach the best score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +84,7 @@ def likelihood_pyramid(
     Returns:
         The pyramid, shape (levels, H, W).
     """
-    size = int(np.ceil(2.0 * half_side_m / CELL_M)) + 1
+    size = math.ceil(2.0 * half_side_m / CELL_M) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
     surfels, count = field.arrays.surfels, int(field.arrays.used[1])
     viewpoint = np.array(T_field_guess[:2]) if visible_only else np.full(2, np.nan)
@@ -129,8 +133,8 @@ def search_pyramid(
     """As ``search``, on a pyramid that was built before; poses have shape (3,)."""
     reach = _quantile(np.hypot(*scan.points.T), REACH_QUANTILE) if len(scan) else 1.0
     step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
-    turns = int(np.ceil(window.angle_rad / step_rad))
-    shifts = int(np.ceil(window.radius_m / pyramid.cell_m))
+    turns = math.ceil(window.angle_rad / step_rad)
+    shifts = math.ceil(window.radius_m / pyramid.cell_m)
     guess = np.array(T_field_guess, dtype=np.float64)  # a writable copy: code is compiled once
     start = np.full(3, np.nan) if better_than is None else np.array(better_than)
     pose, score = _branch_and_bound(
@@ -209,8 +213,11 @@ def _pyramid(base, count):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _bound(cells, level, width, sx, sy):  # type: ignore[no-untyped-def]
-    """Sum of the points' largest likelihoods over shifts from (sx, sy) on, ``width`` cells; off the grid they are 0."""
+def _bound(cells, level, width, sx, sy, needed):  # type: ignore[no-untyped-def]
+    """Sum of the points' largest likelihoods over shifts from (sx, sy) on, ``width`` cells; off the grid they are 0.
+
+    If the sum does not exceed ``needed``, a part of it will do.
+    """
     total = 0
     rows, columns = level.shape
     for i in range(len(cells)):
@@ -218,6 +225,8 @@ def _bound(cells, level, width, sx, sy):  # type: ignore[no-untyped-def]
         # A square that begins before the grid may reach into it.
         if x > -width and y > -width and x < columns and y < rows:
             total += level[max(y, 0), max(x, 0)]
+        if i % CHECKED_AFTER == 0 and total + 255 * (len(cells) - i) <= needed:
+            return total
     return total
 
 
@@ -259,7 +268,7 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
     best = best_raw = 0.0
     best_pose = guess.copy()
     if not np.isnan(start[0]):
-        best_raw = _bound(_cells_of(points, start, corner, cell, 0.0), levels[0], 1, 0, 0) / (255.0 * n)
+        best_raw = _bound(_cells_of(points, start, corner, cell, 0.0), levels[0], 1, 0, 0, -1.0) / (255.0 * n)
         near = ((start[0] - guess[0]) ** 2 + (start[1] - guess[1]) ** 2) / (cell * cell)
         turned = abs((start[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi) / step
         best = best_raw * _penalty(near, shifts, turned, turns, distance_penalty, angle_penalty)
@@ -279,9 +288,11 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
                     if sx > shifts or sy > shifts:  # the last squares overhang the window
                         continue
                     nx, ny = _nearest(sx, sx + (1 << h) - 1), _nearest(sy, sy + (1 << h) - 1)
-                    raw = _bound(cells, levels[h], 1 << h, sx, sy) / (255.0 * n)
                     near = nx * nx + ny * ny
-                    score = raw * _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty)
+                    penalty = _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty)
+                    needed = 255.0 * n * best / max(penalty, 1e-9)
+                    raw = _bound(cells, levels[h], 1 << h, sx, sy, needed) / (255.0 * n)
+                    score = raw * penalty
                     if score <= best:
                         continue
                     if h == 0:

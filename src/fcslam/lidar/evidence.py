@@ -83,7 +83,7 @@ def resolve(
         max(LEAST_SIGMA_M + SIGMA_PER_TURN * turned_rad, learned.position_m),
         max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
     )
-    innovation = se2.between(T_field_guess, match.T_field_base)
+    innovation = se2.motion(T_field_guess, match.T_field_base)
     distance2 = error.mahalanobis2(innovation)
     is_far, is_seen = distance2 >= FAR**2, match.known >= LEAST_KNOWN
     is_clear = is_seen and match.explained >= CLEAR * match.known
@@ -92,7 +92,7 @@ def resolve(
     trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, velocity_information)
     gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
     gain += error.log_likelihood(innovation)
-    gain -= error.log_likelihood(se2.between(T_field_guess, trusting.T_field_base))
+    gain -= error.log_likelihood(se2.motion(T_field_guess, trusting.T_field_base))
     gain += CLEAR_GAIN * is_clear
     return (match, False) if gain > 0.0 and (is_seen or not is_far) else (trusting, is_far)
 

@@ -85,7 +85,7 @@ class SurfelField:
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
         done = 0
-        x, y, turn = se2.between(T_field_base if self._T_field_last is None else self._T_field_last, T_field_base)
+        x, y, turn = se2.motion(T_field_base if self._T_field_last is None else self._T_field_last, T_field_base)
         self._T_field_last = T_field_base
         self.arrays.used[2] += round(1e3 * (math.hypot(x, y) + abs(turn)))
         while (done := _insert(scan.points, scan.normals, scan.solitary, T_field_base, done, self.arrays)) < len(scan):
@@ -121,13 +121,11 @@ class SurfelField:
     def compact(self) -> None:
         """Free unused storage of a complete field, which takes no more scans."""
         corner, table, labels, surfels, used = self.arrays
-        rows, columns = np.nonzero(table != EMPTY)
-        if not len(rows):
-            rows = columns = np.zeros(1, np.int64)
-        first, last = (rows.min(), columns.min()), (rows.max() + 1, columns.max() + 1)
+        filled = table != EMPTY
+        (top, bottom), (left, right) = (_ends(filled.any(axis=axis)) for axis in (1, 0))
         self.arrays = FieldArrays(
-            corner=corner + TILE * CELL_M * np.array((first[1], first[0]), dtype=np.float64),
-            table=table[first[0] : last[0], first[1] : last[1]].copy(),
+            corner=corner + TILE * CELL_M * np.array((left, top), dtype=np.float64),
+            table=table[top:bottom, left:right].copy(),
             labels=labels[: max(1, used[0])].copy(),
             surfels=surfels[: max(1, used[1]), :MERGED].copy(),
             used=used,
@@ -139,6 +137,12 @@ class SurfelField:
             self.arrays = self.arrays._replace(labels=np.concatenate([labels, np.full_like(labels, EMPTY)]))
         if used[1] == len(surfels):
             self.arrays = self.arrays._replace(surfels=np.concatenate([surfels, np.zeros_like(surfels)]))
+
+
+def _ends(filled: NDArray[np.bool_]) -> tuple[int, int]:
+    """The first index and the one after the last where ``filled``, shape (N,), is true; (0, 1) if it never is."""
+    where = np.flatnonzero(filled)
+    return (int(where[0]), int(where[-1]) + 1) if len(where) else (0, 1)
 
 
 @njit(allocates=False)

@@ -4,6 +4,7 @@ It works in the smooth local frame of the tracker and never reads the pose graph
 (``fcslam.lidar.backend``) may run later or in another process without changing a result.
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
@@ -220,12 +221,9 @@ class LidarFrontend:
             return False
         if laser not in self._T_local_newest:
             return True
-        motion = se2.between(self._T_local_newest[laser], tracked.T_local_base)
+        x, y, turn = se2.motion(self._T_local_newest[laser], tracked.T_local_base)
         gate = self.config.keyscans
-        return bool(
-            np.hypot(motion[0], motion[1]) >= gate.minimum_travel_distance_m
-            or abs(motion[2]) >= gate.minimum_travel_heading_rad
-        )
+        return math.hypot(x, y) >= gate.minimum_travel_distance_m or abs(turn) >= gate.minimum_travel_heading_rad
 
     def scan_pose(self, stamp: float, tracked: TrackedScan) -> ScanPose:
         """Pose of a localized scan relative to the newest keyscan, of which there is one after the first scan."""

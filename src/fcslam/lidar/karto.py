@@ -95,7 +95,7 @@ class KartoTracker(ScanTracker):
         if match.response == 0.0:
             return TrackingResult(by_odometry, *unmatched)
         tracked = TrackedScan(match.T_local_base, np.asarray(np.linalg.inv(match.covariance)), points, scan.sweep)
-        innovation = se2.between(T_local_guess, match.T_local_base)
+        innovation = se2.motion(T_local_guess, match.T_local_base)
         trust = self._trust.learn(innovation, odometry_error(moved_m, turned_rad, self._odometry))
         # The grid knows surfaces, but no free space: what is off them lies in unknown area.
         accepted = match.response, match.response, scan.T_odom_base, 0.0, 0.0, laser, trust, self._usual
@@ -118,7 +118,7 @@ class KartoTracker(ScanTracker):
         """Whether the robot moved enough since the last keyscan of this laser."""
         if laser not in self._T_local_newest or not self._odometry.is_measured:
             return True
-        x, y, theta = se2.between(self._T_local_newest[laser], T_local_guess).tolist()
+        x, y, theta = se2.motion(self._T_local_newest[laser], T_local_guess)
         return bool(np.hypot(x, y) >= self._gate[0] or abs(theta) >= self._gate[1])
 
     def _length_m(self) -> float:

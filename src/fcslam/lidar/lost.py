@@ -68,7 +68,7 @@ class LostConfig(Settings):
 
 def has_moved_unseen(before: LaserScan, now: LaserScan) -> bool:
     """Whether a robot moved so far between two scans that odometry alone must not tie their places together."""
-    x, y, _ = se2.between(before.T_odom_base, now.T_odom_base)
+    x, y, _ = se2.motion(before.T_odom_base, now.T_odom_base)
     return math.hypot(x, y) > LARGEST_UNSEEN_M
 
 

@@ -75,11 +75,8 @@ class ScanMatch:
     """
     velocity: FloatArray
     """Correction of the velocity in the sweep, in ``base``, shape (3,), m/s and rad/s; zeros for a scan at once."""
-
-    @property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the scan, relative to a scan without a point on a surface."""
-        return float(self.log_likelihoods.sum())
+    log_likelihood: float
+    """Log-likelihood of the scan, relative to a scan without a point on a surface."""
 
 
 def match_scan(
@@ -109,7 +106,7 @@ def match_scan(
     Returns:
         The pose, the information of the points, and how well they fit.
     """
-    pose, velocity, information, explained, known, log_likelihoods = _match(
+    pose, information, explained, known, log_likelihoods, velocity = _match(
         _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
         np.array(T_field_guess),  # a writable copy: code is compiled once
         prior_information,
@@ -118,7 +115,8 @@ def match_scan(
         wide_scale_m,
         clutter_scale_m,
     )
-    return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihoods, velocity)
+    total = float(log_likelihoods.sum())
+    return ScanMatch(pose, information, explained, known, log_likelihoods, velocity, total)
 
 
 class _Points(NamedTuple):
@@ -184,7 +182,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
     velocity[0], velocity[1] = cos * x + sin * y, cos * y - sin * x
-    return pose, velocity, H, explained, known, log_likelihoods
+    return pose, H, explained, known, log_likelihoods, velocity
 
 
 @njit(allocates=False)
@@ -401,6 +399,7 @@ def _fit(scan, pose, velocity, field):  # type: ignore[no-untyped-def]
             on_surface = abs(e) < EXPLAINED_M and d2 <= ALONG_LIMIT2 * EXPLAINED_M * EXPLAINED_M
         if on_surface:
             explained += 1
-        log_likelihoods[i] = np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
+        likelihood_ratio = INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M))
+        log_likelihoods[i] = INDEPENDENT * np.log1p(likelihood_ratio)
     n = max(1, len(points))
     return explained / n, known / n, log_likelihoods

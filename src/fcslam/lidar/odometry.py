@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fcslam.geometry.se2 import Pose
 from fcslam.records import FloatArray
 
 TAIL: float = 1.0
@@ -58,15 +59,18 @@ class OdometryError(NamedTuple):
     @property
     def information(self) -> FloatArray:
         """Diagonal information matrix over (x, y, theta), shape (3, 3)."""
-        return np.diag((self.position_m**-2, self.position_m**-2, self.heading_rad**-2))
+        information = np.zeros((3, 3))
+        information[0, 0] = information[1, 1] = self.position_m**-2
+        information[2, 2] = self.heading_rad**-2
+        return information
 
-    def mahalanobis2(self, innovation: FloatArray) -> float:
-        """Squared Mahalanobis length of an innovation (x, y, theta), shape (3,), metres and radians."""
-        x, y, theta = innovation.tolist()
+    def mahalanobis2(self, innovation: Pose) -> float:
+        """Squared Mahalanobis length of an innovation (x, y, theta), metres and radians."""
+        x, y, theta = innovation
         return float((x * x + y * y) / self.position_m**2 + (theta / self.heading_rad) ** 2)
 
-    def log_likelihood(self, innovation: FloatArray) -> float:
-        """Log-likelihood of an innovation, shape (3,), relative to none: a Student t distribution with ``TAIL``."""
+    def log_likelihood(self, innovation: Pose) -> float:
+        """Log-likelihood of an innovation (x, y, theta) relative to none: a Student t distribution with ``TAIL``."""
         return -0.5 * (TAIL + 3.0) * math.log1p(self.mahalanobis2(innovation) / TAIL)
 
 
@@ -97,15 +101,15 @@ class OdometryTrust:
         """The error of this robot for a motion with ``error`` by the model."""
         return OdometryError(self.position * error.position_m, self.heading * error.heading_rad)
 
-    def learn(self, innovation: FloatArray, error: OdometryError) -> "OdometryTrust":
+    def learn(self, innovation: Pose, error: OdometryError) -> "OdometryTrust":
         """Learn from a good match.
 
         Args:
-            innovation: matched pose relative to the pose by odometry, shape (3,), metres and radians.
+            innovation: matched pose relative to the pose by odometry, metres and radians.
             error: error of that motion by the model.
         """
         rate = 1.0 / min(FIRST_MATCHES + self.matches, LATEST_MATCHES)
-        x, y, theta = innovation.tolist()
+        x, y, theta = innovation
         return OdometryTrust(
             _learned_scale(self.position, 0.5 * (x * x + y * y) / error.position_m**2, rate),
             _learned_scale(self.heading, theta * theta / error.heading_rad**2, rate),

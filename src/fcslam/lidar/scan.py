@@ -75,8 +75,8 @@ def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) 
     Raises:
         ValueError: the number of ranges is not the number of beams.
     """
-    if np.shape(ranges_m) != (laser.beam_count,):
-        raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {np.shape(ranges_m)}")
+    if ranges_m.shape != (laser.beam_count,):
+        raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {ranges_m.shape}")
     rays = rays_of(laser, sweep)
     points, normals, solitary, kept = _project(
         ranges_m, rays.origins, rays.directions, abs(laser.angle_increment_rad), laser.max_range_m

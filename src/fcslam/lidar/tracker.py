@@ -176,7 +176,7 @@ class ScanTracker:
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
         tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
-        innovation = se2.between(T_local_guess, match.T_field_base)
+        innovation = se2.motion(T_local_guess, match.T_field_base)
         learns = _is_good(match, error) and not (contradicts or has_jumped)
         trust = self._trust.learn(innovation, error) if learns else self._trust
         usual = _learn_usual(self._usual, match.log_likelihood / max(1, len(thinned)))
@@ -221,9 +221,9 @@ class ScanTracker:
     def _predict(self, scan: LaserScan) -> tuple[FloatArray, float, float]:
         """The last pose moved by odometry; travel and turn since the last accepted match."""
         last = scan.T_odom_base if self._T_odom_base is None else self._T_odom_base
-        motion = se2.between(last, scan.T_odom_base)
-        moved_m = self._moved_m + math.hypot(motion[0], motion[1])
-        return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
+        x, y, turn = motion = se2.motion(last, scan.T_odom_base)
+        moved_m, turned_rad = self._moved_m + math.hypot(x, y), self._turned_rad + abs(turn)
+        return se2.compose(self._T_local_base, motion), moved_m, turned_rad
 
     def _explains(self, match: ScanMatch) -> bool:
         """Whether a match explains the points in known area."""
@@ -231,7 +231,7 @@ class ScanTracker:
 
     def _is_long_step(self, T_local_guess: FloatArray) -> bool:
         """Whether odometry moved so far since the last scan that it may have jumped."""
-        x, y, theta = se2.between(self._T_local_base, T_local_guess).tolist()
+        x, y, theta = se2.motion(self._T_local_base, T_local_guess)
         return math.hypot(x, y) > JUMP_M or abs(theta) > JUMP_RAD
 
     def _is_unsure(self, error: OdometryError) -> bool:
@@ -263,7 +263,7 @@ class ScanTracker:
             match = _likeliest(thinned, field, T_local_guess, learned, velocity)
         else:
             match = match_scan(thinned, field, T_local_guess, error.information, velocity)
-        innovation = se2.between(T_local_guess, match.T_field_base)
+        innovation = se2.motion(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
         is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= SURPRISE**2
         is_unlikely = log_posterior < self._usual * len(thinned) - UNLIKELY  # False before the first match
@@ -274,7 +274,7 @@ class ScanTracker:
         if np.array_equal(found.T_field_base, match.T_field_base):
             return match
         other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, velocity)
-        other_innovation = se2.between(T_local_guess, other.T_field_base)
+        other_innovation = se2.motion(T_local_guess, other.T_field_base)
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
             return other
@@ -292,7 +292,7 @@ def _likeliest(
     )
     return max(
         matches,
-        key=lambda match: match.log_likelihood + learned.log_likelihood(se2.between(T_local_guess, match.T_field_base)),
+        key=lambda match: match.log_likelihood + learned.log_likelihood(se2.motion(T_local_guess, match.T_field_base)),
     )
 
 

@@ -371,6 +371,8 @@ class RobotFrontend:
 
     def _send_fixes(self, pose: ScanPose) -> None:
         """Send the fixes up to the newest scan, each with the keyscan of the scan next to it, one for each keyscan."""
+        if not self._fixes:
+            return
         poses = (pose,) if self._newest is None else (self._newest[1], pose)
         due = [fix for fix in self._fixes if fix.stamp <= pose.stamp]
         self._fixes = deque((fix for fix in self._fixes if fix.stamp > pose.stamp), maxlen=MOST_FIXES)

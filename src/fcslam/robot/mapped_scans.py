@@ -43,7 +43,8 @@ class MappedScans:
             points = rays.origins + np.minimum(ranges_m, laser.max_range_m)[:, None] * rays.directions
             ranges_m = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), ranges_m)
         sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
-        return replace(scan, ranges_m=rounded(ranges_m, laser.max_range_m), laser=laser, sweep=sweep)
+        ranges_m = rounded(ranges_m, laser.max_range_m)
+        return LaserScan(scan.stamp, ranges_m, laser, scan.T_odom_base, sweep, scan.on_teammates)
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
@@ -41,7 +40,7 @@ class OdometryGate:
         """Stamp and pose, as it was read, of the scan before."""
         self._bridge: FloatArray | None = None
         """The present frame ``odom`` in the first one, shape (3,); None before the first jump."""
-        self._motion = np.array((LEAST_BRIDGE_M, 0.0, 0.0))
+        self._motion: se2.Pose = (LEAST_BRIDGE_M, 0.0, 0.0)
         """The last motion between two scans of a robot that moved."""
         self._velocity = (0.0, 0.0, 0.0)
         """In the last sweep without a jump."""
@@ -51,15 +50,16 @@ class OdometryGate:
         read = scan.T_odom_base
         if self._last is not None:
             stamp, before = self._last
-            if not np.isfinite(read).all():
+            if not all(map(math.isfinite, read.tolist())):
                 self.jumps += 1
                 read = se2.compose(before, self._motion)
-            motion = se2.between(before, read)
-            if self._is_jump(motion, scan.stamp - stamp):
+            x, y, turn = motion = se2.motion(before, read)
+            moved_m = math.hypot(x, y)
+            if self._is_jump(moved_m, abs(turn), scan.stamp - stamp):
                 self.jumps += 1
-                self.largest_m = max(self.largest_m, math.hypot(motion[0], motion[1]))
+                self.largest_m = max(self.largest_m, moved_m)
                 self._bridge = se2.compose(se2.compose(self.bridged(before), self._motion), se2.inverse(read))
-            elif math.hypot(motion[0], motion[1]) > LEAST_BRIDGE_M or abs(motion[2]) > LEAST_BRIDGE_RAD:
+            elif moved_m > LEAST_BRIDGE_M or abs(turn) > LEAST_BRIDGE_RAD:
                 self._motion = motion
         self._last = scan.stamp, read
         scan = self._with_possible_sweep(scan)
@@ -89,10 +89,7 @@ class OdometryGate:
         """A pose that was read, shape (3,), in the first frame ``odom``."""
         return T_odom_base if self._bridge is None else se2.compose(self._bridge, T_odom_base)
 
-    def _is_jump(self, motion: FloatArray, within_s: float) -> bool:
+    def _is_jump(self, moved_m: float, turned_rad: float, within_s: float) -> bool:
         limits = self._limits
         within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
-        return bool(
-            math.hypot(motion[0], motion[1]) > SLACK_M + limits.speed_m_s * within_s
-            or abs(motion[2]) > SLACK_RAD + limits.turn_rad_s * within_s
-        )
+        return moved_m > SLACK_M + limits.speed_m_s * within_s or turned_rad > SLACK_RAD + limits.turn_rad_s * within_s

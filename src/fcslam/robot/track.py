@@ -34,7 +34,7 @@ class ScanTrack:
         """Append the pose of the next scan."""
         self._stamps.append(pose.stamp)
         self._keyscans.append(pose.keyscan)
-        self._T_keyscan_base.extend(pose.T_keyscan_base)
+        self._T_keyscan_base.extend(pose.T_keyscan_base.tolist())
 
     def extend(self, motion: FloatArray) -> None:
         """Append the next keyscan by the motion to it from the one before, shape (3,), as it is sent to the cloud."""

@@ -42,16 +42,15 @@ class PathSummary:
         elif pose != self._pose:
             self.moves = True
             self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
-            self._judge(self._first, relative_pose(self._pose, pose), pose)
+            if not self.says_something:
+                self._judge(self._first, self._pose, pose)
         self._pose = pose
         self.count += 1
         self.earliest = min(self.earliest, stamp)
         self.latest = max(self.latest, stamp)
 
-    def _judge(self, first: Pose, step: Pose, pose: Pose) -> None:
-        if self.says_something:
-            return
-        self._sideways_m += abs(step[1])
+    def _judge(self, first: Pose, before: Pose, pose: Pose) -> None:
+        self._sideways_m += abs(relative_pose(before, pose)[1])
         self._leaves = self._leaves or hypot(pose[0] - first[0], pose[1] - first[1]) > RESOLUTION_M
         self._turns = self._turns or abs(remainder(pose[2] - first[2], tau)) > RESOLUTION_RAD
 

@@ -4,9 +4,10 @@ from math import cos, nan, remainder, sin, tau
 
 import numpy as np
 
+from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
-Pose = tuple[float, float, float]
+Pose = se2.Pose
 UNKNOWN_POSE: Pose = (nan, nan, nan)
 """Odometry of a robot that has none."""
 

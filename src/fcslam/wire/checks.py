@@ -70,8 +70,8 @@ def check(packet: Packet) -> None:
     _check_count(packet.epoch, "epoch", MAXIMUM_EPOCH)
     _check_count(packet.sequence, "sequence", MAXIMUM_SEQUENCE)
     _require(math.isfinite(packet.time), "time is not finite")
-    robot = _robot_of(packet.body)
-    _require(robot == packet.robot, f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
+    if (robot := _robot_of(packet.body)) != packet.robot:
+        raise PacketError(f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
     _CHECKS[type(packet.body)](packet.body, packet)
 
 
@@ -81,11 +81,15 @@ def check_name(name: str, what: str) -> None:
     Raises:
         PacketError: the name is not valid; the message begins with ``what``.
     """
-    _require(NAME.fullmatch(name) is not None, f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
+    if NAME.fullmatch(name) is None:
+        raise PacketError(f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
+
+
+_OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
 
 
 def _robot_of(body: Body) -> str:
-    return body.id.robot if isinstance(body, Keyscan | Place | WordPlace | TagSighting | KeyscanFix) else body.robot
+    return body.id.robot if isinstance(body, _OF_KEYSCANS) else body.robot
 
 
 def _check_hello(hello: Hello, packet: Packet) -> None:
@@ -295,11 +299,13 @@ def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TUR
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None:
-    _require(array.shape == shape, f"{what} have shape {array.shape}, not {shape}")
+    if array.shape != shape:
+        raise PacketError(f"{what} have shape {array.shape}, not {shape}")
 
 
 def _check_count(value: int, what: str, maximum: int) -> None:
-    _require(0 <= value <= maximum, f"{what} is {value}, not in 0..{maximum}")
+    if not 0 <= value <= maximum:
+        raise PacketError(f"{what} is {value}, not in 0..{maximum}")
 
 
 def _require(condition: bool, reason: str) -> None:

@@ -29,6 +29,7 @@ from fcslam.sources.logs.dialect import (
     ScanLine,
     StatedLaser,
     check_beams,
+    has_beams,
     pose_of,
     stamp_of,
     with_points,
@@ -72,7 +73,7 @@ class _CarmenParser:
         front, *tail = line.rsplit(None, 9)
         _, count, range_text = front.split(None, 2)
         beam_count = int(count)
-        is_timed = len(front.split()) - 2 == beam_count
+        is_timed = has_beams(range_text, beam_count)
         if not is_timed:
             front, *tail = line.rsplit(None, 6)
             _, _, range_text = front.split(None, 2)

@@ -97,8 +97,12 @@ def with_points(line: bytes) -> bytes:
 
 def check_beams(range_text: bytes, beam_count: int) -> None:
     """Raise ValueError unless ``range_text`` has ``beam_count`` numbers, at least two, by count and characters."""
-    single_spaced = range_text.count(b" ") + 1 == beam_count
-    if beam_count < 2 or not (single_spaced or len(range_text.split()) == beam_count):
+    if beam_count < 2 or not has_beams(range_text, beam_count):
         raise ValueError("not as many ranges as stated")
     if range_text.translate(None, _NUMBER_LETTERS):
         raise ValueError("a range is not a number")
+
+
+def has_beams(range_text: bytes, beam_count: int) -> bool:
+    """Whether a text has ``beam_count`` words, which most often are separated by single spaces."""
+    return range_text.count(b" ") + 1 == beam_count or len(range_text.split()) == beam_count
