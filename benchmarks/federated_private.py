@@ -3,13 +3,12 @@
     FCSLAM_DATA=/path/to/data python benchmarks/federated_private.py --study FOLDER
 
 Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained and measured; the same command goes on
-where it was interrupted. Robots, images, first detector and settings are those of federated.py, but for fewer rounds
-and pairs. Central training takes as many steps as all robots together.
+where it was interrupted. Robots, images, first detector and settings are those of federated.py, but for a tenth of the
+rounds, a quarter of the pairs and one seed. Central training takes as many steps as all robots together.
 
 Private robots share every layer but those of the keypoints (`private` in the settings). So each has a network of its
-own, and a pair of views is measured with one of them, which changes with the pair and the seed. Between: the first view
-is seen by another robot's network, as when two robots find the same place. Gaps are in points, with 95 % by paired
-bootstrap over pairs, not over seeds.
+own, and a pair of views is measured with one of them, in turns. Between: the first view is seen by another robot's
+network, as when two robots find the same place. Gaps are in points, with 95 % by paired bootstrap over pairs.
 """
 
 from pathlib import Path
@@ -22,7 +21,7 @@ HEAD = ("body.context_quarter", "body.point_head", "body.refine")
 ARMS = {"together": {}, "private": {"settings": {"private": HEAD}}}
 COMPARED = ("start", "central", *ARMS)
 BETWEEN = {"mma_3px_between": "MMA at 3 px between two robots, %"}
-ROUNDS, SEEDS, PAIRS = 40, 2, 1000
+ROUNDS, SEEDS, PAIRS = 20, 1, 500
 
 
 def main() -> None:
@@ -30,7 +29,7 @@ def main() -> None:
     parser.add_argument("--study", type=Path, help="folder of the study; the same one resumes")
     chosen = parser.parse_args()
     if chosen.study is None:
-        print("skipped: takes half an hour; name a folder by --study")
+        print("skipped: takes 15 minutes; name a folder by --study")
         return
     folder: Path = chosen.study.resolve()
     vision = common.recordings(*VISION.values(), PUBLIC, kind="vision")
