@@ -25,7 +25,7 @@ import itertools
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import common
 import numpy as np
@@ -44,6 +44,7 @@ class Step(NamedTuple):
 
 
 PAPER, KARTO = "the paper", "the paper, Karto's scan matcher"
+KARTO_TRACKER = "robot.lidar.tracker=karto"
 DEFAULT = "light network, words and bits, LiDAR places: the default"
 PICTURES = {step: common.REPOSITORY / "docs" / "images" / f"figure5-{name}.png" for step, name in
             ((PAPER, "paper"), (DEFAULT, "default"))}  # fmt: skip
@@ -91,13 +92,10 @@ def fleet_rows(fleet: Path, seed: int, full: bool, pictures: Mapping[str, Path])
     robots = sorted(fleet.glob("robot_*"))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        paper, run, file = folder / "paper", folder / "run", folder / "changed.yaml"
+        paper, run, file = folder / "paper", folder / "run", folder / "cloud.yaml"
         common.run_fcslam("map", *robots, "--config", Preset.PAPER, "--output", paper)
         yield seed, PAPER, *measures(paper, fleet, pictures.get(PAPER))
-        preset = preset_settings()
-        preset["robot"]["lidar"] = {"tracker": "karto"}
-        file.write_text(yaml.safe_dump(preset), encoding="utf-8")
-        common.run_fcslam("map", *robots, "--config", file, "--output", run)
+        common.run_fcslam("map", *robots, "--config", Preset.PAPER, "--config", KARTO_TRACKER, "--output", run)
         yield seed, KARTO, *measures(run, fleet)
         if not full:
             return
@@ -109,14 +107,9 @@ def fleet_rows(fleet: Path, seed: int, full: bool, pictures: Mapping[str, Path])
         yield seed, DEFAULT, *measures(run, fleet, pictures.get(DEFAULT))
 
 
-def preset_settings() -> dict[str, Any]:
-    """The paper's system, as its file says."""
-    return yaml.safe_load(Preset.PAPER.file.read_text(encoding="utf-8"))
-
-
 def changed_clouds() -> Iterator[tuple[Step, dict[str, object]]]:
     """The settings of the cloud after each change: the preset, then one change after the other."""
-    fleet = preset_settings()["fleet"]
+    fleet = yaml.safe_load(Preset.PAPER.file.read_text(encoding="utf-8"))["fleet"]
     for step in CHANGES:
         changes = dict(step.changes)
         fleet["fusion"] = changes.pop("fusion", fleet["fusion"])
