@@ -31,7 +31,7 @@ pairs of one image resemble one another, so they are somewhat too narrow; most s
 import csv
 import json
 import sys
-from collections.abc import Iterator, Set
+from collections.abc import Iterable, Iterator, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +108,8 @@ def main() -> None:
     known = set(findings.measured)
     for measure, title in TITLES.items():
         report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED if arm in known])
-    report.table("Robots' own networks, at home and where other robots are", AT_HOME, list(home_rows(findings)))
+    at_home = list(home_rows(findings, ("local", "alone")))
+    report.table("Robots' own networks, at home and where other robots are", AT_HOME, at_home)
     unpoisoned = compare(findings, "together")
     if poisoned := list(poison_rows(unpoisoned)):
         report.table("One of five robots poisoned", LOSSES, poisoned)
@@ -121,11 +122,6 @@ def main() -> None:
 def study(vision: Path, folder: Path, until: str | None) -> "StudyResults":
     """Train and measure whatever is missing, up to an arm."""
     fleet = robots(vision, folder)
-    if not (folder / "start" / "detector.onnx").exists():
-        (folder / "start.yaml").write_text(json.dumps(START), encoding="utf-8")
-        common.run_fcslam(
-            "tools", "train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start"
-        )
     names = list(arms())
     wanted = names[: names.index(until) + 1] if until else names
     content = {
@@ -136,9 +132,19 @@ def study(vision: Path, folder: Path, until: str | None) -> "StudyResults":
         "pairs": PAIRS,
         "images": IMAGES,
         "trained": TRAINED,
-        "start": folder / "start" / "joint" / "checkpoint.npz",
+        "start": initial(vision, folder),
     }
     return run(fleet, folder / "study", content)
+
+
+def initial(vision: Path, folder: Path) -> Path:
+    """The checkpoint that all arms start from, trained unless it is there."""
+    if not (folder / "start" / "detector.onnx").exists():
+        (folder / "start.yaml").write_text(json.dumps(START), encoding="utf-8")
+        common.run_fcslam(
+            "tools", "train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start"
+        )
+    return folder / "start" / "joint" / "checkpoint.npz"
 
 
 def setting(findings: "StudyResults", folder: Path) -> str:
@@ -160,17 +166,17 @@ def places() -> list[tuple[str, str]]:
     return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
 
 
-def home_rows(findings: "StudyResults") -> Iterator[tuple[object, ...]]:
-    """What a robot's own network makes of its own images, and of others', beside the networks that all have."""
+def home_rows(findings: "StudyResults", own: Iterable[str]) -> Iterator[tuple[object, ...]]:
+    """What robots' own networks make of their own images, and of others', beside the networks that all have."""
     from federated_study.pairs import MEASURES
 
     owners = np.array(findings.owners)
     everybody = {arm: np.nanmean(findings.measured[arm], axis=(0, 1)) for arm in ("central", "together")}
-    for arm in ("local", "alone"):
-        values = findings.measured[arm][0]
+    for arm in own:
+        values = findings.measured[arm]
         known = np.isfinite(values[..., 0])
-        shown = [network == owners[pair] for network, pair in np.argwhere(known)]
-        pairs = np.argwhere(known)[:, 1]
+        shown = [network == owners[pair] for _, network, pair in np.argwhere(known)]
+        pairs = np.argwhere(known)[:, 2]
         for images, mask in (("its own", np.array(shown)), ("others'", ~np.array(shown))):
             cells: list[object] = []
             for index in (MEASURES.index(measure) for measure in TITLES):

@@ -74,7 +74,7 @@ class DrawnRobot:
             self.on_missing(self, fate < self.missing / 2)
         return ClientUpdate(drawn_update(weights, rng, round_number), {"drawn": STEP})
 
-    def evaluate(self, _weights: Weights, _settings: FederatedSettings) -> dict[str, float]:
+    def evaluate(self, *_request: object) -> dict[str, float]:
         raise TrainingError("has no images")
 
 

@@ -16,8 +16,10 @@ from fcslam.metrics.homography import corner_error, estimate_homography, inverse
 from fcslam.metrics.repeatability import in_common_view, repeatability
 from fcslam.records import Codes, FloatArray
 
-MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former")
-"""Shares in [0, 1]; the last one matches codes of the initial network with codes of the measured one."""
+MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former", "mma_3px_between")
+"""Shares in [0, 1]. The last two match the measured network in the second view with another one in the first: the
+initial network, and the network of another robot, which is the same one where all robots share it.
+"""
 WITHIN_PX: Final = 3.0
 VIEW: Final = (320, 240)
 """Width and height of a view [px]."""
@@ -59,14 +61,15 @@ def detect_features(detector: FeatureDetector, view: AugmentedView) -> DetectedF
 
 
 def measure_pair(
-    detector: FeatureDetector, pair: ViewPair, legacy: DetectedFeatures
-) -> tuple[float, float, float, float]:
-    """``MEASURES`` of one pair: homography correct to 3 px at its corners (0 or 1), MMA, repeatability, legacy MMA.
+    detector: FeatureDetector, other: FeatureDetector, pair: ViewPair, legacy: DetectedFeatures
+) -> tuple[float, float, float, float, float]:
+    """``MEASURES`` of one pair; the homography is correct to 3 px at its corners (0 or 1).
 
     Without matches MMA is 0, so that a detector that finds nothing does not look good.
 
     Args:
         detector: to measure.
+        other: the detector of another robot, or the same one.
         pair: two views.
         legacy: what the initial network detects in the first view, for the legacy MMA.
     """
@@ -74,7 +77,9 @@ def measure_pair(
     matched = _matched(first, second, pair)
     error = corner_error(estimate_homography(*matched), pair.homography, VIEW)
     again = repeatability(first.points, second.points, pair.homography, VIEW, MOST_POINTS).repeatability
-    return float(error <= WITHIN_PX), _accuracy(matched, pair), again, _accuracy(_matched(legacy, second, pair), pair)
+    others = first if other is detector else detect_features(other, pair.views[0])
+    accuracies = (_accuracy(_matched(features, second, pair), pair) for features in (legacy, others))
+    return float(error <= WITHIN_PX), _accuracy(matched, pair), again, *accuracies
 
 
 def _matched(first: DetectedFeatures, second: DetectedFeatures, pair: ViewPair) -> tuple[FloatArray, FloatArray]:

@@ -44,6 +44,8 @@ class PoisonedClient:
                 update = np.full_like(update, np.nan)
         return ClientUpdate(apply_update(weights, update, names), trained.losses)
 
-    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+    def evaluate(
+        self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings
+    ) -> dict[str, float]:
         """As in ``FederatedClient``."""
-        return self.client.evaluate(weights, settings)
+        return self.client.evaluate(weights, round_number, run_id, settings)

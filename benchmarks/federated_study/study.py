@@ -20,6 +20,7 @@ from fcslam.config import parse
 from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.checkpoint import run_id
 from fcslam.learning.federated.client import FederatedClient, RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
@@ -118,9 +119,9 @@ class StudyResults:
     owners: tuple[int, ...]
     """For each pair the index in ``robots`` of the robot whose image it shows."""
     measured: Mapping[str, FloatArray]
-    """By arm: shape (seeds, networks, pairs, measures). The arms ``local`` and ``alone`` have a network for each robot,
-    all others one. Each pair is measured with one network only; the others have NaN there. An arm may have fewer seeds
-    than central, and ``local`` and ``alone`` may be missing.
+    """By arm: shape (seeds, networks, pairs, measures). The arms ``local`` and ``alone``, and arms with private
+    layers, have a network for each robot, all others one. Each pair is measured with one network only; the others have
+    NaN there. An arm may have fewer seeds than central, and ``local`` and ``alone`` may be missing.
     """
 
 
@@ -202,7 +203,7 @@ def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
 
 
 def _trained(study: Study, common: SharedInputs, name: str, seed: int) -> list[KeypointNetwork]:
-    """The networks of an arm: one for each robot in the arms ``LOCAL`` and ``ALONE``, else one."""
+    """The networks of an arm: one for each robot if the robots' networks differ, else one."""
     if name == START:
         return [weights_to_network(common.start, study.federated.training.encoder)]
     everything = [example for images in common.images.values() for example in images.train]
@@ -218,29 +219,33 @@ def _trained(study: Study, common: SharedInputs, name: str, seed: int) -> list[K
     settings = arm.federated(study.federated, seed)
     if not arm.together:
         return [_centrally(study, common, name, seed, everything, settings.client_training())]
-    return [_federated(study, common, name, seed, settings)]
+    return _federated(study, common, name, seed, settings)
 
 
 def _federated(
     study: Study, common: SharedInputs, name: str, seed: int, settings: FederatedSettings
-) -> KeypointNetwork:
-    """Train the network of an arm: the one that could be released at its end."""
-    folder = study.folder / f"seed{seed}" / name
-    clients: list[FederatedClient] = [
+) -> list[KeypointNetwork]:
+    """Train the network of an arm: the one that could be released at its end. With private layers, each robot's."""
+    folder, encoder = study.folder / f"seed{seed}" / name, settings.training.encoder
+    robots = [
         RobotClient(robot, Path(robot), folder / robot, study.options.device, images=own)
         for robot, own in common.images.items()
     ]
+    clients: list[FederatedClient] = [*robots]
     poison = study.arms[name].poison
     if poison is not None:
         clients[-1] = PoisonedClient(clients[-1], poison)
     hooks = CoordinatorHooks(
-        partial(weights_version, encoder=settings.training.encoder),
+        partial(weights_version, encoder=encoder),
         # Without metrics no version is better than another: the last one counts, as in the other arms.
         evaluate_fn=lambda _weights: {},
         on_round=lambda report: study.on_progress(f"{name}, seed {seed}", report.round_number, settings.rounds),
     )
     state = Coordinator(in_process_grid(clients), settings, common.start, folder, hooks).run()
-    return weights_to_network(state.average, settings.training.encoder)
+    if not settings.private:
+        return [weights_to_network(state.average, encoder)]
+    request = settings.rounds - 1, run_id(settings, weights_version(common.start, encoder)), settings
+    return [weights_to_network(robot.own_weights(state.average, *request), encoder) for robot in robots]
 
 
 def _steps_of(study: Study, seed: int, shares: int) -> TrainingSettings:
@@ -277,7 +282,8 @@ def _measured(
     measures = np.full((len(detectors), len(pairs), len(MEASURES)), np.nan)
     for index, pair in enumerate(pairs):
         turn = (index + seed) % len(detectors)
-        measures[turn, index] = measure_pair(detectors[turn], pair, common.legacy[index])
+        other = detectors[(turn + 1) % len(detectors)]
+        measures[turn, index] = measure_pair(detectors[turn], other, pair, common.legacy[index])
         study.on_progress("measuring", index + 1, len(pairs))
     return measures
 

@@ -95,8 +95,8 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
     assert ("averaged, seed 2", 2) in told
     assert not [name for name, _ in told if name.startswith("central") or name == "averaged, seed 1"]
     assert {name: values.shape for name, values in whole.measured.items()} == {
-        "start": (1, 1, 4, 4), "central": (2, 1, 4, 4), "local": (2, 2, 4, 4), "alone": (2, 2, 4, 4),
-        "averaged": (2, 1, 4, 4), "bad": (2, 1, 4, 4),
+        "start": (1, 1, 4, 5), "central": (2, 1, 4, 5), "local": (2, 2, 4, 5), "alone": (2, 2, 4, 5),
+        "averaged": (2, 1, 4, 5), "bad": (2, 1, 4, 5),
     }  # fmt: skip
     assert whole.owners == (0, 0, 1, 1)
     start = whole.measured["start"]
@@ -165,13 +165,13 @@ def test_a_network_matches_a_view_with_itself(robots, tmp_path):
         (pair.views[0], pair.views[0]), pair.valid, pair.teacher_valid, pair.teacher_descriptors, np.eye(3)
     )
     own = detect_features(detector, pair.views[0])
-    correct, accuracy, again, former = measure_pair(detector, same, own)
+    correct, accuracy, again, former, between = measure_pair(detector, detector, same, own)
     assert (correct, again) == (1.0, 1.0)
     assert accuracy > 0.95
-    assert former == accuracy
-    assert measure_pair(detector, same, DetectedFeatures(own.points, np.bitwise_not(own.codes)))[3] < 0.2
+    assert former == between == accuracy
+    assert measure_pair(detector, detector, same, DetectedFeatures(own.points, np.bitwise_not(own.codes)))[3] < 0.2
     nothing = DetectedFeatures(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
-    assert measure_pair(detector, same, nothing)[3] == 0.0
+    assert measure_pair(detector, detector, same, nothing)[3] == 0.0
 
 
 def findings(central, federated, local):

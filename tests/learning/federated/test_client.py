@@ -185,6 +185,19 @@ def test_private_layers_continue_from_the_robots_own_last_round(folder, start, t
     assert not same(client.train(start, 1, "run", settings()).weights, again.weights)
 
 
+def test_a_robot_evaluates_with_its_own_private_layers(folder, start, tmp_path):
+    private = settings(private=["body.point_head"])
+    client = robot(folder, tmp_path)
+    trained = client.train(start, 0, "run", private).weights
+    names = [name for name in start if name.startswith("body.point_head.")]
+    own = start | {name: trained[name] for name in names}
+    blind = start | {name: np.zeros_like(start[name]) for name in names}
+    assert same(own, client.own_weights(blind, 0, "run", private))
+    found = client.evaluate(own, 0, "run", settings())
+    assert client.evaluate(blind, 0, "run", private) == found
+    assert client.evaluate(blind, 0, "another run", private) != found
+
+
 def test_robots_and_seeds_draw_differently():
     assert len({robot_seed(name, seed) for name in "abc" for seed in (1, 2)}) == 6
 

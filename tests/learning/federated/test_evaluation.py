@@ -27,7 +27,7 @@ class Judging(Fake):
     level: float = 0.5
     slope: float = 0.01
 
-    def evaluate(self, weights, _settings):
+    def evaluate(self, weights, *_):
         return figures(self.level + self.slope * 10.0 * float(weights["b.weight"] - START["b.weight"]))
 
 
@@ -90,11 +90,11 @@ def test_nobody_who_can_judge_is_waited_for_and_is_no_collapse(tmp_path):
     class Sick(Judging):
         asked_to_judge = 0
 
-        def evaluate(self, weights, chosen):
+        def evaluate(self, weights, *rest):
             self.asked_to_judge += 1
             if self.asked_to_judge in (1, 3, 4):
                 raise TrainingError("the disk is gone")
-            return super().evaluate(weights, chosen)
+            return super().evaluate(weights, *rest)
 
     waited = []
     state, reports = run([Sick("a")], tmp_path / "waits", evaluate_fn=None, wait=waited.append)
@@ -118,10 +118,10 @@ def test_a_run_that_robots_judged_goes_on_with_public_images(tmp_path):
 
 def test_a_robot_that_only_fails_to_judge_the_best_is_named(tmp_path):
     class Late(Judging):
-        def evaluate(self, weights, chosen):
+        def evaluate(self, weights, *rest):
             if weights["b.weight"] < START["b.weight"] + 0.25:
                 raise TrainingError("too dark")
-            return super().evaluate(weights, chosen)
+            return super().evaluate(weights, *rest)
 
     _, reports = run_coming([Judging("a", slope=-0.01), Late("b", slope=-0.01)], [0, 2], tmp_path, rounds=4)
     assert reports[2].left_out == {"judging by b": "too dark"}

@@ -22,7 +22,7 @@ class Judge(Fake):
     likes: float = 1.0
     pairs: int = 100
 
-    def judge(self, weights, _settings):
+    def judge(self, weights, *_):
         rng = np.random.default_rng(1)
         recall = 0.3 + 0.1 * self.likes * (float(weights["a.weight"][0, 0]) - 1.0) + 0.01 * rng.random(self.pairs)
         return np.column_stack((recall, rng.random(self.pairs) < 0.8)).astype(np.float32)
@@ -56,7 +56,7 @@ def test_a_small_fleet_with_few_pairs_releases_nothing(tmp_path):
 
 def test_a_robot_whose_report_is_no_report_does_not_count(tmp_path):
     class Liar(Judge):
-        def judge(self, _weights, _settings):
+        def judge(self, *_):
             return np.full((500, 2), 7.0, np.float32)
 
     _, reports = gated([Judge("r0"), Judge("r1"), Liar("r2")], tmp_path)

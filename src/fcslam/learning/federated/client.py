@@ -17,7 +17,7 @@ from fcslam.learning.federated.evaluation import SCORE_METRICS
 from fcslam.learning.federated.held_out import HeldOutPairs, Judgement, judge
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network
 from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.learning.federated.weights import Weights, shared_weights
+from fcslam.learning.federated.weights import Weights, shared_weights, with_private
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
 from fcslam.learning.revisit_batches import RevisitExamples
@@ -46,16 +46,18 @@ class FederatedClient(Protocol):
     def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
         """Train for a round, counted from 0, of the run with this number."""
 
-    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
-        """Metrics of the weights by name."""
+    def evaluate(
+        self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings
+    ) -> dict[str, float]:
+        """Metrics of the weights by name, after the round."""
 
 
 @runtime_checkable
 class JudgingClient(Protocol):
     """A participant that holds out pairs of keyframes."""
 
-    def judge(self, weights: Weights, settings: FederatedSettings) -> Judgement:
-        """A report on these pairs with the weights."""
+    def judge(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> Judgement:
+        """A report on these pairs with the weights, after the round."""
 
 
 @dataclass(slots=True)
@@ -100,8 +102,7 @@ class RobotClient:
         """
         encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
         moments, own = load_robot_state(self.cache, run_id, round_number)
-        shared = shared_weights(weights, settings.private)
-        weights = {name: shared[name] if name in shared else own.get(name, array) for name, array in weights.items()}
+        weights = with_private(weights, own, settings.private)
         start = weights_to_network(weights, encoder).state_dict()
         plan = LocalTrainingPlan(
             first_step=round_number * settings.local_steps,
@@ -122,29 +123,47 @@ class RobotClient:
             images = self._labelled_images(weights, settings).train
             trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)
         found = network_to_weights(trained.network)
+        shared = shared_weights(found, settings.private)
         own = {name: array for name, array in found.items() if name not in shared}
         save_robot_state(self.cache, run_id, round_number, trained.optimiser_state, own)
         return ClientUpdate(found, trained.losses)
 
-    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+    def own_weights(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> Weights:
+        """The weights with the robot's own private layers, as they are after the round.
+
+        Raises:
+            TrainingError: the cache cannot be read.
+        """
+        _, own = load_robot_state(self.cache, run_id, round_number + 1)
+        return with_private(weights, own, settings.private)
+
+    def evaluate(
+        self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings
+    ) -> dict[str, float]:
         """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out.
+
+        Private layers are the robot's own.
 
         Raises:
             TrainingError: as in ``train``.
         """
+        weights = self.own_weights(weights, round_number, run_id, settings)
         network = weights_to_network(weights, settings.training.encoder).to(self.device)
         held_out = self._labelled_images(weights, settings).held_out
         found = validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
         # A detector that finds nothing has no metrics; it counts as one that finds nothing again.
         return {name: found[name] if np.isfinite(found[name]) else 0.0 for name in SCORE_METRICS}
 
-    def judge(self, weights: Weights, settings: FederatedSettings) -> Judgement:
+    def judge(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> Judgement:
         """A report on the pairs of keyframes that the robot holds out, with the weights, shape (P, 2).
 
+        Private layers are the robot's own.
+
         Raises:
-            TrainingError: the weights belong to another network.
+            TrainingError: the weights belong to another network, or the cache cannot be read.
         """
         device = torch.device(self.device)
+        weights = self.own_weights(weights, round_number, run_id, settings)
         network = weights_to_network(weights, settings.training.encoder).to(device)
         judgement: Judgement = judge(network, self.held_out, device)
         return judgement

@@ -49,8 +49,8 @@ def _train(message: Message, client: FederatedClient) -> Message:
 def _evaluate(message: Message, client: FederatedClient) -> Message:
     request = read_request(message.content)
     if request.settings.on_revisits and isinstance(client, JudgingClient):
-        rows = client.judge(request.weights, request.settings)
+        rows = client.judge(request.weights, request.round_number, request.run_id, request.settings)
         arrays = weights_to_record({PAIRS_KEY: rows})
         return Message(client_reply(client.name, request.version, {}, arrays), reply_to=message)
-    metrics = client.evaluate(request.weights, request.settings)
+    metrics = client.evaluate(request.weights, request.round_number, request.run_id, request.settings)
     return Message(client_reply(client.name, request.version, metrics), reply_to=message)

@@ -26,6 +26,11 @@ def shared_weights(weights: Weights, private: Collection[str]) -> dict[str, NDAr
     return {name: array for name, array in weights.items() if not _belongs(name, private)}
 
 
+def with_private(weights: Weights, own: Weights, private: Collection[str]) -> Weights:
+    """The weights with the arrays of ``own`` in the private layers; those that ``own`` lacks stay as they are."""
+    return {name: own.get(name, array) if _belongs(name, private) else array for name, array in weights.items()}
+
+
 def check_private(weights: Weights, private: Collection[str]) -> None:
     """Check that each private layer is one of the network, and that others are left to share.
 
