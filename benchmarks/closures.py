@@ -2,7 +2,7 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/closures.py
 
-The relations are optimised together, so that they place stamps to each other that
+The relations are optimized together, so that they place stamps to each other that
 no single one joins; a closure is covered if both its stamps lie within 1 s of such stamps in one component, and the gap
 is bridged by the run's own trajectory. "One relation" asks the same of a single relation, without any chain. A covered
 closure is wrong if it is off by more than 0.5 m or 10 deg. A revisit is a relation between robots more than 20 s apart,

@@ -6,7 +6,7 @@ FOLDER keeps the networks; those that it lacks are trained, all at the same time
 table measures, and on --images, such as renders. Pairs are drawn on the device (`device_pairs.py`).
 
 - near, wide, turns: the light network from the bundled one, with the losses of `fcslam tools train` and the
-  localisation loss, in float32. Views change as in `fcslam tools train` in `near`. In the others, the scales of a pair
+  localization loss, in float32. Views change as in `fcslam tools train` in `near`. In the others, the scales of a pair
   differ by up to 4; in `wide` views turn by 26 degrees (standard deviation), in `turns` half of them by any angle.
   Labels are those of the bundled network and of Harris's measure
 - ours, hardest, all: the paper's network from `vgg`. The last two have eqs. (1)-(3) alone for their codes, without a
@@ -52,7 +52,7 @@ from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import LossSettings, TrainingSettings
 from fcslam.learning.stages import keypoint_response, read_labelled_images
 from fcslam.learning.trainer import AVERAGE_DECAY, ExecutionOptions
-from fcslam.learning.training_step import CLIP_NORM, create_optimiser, learning_rate
+from fcslam.learning.training_step import CLIP_NORM, create_optimizer, learning_rate
 
 SOURCES = (
     "bsds500", "coco_subset", "urban100", "sun_hays80", "kodak24", "icl_nuim_snippet", "camvid", "ie_tower",
@@ -88,7 +88,7 @@ class Arm:
 
 
 def light(change: Change) -> Arm:
-    loss = LossSettings(localisation=2.0)
+    loss = LossSettings(localization=2.0)
     return Arm(TrainingSettings(pairs=64, side_px=256, points=448, learning_rate=1e-3, loss=loss), change)
 
 
@@ -201,7 +201,7 @@ def train_arm(
     network = bundled(arm.start, settings, folder / name, train_on).to(device, memory_format=torch.channels_last)
     average = KeypointNetwork(settings.encoder).to(device).eval()
     average.load_state_dict(network.state_dict())
-    optimiser = create_optimiser(network)
+    optimizer = create_optimizer(network)
     draw = partial(draw_on_device, side=settings.side_px, points=settings.points, change=arm.change)
     photographs = Photographs.of(train_on, device)
     generator = torch.Generator(device).manual_seed(SEED)
@@ -211,16 +211,16 @@ def train_arm(
     watch.look(name, 0, average, parts)
     while progress < 1.0:
         shown = settings.model_copy(update={"steps": 10_000})  # the schedules depend on the share that is done alone
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = learning_rate(shown, int(progress * shown.steps))
         batch = draw(photographs, settings.pairs, generator=generator)
         maps = network.train()(batch.images.contiguous(memory_format=torch.channels_last))
         shift = grid_shift(settings.encoder, SEED, step)
         total, parts = objective(maps, batch, settings.loss, progress, shift, None)
-        optimiser.zero_grad(set_to_none=True)
+        optimizer.zero_grad(set_to_none=True)
         total.backward()
         if torch.isfinite(torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)):
-            optimiser.step()
+            optimizer.step()
         else:
             print(f"{name} {step}: left out, because it is not finite: {parts}", flush=True)
         follow(average, network, step)

@@ -17,7 +17,7 @@ was; the worst robot is the one whose images an arm does worst on, whoever train
 
 Chosen on another fleet's held-out images (another floor, another drive, photographs of another set, robots of another
 simulation; 600 pairs, one seed): the learning rate, which gave central training the better MMA of 1e-3 and 3e-3, that a
-robot's optimiser goes on where its last round ended, the length of rounds, and the server's momentum. The number of
+robot's optimizer goes on where its last round ended, the length of rounds, and the server's momentum. The number of
 images was chosen before any of this was measured, but after a smaller study with 36 to 46 images a robot, where robots
 alone lacked nothing; the number of rounds is the default, after studies of fewer, where steps were still lacking more
 than others' images.

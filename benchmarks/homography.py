@@ -34,7 +34,7 @@ SCENES = ("oxford_affine", "hpatches_subset")
 SEED = 1
 BASELINE, LOGITS = "orb", "-logits"
 SHARE = ".3f"
-REPEATABILITY = {"": "s", "illumination": SHARE, "viewpoint": SHARE, "all": "s", "localisation, px": ".2f",
+REPEATABILITY = {"": "s", "illumination": SHARE, "viewpoint": SHARE, "all": "s", "localization, px": ".2f",
                  "ms 320x240": ".1f", "ms 640x480": ".1f"}  # fmt: skip
 MATCHING = {"": "s", "NMS": "d", "i, e=3": SHARE, "v, e=3": SHARE, "e=1": SHARE, "e=2": SHARE, "e=3": "s", "e=5": SHARE,
             "MMA@1": SHARE, "MMA@3": "s", "MMA@5": SHARE, "matching score": SHARE,
@@ -73,7 +73,7 @@ def _repeatability(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
             name,
             *(mean(pairs, "repeatability", kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT)),
             _shown(interval(pairs, "repeatability", SEED)),
-            mean(pairs, "localisation_error_px"),
+            mean(pairs, "localization_error_px"),
             *(measured.milliseconds.get((name, size), math.nan) for size in (SMALL, LARGE)),
         )
 

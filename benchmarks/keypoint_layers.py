@@ -7,8 +7,8 @@ of views of photographs under random homographies and light (BSDS500, COCO, SUN 
 Every arm has the cross entropy to the bundled network's own probabilities, and beside it:
 
 - agreement: the keypoint maps of both views agree in windows (`agreement_loss` in `learning/losses.py`)
-- localisation: keypoints of both views that are mutual nearest neighbours within 2.5 px lie, by the parabola through
-  each peak, at the same point (`localisation_loss` in `learning/localisation.py`)
+- localization: keypoints of both views that are mutual nearest neighbours within 2.5 px lie, by the parabola through
+  each peak, at the same point (`localization_loss` in `learning/localization.py`)
 - both
 
 Measured on 25 pairs of photographs of other places (corrected, NMS 8 px; needs FCSLAM_DATA), and in the unseen
@@ -48,7 +48,7 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.images import find_images, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.local_training import LocalTrainingPlan, train_layers
-from fcslam.learning.localisation import localisation_loss
+from fcslam.learning.localization import localization_loss
 from fcslam.learning.losses import agreement_loss, detector_loss
 from fcslam.learning.network import cell_probabilities
 from fcslam.learning.objective import grid_shift, shift_grid, views_aligned
@@ -57,8 +57,8 @@ from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
 
 PHOTOGRAPHS = ("bsds500", "coco_subset", "sun_hays80", "openimages_doors")
-ARMS = {"bundled": (), "agreement": ("agreement",), "localisation": ("localisation",),
-        "both": ("agreement", "localisation")}  # fmt: skip
+ARMS = {"bundled": (), "agreement": ("agreement",), "localization": ("localization",),
+        "both": ("agreement", "localization")}  # fmt: skip
 UNLABELLED = Labels(np.zeros((1, 2), np.float32), np.ones(1, np.float32))
 """No arm uses labels."""
 
@@ -114,8 +114,8 @@ def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | N
         parts = {"initial": detector_loss(*shift_grid((logits, wanted, batch.seen), shift))}
         if "agreement" in ARMS[arm]:
             parts["agreement"] = agreement_loss(*views_aligned(logits.sigmoid(), batch))
-        if "localisation" in ARMS[arm]:
-            parts["localisation"] = localisation_loss(logits.sigmoid(), batch.homographies)
+        if "localization" in ARMS[arm]:
+            parts["localization"] = localization_loss(logits.sigmoid(), batch.homographies)
         return torch.stack(list(parts.values())).sum(), parts
 
     train_layers(network, network.point_layers, losses_of, settings, LocalTrainingPlan(0, settings.steps))

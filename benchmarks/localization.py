@@ -1,4 +1,4 @@
-"""Localisation in a finished map: found after how far, how exactly, and never in the wrong place.
+"""Localization in a finished map: found after how far, how exactly, and never in the wrong place.
 
     FCSLAM_DATA=/path/to/data python benchmarks/localization.py [--keep rows.jsonl]
 
@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import common
 import numpy as np
-from relocalisation import Drive, kidnap
+from relocalization import Drive, kidnap
 from strangers import CORRECTED, RAW
 from wean_hall import LOGS as WEAN_HALL
 
@@ -54,7 +54,7 @@ BUILDINGS, SEEDS, PATH_M = ("default", "office"), tuple(range(101, 117)), 60.0
 MAPPING = (0, 3, 4)
 """Robots of a fleet of five that make the map."""
 
-FOUND = {"scans": ",.0f", "localised": ".3f", "fixed after, m": ".1f", "fixes": ".0f", "losses": ".0f"}
+FOUND = {"scans": ",.0f", "localized": ".3f", "fixed after, m": ".1f", "fixes": ".0f", "losses": ".0f"}
 PARTS = {"log": "", **FOUND, "relations, m": ".4f", "deg": ".3f", "largest, m": ".3f", "CPU, s": ".1f",
          "of a core at 10 Hz": ".4f"}  # fmt: skip
 WEAN = {"run": "", **FOUND, "driven, m": ".1f", "off, median, m": ".3f", "largest, m": ".3f", "wrong": ".0f"}
@@ -136,7 +136,7 @@ def found(run: Run) -> tuple[float, ...]:
 
 
 def localized(source: Any, place: Path | Any) -> tuple[Run, float]:
-    """The run of a localisation, and its CPU time."""
+    """The run of a localization, and its CPU time."""
     from fcslam.mission.localization import run_localization
     from fcslam.mission.mission import MissionConfig
 
@@ -172,7 +172,7 @@ def wean_hall(folder: Path, work: Path) -> Iterable[tuple]:
 def in_map_of_others(
     recordings: Sequence[sources.Source], own: sources.Source, together: Run, work: Path
 ) -> tuple[Run, FloatArray]:
-    """A robot localised in the map of the others, and how far each scan is from its pose in the map of all, (N, 3).
+    """A robot localized in the map of the others, and how far each scan is from its pose in the map of all, (N, 3).
 
     The map of all is moved onto that of the others by a robot that is in both.
     """
@@ -213,7 +213,7 @@ class Carried(NamedTuple):
 
 
 def carry_away(building: str, seed: int) -> Carried | None:
-    """Localise a robot that is carried away; None if the building is too small."""
+    """Localize a robot that is carried away; None if the building is too small."""
     settings = SimulationSettings(building=Building(building), robots=5, path_length_m=PATH_M, camera=None)
     robots = simulate_fleet(settings, seed).robots
     drives = [Drive(robot.name, list(robot.scans()), robot.T_building_base) for robot in robots]
@@ -273,7 +273,7 @@ def known_share(carried: Carried, number: int) -> float:
 def summary(rows: Sequence[tuple]) -> Iterator[tuple[str, float]]:
     some = [dict(zip(CARRIED, row, strict=True)) for row in rows]
     yield "carried away", len(some)
-    yield "localised before", sum(row["fixed before"] == "yes" for row in some)
+    yield "localized before", sum(row["fixed before"] == "yes" for row in some)
     yield "found again", sum(row["found"] == "yes" for row in some)
     able = [row for row in some if row["in known area, m"] >= ENOUGH_M]
     yield f"at least {ENOUGH_M:.0f} m in known area", len(able)

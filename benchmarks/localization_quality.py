@@ -7,7 +7,7 @@ three others. **Real robots**: poses of five runs in Wean Hall, each in the map 
 of three logs in the map of the parts before it; reference: the map of all of them. A pose is wrong if it is more than
 0.5 m or 0.1 rad off.
 
-**Corrections**: all those that the cloud sends to the simulated robots of `relocalisation.py` before and after they are
+**Corrections**: all those that the cloud sends to the simulated robots of `relocalization.py` before and after they are
 carried away half-way, while they are mapped together with another one. Wrong: more than 0.3 m or 5 degrees off.
 
 Per range of quality: how many, wrong ones, and the upper end of the 95 % confidence interval of their share, with each
@@ -28,7 +28,7 @@ from typing import Any
 
 import common
 import numpy as np
-import relocalisation
+import relocalization
 from localization import BUILDINGS, SEEDS, WRONG_M, carry_away, in_map_of_others
 from numpy.typing import NDArray
 from wean_hall import LOGS as WEAN_HALL
@@ -89,10 +89,10 @@ def carried(building: str, seed: int) -> Counts:
 
 def corrected(building: str, seed: int) -> Counts:
     """Corrections of a robot that is carried away while it is mapped together with another one; 0 is not counted."""
-    drives = relocalisation.recorded(building, seed)
-    kidnapped, _ = relocalisation.kidnap(drives[1], drives[2], np.random.default_rng(seed))
-    others, packets = (relocalisation.driven(drive, relocalisation.WATCHED)[0] for drive in (drives[0], kidnapped))
-    sent, _ = relocalisation.mission((drives[0], kidnapped), others, packets)
+    drives = relocalization.recorded(building, seed)
+    kidnapped, _ = relocalization.kidnap(drives[1], drives[2], np.random.default_rng(seed))
+    others, packets = (relocalization.driven(drive, relocalization.WATCHED)[0] for drive in (drives[0], kidnapped))
+    sent, _ = relocalization.mission((drives[0], kidnapped), others, packets)
     quality, wrong = np.array([one.quality for one in sent]), np.array([not one.is_right for one in sent])
     return in_ranges(quality, wrong, quality > 0.0)
 

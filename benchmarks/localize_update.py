@@ -1,9 +1,9 @@
-"""A map that follows the building: a robot localises in the map of the day before, and draws what moved since.
+"""A map that follows the building: a robot localizes in the map of the day before, and draws what moved since.
 
     python benchmarks/localize_update.py [--seeds 10] [--path 120]
 
 On the first day, a simulated robot (LiDAR, 360 beams at 5 Hz) maps a building. Then 30 % of the furniture moves in the
-rooms that a second robot visits. On the second day, that robot localises in the map with `fcslam localize --update`.
+rooms that a second robot visits. On the second day, that robot localizes in the map with `fcslam localize --update`.
 On the third day the building is as the second robot found it: F1 of the surfaces (0.10 m) of the map against this
 building, before and after the update. Moved: the same of surfaces farther than 0.15 m from those of the other day; the
 share of new ones that the map has, and the share of old ones that it still has.
@@ -37,7 +37,7 @@ def main() -> None:
     report.table(
         "Maps",
         {"": "s", "F1 before": ".3f", "F1 after": ".3f", "new surfaces drawn, %": ".1f", "old ones left, %": ".1f",
-         "localised, %": ".1f"},
+         "localized, %": ".1f"},
         rows,
     )  # fmt: skip
     report.write()
@@ -66,8 +66,8 @@ def _judged(seed, path_m):
     before = se2.transform(T_truth_map, maps[0].centres(maps[0].occupied))
     gone = gone[within(gone, before, 0.1)]
     f1 = [grid_agreement(grid, truth, T_truth_map).f1 for grid in maps]
-    localised = followed.localized[second.name].is_localized.mean()
-    return *f1, 100.0 * _share(appeared, drawn), 100.0 * _share(gone, drawn), 100.0 * localised
+    localized = followed.localized[second.name].is_localized.mean()
+    return *f1, 100.0 * _share(appeared, drawn), 100.0 * _share(gone, drawn), 100.0 * localized
 
 
 def _share(points, drawn):

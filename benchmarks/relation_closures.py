@@ -1,4 +1,4 @@
-"""Precision and recall of a run's closures by stage, against the optimised graph of reference relations.
+"""Precision and recall of a run's closures by stage, against the optimized graph of reference relations.
 
 The optimum of all relations gives relative poses of stamps that no single relation connects. The ends of a closure are
 other poses, shortly before or after. The run's own trajectory bridges this gap; over such a short time it is as
@@ -45,12 +45,12 @@ for consistent relations, it cancels out."""
 
 @dataclass(frozen=True, slots=True)
 class RelationGraph:
-    """The optimised pose graph of a set of relations."""
+    """The optimized pose graph of a set of relations."""
 
     stamps: FloatArray
     """Stamps of all relations, ascending, shape (M,), seconds."""
     T_component_base: FloatArray
-    """Optimised poses, shape (M, 3); each component has its own coordinate frame."""
+    """Optimized poses, shape (M, 3); each component has its own coordinate frame."""
     components: NDArray[np.int64]
     """Connected component of each stamp by inlier relations, shape (M,)."""
     relations: Relations
@@ -58,7 +58,7 @@ class RelationGraph:
     ends: NDArray[np.int64]
     """Numbers of the stamps that each relation connects, shape (R, 2)."""
     holds: NDArray[np.bool_]
-    """Inliers of the robust optimisation, shape (R,)."""
+    """Inliers of the robust optimization, shape (R,)."""
     residual_m: FloatArray
     """Translation residual of each relation, shape (R,); NaN across components."""
     residual_deg: FloatArray
@@ -81,7 +81,7 @@ class RelationGraph:
 
 
 def build_relation_graph(relations: Relations) -> RelationGraph:
-    """Optimise ``relations``, any of which may be false, by graduated non-convexity."""
+    """Optimize ``relations``, any of which may be false, by graduated non-convexity."""
     useful = relations.where(relations.stamps[:, 0] != relations.stamps[:, 1])
     stamps, numbers = np.unique(useful.stamps, return_inverse=True)
     ends = numbers.reshape(-1, 2)
@@ -159,7 +159,7 @@ class PoseReference:
 
 
 class RelationReference:
-    """Single reference relations, in both directions, neither chained nor optimised."""
+    """Single reference relations, in both directions, neither chained nor optimized."""
 
     def __init__(self, run: PoseTable, bridge_s: float, ends: Rows, T_1_2: FloatArray) -> None:
         """``ends``, shape (R, 2), are the rows that the relative poses ``T_1_2``, shape (R, 3), connect."""
@@ -206,7 +206,7 @@ class ClosureScore:
     """Scores of one set of closures against the reference."""
 
     graph: Precision
-    """Precision against the optimised graph of the relations."""
+    """Precision against the optimized graph of the relations."""
     single: Precision
     """Precision against single relations, those with the nearest stamps."""
     recall: Recall | None

@@ -122,7 +122,7 @@ def live(records: Any, robot: RobotFrontend) -> Iterator[tuple[float, float]]:
 
 
 def way_back(log: Path) -> Any:
-    """T_last_first of the log's optimised trajectory, shape (3,)."""
+    """T_last_first of the log's optimized trajectory, shape (3,)."""
     source = open_source(log)
     config = MissionConfig()
     robot, cloud = RobotFrontend("robot", config.robot), Cloud(config.fleet, config.seed)

@@ -103,7 +103,7 @@ def test_a_mission_goes_on_with_another_floor(mapped, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_robot_is_localised_in_the_map_of_its_floor(mapped):
+def test_a_robot_is_localized_in_the_map_of_its_floor(mapped):
     whole, recordings = mapped
     found = fcslam.localize(recordings["c"], whole, floor="2").trajectories.values()
     assert [robot.floor for robot in found if len(robot.stamps)] == ["2"]

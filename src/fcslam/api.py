@@ -1,4 +1,4 @@
-"""Map recordings, or localise in a map, with one function call; the commands call the same functions."""
+"""Map recordings, or localize in a map, with one function call; the commands call the same functions."""
 
 import logging
 import os
@@ -129,7 +129,7 @@ def localize(
     floor: str = "",
     update: bool = False,
 ) -> Run:
-    """Localise the robot of a recording in a finished map, which does not change meanwhile.
+    """Localize the robot of a recording in a finished map, which does not change meanwhile.
 
     The robot's starting pose need not be known. A robot that does not know where it is has no pose, never a guess.
 

@@ -120,7 +120,7 @@ def test_a_name_that_cannot_be_used_is_one_line(log, cloud, tmp_path, capsys, na
         (["localize", "ros2:/robot1", "--map", "no", "--server", "http://127.0.0.1:9"], "no holds no earlier copy"),
         (["localize", "ros2:/robot1", "--map", "no", "--server", "cloud"], "'cloud' is not the address of a cloud"),
         (["localize", "ros2:/robot1", "--map", "no", "--initial-pose", "1,2"], "--initial-pose '1,2' is not a pose"),
-        (["localize", "ros2:/robot1", "--map", "no", "--update"], "record the drive, and localise the recording"),
+        (["localize", "ros2:/robot1", "--map", "no", "--update"], "record the drive, and localize the recording"),
     ],
 )
 def test_what_a_robot_cannot_use_is_one_line(capsys, arguments, reason):
@@ -162,7 +162,7 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
         for times_lost, quality in [(0, 0.0), (1, 0.0), (1, 0.5), (1, 0.0), (2, 0.0)]:
             watch(RobotStatus(9, 9, WaitingPackets(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
     said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]
-    assert said == ["connected", "lost", "relocalised in map 0, quality 0.50", "not relocalised", "lost"]
+    assert said == ["connected", "lost", "relocalized in map 0, quality 0.50", "not relocalized", "lost"]
 
 
 def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():

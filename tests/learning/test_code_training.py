@@ -117,7 +117,7 @@ def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light
     first = train_codes(light, OWN, inputs, SMALL, LocalTrainingPlan(0, RAMP_STEPS, compatible=1.0), CPU)
     second = train_codes(
         first.network.state_dict(), OWN, inputs, SMALL, LocalTrainingPlan(RAMP_STEPS, 1, compatible=1.0), CPU,
-        legacy=light, optimiser_state=first.optimiser_state,
+        legacy=light, optimizer_state=first.optimizer_state,
     )  # fmt: skip
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())

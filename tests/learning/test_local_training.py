@@ -65,21 +65,21 @@ def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, s
     first = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS), CPU)
     halfway = first.network.state_dict()
     second = local_training(
-        halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU, optimiser_state=first.optimiser_state
+        halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU, optimizer_state=first.optimizer_state
     )
     forgetful = local_training(halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU)
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
-    assert all(torch.equal(tensor, whole.optimiser_state[name]) for name, tensor in second.optimiser_state.items())
+    assert all(torch.equal(tensor, whole.optimizer_state[name]) for name, tensor in second.optimizer_state.items())
     assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.network.state_dict().items())
 
 
 def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, monkeypatch):
-    def overflow(network, optimiser, *_, **__):
+    def overflow(network, optimizer, *_, **__):
         for value in network.parameters():
             value.grad = torch.full_like(value, torch.inf)
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
+        optimizer.step()
         return {}
 
     monkeypatch.setattr("fcslam.learning.local_training.training_step", overflow)

@@ -55,7 +55,7 @@ def test_the_poses_are_those_of_a_recording(fleet, building, scans, tmp_path):
     assert [pose.is_localized for pose in poses] == known.tolist()
     assert np.allclose([pose.T_map_base for pose in poses], recorded.T_map_base, atol=1e-3, equal_nan=True)
     assert errors(saved.localized["anna"], fleet.robots[2])[0].max() < 0.1
-    assert [event.kind for event in said] == [fcslam.EventKind.LOCALISED]
+    assert [event.kind for event in said] == [fcslam.EventKind.LOCALIZED]
     assert fcslam.open_run(tmp_path / "run").trajectories["anna"].stamps.tolist() == recorded.stamps[known].tolist()
     assert np.array_equal(read_map(tmp_path / "run").cells, building.cells), "the map does not change"
 
@@ -63,7 +63,7 @@ def test_the_poses_are_those_of_a_recording(fleet, building, scans, tmp_path):
 def test_an_unknown_pose_is_no_number(building, scans):
     with robot_in(building, scans) as robot:
         (pose,) = drive(robot, scans[:1])
-        assert robot.status().localization == "not localised"
+        assert robot.status().localization == "not localized"
     assert not pose.is_localized
     assert np.isnan(pose.T_map_base).all()
     assert np.isnan(pose.covariance).all()
@@ -96,7 +96,7 @@ def test_a_given_pose_counts_once_the_walls_confirm_it(fleet, building, scans):
         assert np.hypot(*(pose.T_map_base - start[11])[:2]) < 0.1
 
 
-def test_a_wrong_given_pose_does_not_move_a_localised_robot(fleet, building, scans):
+def test_a_wrong_given_pose_does_not_move_a_localized_robot(fleet, building, scans):
     start = small_fleet.truth_at(fleet.robots[2], [scan.stamp for scan in scans])
     with robot_in(building, scans, initial_pose=start[0]) as robot:
         drive(robot, scans[:10])

@@ -268,7 +268,7 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     robot._map_poses.correct_by_server(0, replace(CORRECTION, map_index=1))
     robot._map_poses.correct_by_server(1, replace(CORRECTION, quality=0.5))
     now = robot.status()
-    assert (now.localization, now.quality, now.map_index, now.times_lost) == (LocalizationState.RELOCALISED, 0.5, 0, 1)
+    assert (now.localization, now.quality, now.map_index, now.times_lost) == (LocalizationState.RELOCALIZED, 0.5, 0, 1)
     path = robot.trajectory()
     stamps, poses = path.stamps, path.T_map_base
     assert np.array_equal(stamps, [scan.stamp for scan in scans if scan.stamp >= stamps[0]])

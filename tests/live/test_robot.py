@@ -161,7 +161,7 @@ def test_a_lost_robot_says_so_and_finds_its_place_again():
     with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread()), on_event=events.append) as robot:
         poses = drive(robot, scans)
     lost, found = (event for event in events if event.kind is not fcslam.EventKind.CORRECTED)
-    assert (lost.kind, found.kind) == (fcslam.EventKind.LOST, fcslam.EventKind.RELOCALISED)
+    assert (lost.kind, found.kind) == (fcslam.EventKind.LOST, fcslam.EventKind.RELOCALIZED)
     assert moment < lost.stamp < found.stamp
     assert all(pose.is_localized == (not lost.stamp <= pose.stamp < found.stamp) for pose in poses if settled(pose))
 

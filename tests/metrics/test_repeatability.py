@@ -45,7 +45,7 @@ def test_it_is_that_of_the_loops(most):
     assert (result.found, result.points) == (found, count)
     assert result.distance_px == pytest.approx(distance)
     assert result.repeatability == pytest.approx(found / count)
-    assert result.localisation_error_px == pytest.approx(distance / found)
+    assert result.localization_error_px == pytest.approx(distance / found)
 
 
 def test_the_same_points_repeat_exactly():
@@ -53,7 +53,7 @@ def test_the_same_points_repeat_exactly():
     seen = first[in_common_view(first, H, SIZE)]
     result = repeatability(first, warp(H, seen), H, SIZE, 300)
     assert result.repeatability == 1.0
-    assert result.localisation_error_px == pytest.approx(0.0, abs=1e-9)
+    assert result.localization_error_px == pytest.approx(0.0, abs=1e-9)
     assert result.points == 2 * len(seen) < 200
 
 
@@ -71,7 +71,7 @@ def test_without_points_there_is_no_share():
     assert np.isnan(repeatability(none, none, H, SIZE, 300).repeatability)
     lonely = repeatability(np.array([[100.0, 100.0]]), none, H, SIZE, 300)
     assert lonely.repeatability == 0.0
-    assert np.isnan(lonely.localisation_error_px)
+    assert np.isnan(lonely.localization_error_px)
 
 
 def test_the_interval_is_that_of_the_mean_of_normal_samples():

@@ -249,7 +249,7 @@ def test_a_floor_begins_a_session_on_it(network, robot, scans):
     said = []
     start(network, robot, said.append)
     network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data="2"))
-    assert said == ["a floor is ignored: the robot localises in one finished map"]
+    assert said == ["a floor is ignored: the robot localizes in one finished map"]
     said.clear()
     network = MemoryNetwork([offered(*topic) for topic in TOPICS])
     node = start(network, robot, said.append, None, robot.change_floor)
@@ -277,7 +277,7 @@ def own_map(scans):
         return robot.map()
 
 
-def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(network, scans, own_map):
+def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localized(network, scans, own_map):
     said = []
     with fcslam.LocalizedRobot("robot1", own_map, wiring=Wiring(SameThread())) as robot:
         node = start(network, robot, said.append, suggest_pose=robot.suggest_pose)
@@ -289,7 +289,7 @@ def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(netwo
         assert not network.sent["/tf"]
         assert not network.sent["/robot1/pose"]
         node._diagnose()
-        assert "not localised for" in network.sent["/diagnostics"][-1].status[0].message
+        assert "not localized for" in network.sent["/diagnostics"][-1].status[0].message
         x, y, theta = se2.between(scans[0].T_odom_base, scans[9].T_odom_base)  # the map begins at the first scan
         network.say(f"/robot1/{INITIAL_POSE}", POSE, given_pose(x, y, theta))
         assert said[-1].endswith("it counts once the walls confirm it")
@@ -298,7 +298,7 @@ def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(netwo
         run_until(node, 10)
         assert len(network.sent["/robot1/pose"]) >= 10
         node._diagnose()
-        assert network.sent["/diagnostics"][-1].status[0].message.startswith("localised for")
+        assert network.sent["/diagnostics"][-1].status[0].message.startswith("localized for")
         node.publish_map()
         assert len(network.sent["/robot1/map"]) <= 2, "once for each start"
 

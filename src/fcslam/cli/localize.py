@@ -87,7 +87,7 @@ def localize(
     initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
     cloud, live = access(server, credentials), is_live(source)
     if live and update:
-        raise InputError("--update draws what a recording saw; record the drive, and localise the recording")
+        raise InputError("--update draws what a recording saw; record the drive, and localize the recording")
     if cloud is not None:
         keep_private()
         _fetch(map_path, cloud, console)
@@ -129,8 +129,8 @@ def _fetch(folder: Path, server: "Server", console: "Console") -> None:
 
 def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationProgress], None]":
     def watch(now: "LocalizationProgress") -> None:
-        state = f"localised, quality {now.quality:.2f}" if now.is_localized else "not localised"
-        display.show("localising", now.scans, total, state)
+        state = f"localized, quality {now.quality:.2f}" if now.is_localized else "not localized"
+        display.show("localizing", now.scans, total, state)
 
     return watch
 
@@ -141,13 +141,13 @@ def _report(run: "Run", robot: str, output: Path) -> None:
     if not values["fixes"]:
         print_line(
             console,
-            f"{robot}: not localised in {scans} scans; is this the right map, and did the robot drive far enough?",
+            f"{robot}: not localized in {scans} scans; is this the right map, and did the robot drive far enough?",
         )
     else:
         times = "" if values["losses"] == 0 else f", lost {values['losses']:.0f} x"
         print_line(
             console,
-            f"{robot}: localised after {values['first_fix_after']:.1f} m, at {share:.0%} of {scans} scans{times}",
+            f"{robot}: localized after {values['first_fix_after']:.1f} m, at {share:.0%} of {scans} scans{times}",
         )
     print_line(console, f"poses: {output / 'localization' / f'{robot}.csv'}")
     print_line(console, f"map: {output / 'map.png'}")

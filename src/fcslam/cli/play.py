@@ -207,7 +207,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
-    """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localisation."""
+    """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localization."""
     trouble: str | None = "connecting"
     notices_before: tuple[str, ...] = ()
     localization, times_lost = "mapping", 0
@@ -217,7 +217,7 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
         nonlocal trouble, notices_before, localization, times_lost, waits, sends
         lines = [now.trouble or "connected"] * (now.trouble != trouble)
         if (now.localization, now.times_lost) != (localization, times_lost):
-            lines.append(_localisation(now, times_lost))
+            lines.append(_localization(now, times_lost))
         localization, times_lost = now.localization, now.times_lost
         for line in [*lines, *(notice for notice in now.notices if notice not in notices_before)]:
             print_line(console, line)
@@ -239,13 +239,13 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
     return watch
 
 
-def _localisation(now: "RobotStatus", times_lost_before: int) -> str:
+def _localization(now: "RobotStatus", times_lost_before: int) -> str:
     """Return a line on the place of a robot that was lost; ``times_lost_before``: its count at the last such line."""
     if now.quality > 0.0:
-        return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
+        return f"relocalized in map {now.map_index}, quality {now.quality:.2f}"
     if now.times_lost > times_lost_before:
         return "lost: the scans contradict the map; a new session begins here"
-    return "not relocalised: no other closure supports the estimated place"
+    return "not relocalized: no other closure supports the estimated place"
 
 
 def _details(now: "RobotStatus", is_complete: bool) -> str:
@@ -279,7 +279,7 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
         print_line(console, f"{now.refused} packets were refused: {state / 'refused'}")
     if now.times_lost:
         lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
-        print_line(console, f"{lost}; {_localisation(now, now.times_lost)}")
+        print_line(console, f"{lost}; {_localization(now, now.times_lost)}")
     if now.map_index is not None:
         trajectory = robot.trajectory()
         write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)

@@ -332,7 +332,7 @@ class Fleet:
         self._add_place(place)  # place recognition and map fusion
 
     def _add_sighting(self, sighting: TagSighting) -> None:
-        """Match a sighting with those of the same tag, decide about the closures, join maps, optimise."""
+        """Match a sighting with those of the same tag, decide about the closures, join maps, optimize."""
         session = sighting.id.robot
         matches = self._tags.add(sighting)
         for match in matches:
@@ -351,7 +351,7 @@ class Fleet:
         check_submap(place, self._graph.chain(robot, place.first, place.last))
 
     def _add_place(self, place: Place) -> None:
-        """Match a place (Algorithm 1), decide about its closures, join maps, optimise."""
+        """Match a place (Algorithm 1), decide about its closures, join maps, optimize."""
         session, decisions = place.id.robot, self._decisions
         matches: list[PlaceMatch] = []
         if self._config.join_maps and self._sessions.hold(place):

@@ -76,7 +76,7 @@ class FleetResult:
     """Between robots and within them."""
     corrections: tuple[Correction, ...]
     graph: PoseGraph
-    """All keyscans at their optimised poses, with the accepted constraints."""
+    """All keyscans at their optimized poses, with the accepted constraints."""
     regions: tuple[PlacedRegion, ...] = ()
     """Regions that users drew in the maps."""
     sightings: tuple[TagSighting, ...] = ()

@@ -3,7 +3,7 @@
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
 translation between the two, eqs. (5) and (6). The paper does not say which two. Here two points are valid if they lie
 ``DIRECTION_M`` or more apart and equally far in both maps, as maps are rigid. ``two_point`` takes the two most similar
-such matches, ``first_two`` the first two to arrive. No other closure is asked and nothing is optimised: two false
+such matches, ``first_two`` the first two to arrive. No other closure is asked and nothing is optimized: two false
 matches that fit each other turn a whole map, and the drift within the robots' maps stays. ``n_point`` is the same with
 all matched points, in the least squares sense. All are here to be compared with the joint graph.
 

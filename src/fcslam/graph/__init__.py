@@ -1,1 +1,1 @@
-"""The pose graph: variables and measured motions, robust optimisation, consistency of closures, g2o files."""
+"""The pose graph: variables and measured motions, robust optimization, consistency of closures, g2o files."""

@@ -30,7 +30,7 @@ class PosePrior:
 
 
 def optimize_anchored(graph: PoseGraph, initial: FloatArray, priors: Sequence[PosePrior]) -> FloatArray:
-    """Optimise a pose graph with priors.
+    """Optimize a pose graph with priors.
 
     Args:
         graph: N variables; all of its edges count.

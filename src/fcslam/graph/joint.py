@@ -145,7 +145,7 @@ def solve_jointly(
     Returns:
         Poses (N, 3), weights (E,), and the maps.
     """
-    # 1. Optimise each robot's own graph.
+    # 1. Optimize each robot's own graph.
     factors = FactorCache(evidence.graph, find_chains(evidence.graph))
     initial = evidence.graph.poses()
     own = [_solve_own_graph(evidence, robot, initial[robot], consistency, factors) for robot in evidence.robots]

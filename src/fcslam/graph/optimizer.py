@@ -49,7 +49,7 @@ class SolveStats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Optimised poses and the weight of each edge."""
+    """Optimized poses and the weight of each edge."""
 
     poses: FloatArray
     """Shape (N, 3), metres and radians."""
@@ -66,7 +66,7 @@ def optimize(
     kept: ArrayLike | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """Optimise a pose graph by Levenberg-Marquardt.
+    """Optimize a pose graph by Levenberg-Marquardt.
 
     Args:
         graph: N variables and E edges.
@@ -101,7 +101,7 @@ def optimize_gnc(
     *,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """Optimise under the truncated squared loss on closures: each ends at weight 1 (inlier) or 0 (outlier).
+    """Optimize under the truncated squared loss on closures: each ends at weight 1 (inlier) or 0 (outlier).
 
     Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry always counts.
 
@@ -142,7 +142,7 @@ def refine_inliers(
     """Alternate solving and deciding every closure by its residual, until no decision changes.
 
     The last part of ``optimize_gnc``, from closures that are trusted already: for graphs most of whose closures are
-    false, where optimising with all of them gives no useful start.
+    false, where optimizing with all of them gives no useful start.
 
     Args:
         graph: N variables and E edges.

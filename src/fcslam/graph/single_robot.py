@@ -20,7 +20,7 @@ def solve_single_robot(
     consistency: ConsistencySettings,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """Optimise the graph of one robot robustly; its variables are in the order of its path.
+    """Optimize the graph of one robot robustly; its variables are in the order of its path.
 
     Returns the cheapest of three solutions; the value of the truncated loss, which has many minima, ranks them:
 

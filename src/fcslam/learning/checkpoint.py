@@ -28,7 +28,7 @@ class Checkpoint:
     settings: dict[str, Any]
     """Settings of the run; a run with other settings does not continue from this checkpoint."""
     tensors: dict[str, Tensor]
-    """All tensors of network, averaged network and optimiser, by name."""
+    """All tensors of network, averaged network and optimizer, by name."""
     examples: int = 0
     """Checksum of what is trained on; a run on something else does not continue from this checkpoint."""
 

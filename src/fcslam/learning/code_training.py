@@ -73,7 +73,7 @@ def train_codes(
     device: torch.device,
     on_step: Callable[[int], None] = lambda _steps: None,
     legacy: Mapping[str, Tensor] | None = None,
-    optimiser_state: Mapping[str, Tensor] | None = None,
+    optimizer_state: Mapping[str, Tensor] | None = None,
 ) -> LocalTrainingResult:
     """Train for some steps, with the batch statistics as they are. The result depends on the arguments alone.
 
@@ -87,10 +87,10 @@ def train_codes(
         on_step: called with the number of steps done.
         legacy: state of the network that the whole training started from; None for ``start``. Keypoints stay where it
             finds them, and codes compatible with it.
-        optimiser_state: result of an earlier local training, to continue it.
+        optimizer_state: result of an earlier local training, to continue it.
 
     Raises:
-        TrainingError: nothing was seen again; ``start``, ``legacy`` or ``optimiser_state`` does not fit the network, or
+        TrainingError: nothing was seen again; ``start``, ``legacy`` or ``optimizer_state`` does not fit the network, or
             training diverged.
     """
     if not revisits:
@@ -111,7 +111,7 @@ def train_codes(
             total = total + plan.compatible * losses["compatible"]
         return total, losses
 
-    return train_layers(network, network.code_layers, losses_of, settings, plan, on_step, optimiser_state)
+    return train_layers(network, network.code_layers, losses_of, settings, plan, on_step, optimizer_state)
 
 
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:

@@ -14,16 +14,16 @@ from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import Encoder, TrainingSettings
 from fcslam.learning.training_step import (
     LegacyDetector,
-    create_optimiser,
+    create_optimizer,
     descend,
-    get_optimiser_state,
+    get_optimizer_state,
     learning_rate,
-    restore_optimiser_state,
+    restore_optimizer_state,
     training_step,
 )
 
 RAMP_STEPS: Final = 10
-"""Steps over which the learning rate rises of a new optimiser: without moments, Adam only follows gradients' signs."""
+"""Steps over which the learning rate rises of a new optimizer: without moments, Adam only follows gradients' signs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class LocalTrainingResult(NamedTuple):
     network: KeypointNetwork
     losses: dict[str, float]
     """Means over the steps."""
-    optimiser_state: dict[str, Tensor]
+    optimizer_state: dict[str, Tensor]
     """With which a later local training continues."""
 
 
@@ -57,7 +57,7 @@ def local_training(
     device: torch.device,
     on_step: Callable[[int], None] = lambda _steps: None,
     legacy: Mapping[str, Tensor] | None = None,
-    optimiser_state: Mapping[str, Tensor] | None = None,
+    optimizer_state: Mapping[str, Tensor] | None = None,
 ) -> LocalTrainingResult:
     """Train for some steps. The result depends on the arguments alone.
 
@@ -69,10 +69,10 @@ def local_training(
         device: to train on.
         on_step: called with the number of steps done.
         legacy: state of the network whose codes are still in use.
-        optimiser_state: result of an earlier local training, to continue it.
+        optimizer_state: result of an earlier local training, to continue it.
 
     Raises:
-        TrainingError: ``start``, ``legacy`` or ``optimiser_state`` does not fit the network, or training diverged.
+        TrainingError: ``start``, ``legacy`` or ``optimizer_state`` does not fit the network, or training diverged.
     """
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
@@ -81,17 +81,17 @@ def local_training(
     legacy_detector = None
     if legacy is not None and plan.compatible > 0.0:
         legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, legacy).to(device))
-    optimiser = continued_optimiser(network, optimiser_state)
+    optimizer = continued_optimizer(network, optimizer_state)
     sums: dict[str, float] = {}
     until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
     for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
         done = step - plan.first_step + 1
-        rate = local_rate(settings, step, done, optimiser_state is None)
-        losses = training_step(network, optimiser, batch.to(device), settings, step, rate, legacy=legacy_detector)
+        rate = local_rate(settings, step, done, optimizer_state is None)
+        losses = training_step(network, optimizer, batch.to(device), settings, step, rate, legacy=legacy_detector)
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss)
         on_step(done)
-    return local_result(network, optimiser, sums, plan)
+    return local_result(network, optimizer, sums, plan)
 
 
 def train_layers(
@@ -101,7 +101,7 @@ def train_layers(
     settings: TrainingSettings,
     plan: LocalTrainingPlan,
     on_step: Callable[[int], None] = lambda _steps: None,
-    optimiser_state: Mapping[str, Tensor] | None = None,
+    optimizer_state: Mapping[str, Tensor] | None = None,
 ) -> LocalTrainingResult:
     """Train some layers of a network in place by losses of the caller's, with the batch statistics as they are.
 
@@ -112,50 +112,50 @@ def train_layers(
         settings: of the whole run; the learning rate falls towards the end of its steps.
         plan: which steps are done, and how.
         on_step: called with the number of steps done.
-        optimiser_state: result of an earlier local training, to continue it.
+        optimizer_state: result of an earlier local training, to continue it.
 
     Raises:
-        TrainingError: ``optimiser_state`` belongs to another network, or training diverged.
+        TrainingError: ``optimizer_state`` belongs to another network, or training diverged.
     """
     freeze_all_but(network, layer_names(network, layers))
-    optimiser = continued_optimiser(network, optimiser_state)
+    optimizer = continued_optimizer(network, optimizer_state)
     sums: dict[str, float] = {}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
-        for group in optimiser.param_groups:
-            group["lr"] = local_rate(settings, step, done, optimiser_state is None)
+        for group in optimizer.param_groups:
+            group["lr"] = local_rate(settings, step, done, optimizer_state is None)
         total, losses = losses_of(step)
-        descend(network, optimiser, total, step)
+        descend(network, optimizer, total, step)
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss.detach())
         on_step(done)
-    return local_result(network, optimiser, sums, plan)
+    return local_result(network, optimizer, sums, plan)
 
 
-def continued_optimiser(
-    network: KeypointNetwork, optimiser_state: Mapping[str, Tensor] | None
+def continued_optimizer(
+    network: KeypointNetwork, optimizer_state: Mapping[str, Tensor] | None
 ) -> torch.optim.Optimizer:
-    """A new optimiser, or one that continues from the result of an earlier local training.
+    """A new optimizer, or one that continues from the result of an earlier local training.
 
     Raises:
         TrainingError: the state belongs to another network.
     """
-    optimiser = create_optimiser(network)
-    if optimiser_state is not None:
+    optimizer = create_optimizer(network)
+    if optimizer_state is not None:
         try:
-            restore_optimiser_state(optimiser, optimiser_state)
+            restore_optimizer_state(optimizer, optimizer_state)
         except (KeyError, ValueError) as error:
-            raise TrainingError(f"the optimiser cannot continue ({error})") from error
-    return optimiser
+            raise TrainingError(f"the optimizer cannot continue ({error})") from error
+    return optimizer
 
 
 def local_rate(settings: TrainingSettings, step: int, done: int, is_new: bool) -> float:
-    """Learning rate of a step of the whole run, the ``done``-th here, of an optimiser that may be new."""
+    """Learning rate of a step of the whole run, the ``done``-th here, of an optimizer that may be new."""
     return learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if is_new else 1.0)
 
 
 def local_result(
-    network: KeypointNetwork, optimiser: torch.optim.Optimizer, sums: Mapping[str, float], plan: LocalTrainingPlan
+    network: KeypointNetwork, optimizer: torch.optim.Optimizer, sums: Mapping[str, float], plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
     """The result after the last step, from sums of the losses over the steps.
 
@@ -163,7 +163,7 @@ def local_result(
         TrainingError: training diverged.
     """
     network.eval()
-    state = get_optimiser_state(optimiser)
+    state = get_optimizer_state(optimizer)
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
         # Checked here, because whatever continues from this state would diverge.
         raise TrainingError("training diverged in the last step; lower the learning rate")

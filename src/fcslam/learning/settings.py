@@ -49,7 +49,7 @@ class LossSettings(Settings):
     agreement: float = Field(
         default=1.0, ge=0.0, description="weight of the loss that makes the keypoint maps of both views agree"
     )
-    localisation: float = Field(
+    localization: float = Field(
         default=0.0,
         ge=0.0,
         description="weight of the loss of the distance between keypoints that both views show",
@@ -65,9 +65,9 @@ class TrainingSettings(Settings):
     """Settings of a training run."""
 
     encoder: Encoder = Field(default="light", description="encoder of the network: light, or vgg as in the paper")
-    steps: int = Field(default=20_000, ge=1, description="optimiser steps of the joint training on images")
+    steps: int = Field(default=20_000, ge=1, description="optimizer steps of the joint training on images")
     shape_steps: int = Field(
-        default=5_000, ge=1, description="optimiser steps on synthetic shapes before; not used with a teacher"
+        default=5_000, ge=1, description="optimizer steps on synthetic shapes before; not used with a teacher"
     )
     label_copies: int = Field(
         default=16, ge=0, description="warped copies of an image over which its keypoint labels are averaged"

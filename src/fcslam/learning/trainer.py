@@ -22,10 +22,10 @@ from fcslam.learning.objective import TeacherBits
 from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import (
-    create_optimiser,
-    get_optimiser_state,
+    create_optimizer,
+    get_optimizer_state,
     learning_rate,
-    restore_optimiser_state,
+    restore_optimizer_state,
     training_step,
 )
 from fcslam.learning.validation import collapse_warnings, validate
@@ -40,7 +40,7 @@ VALIDATION_POINTS: Final = 16
 VALIDATION_SEED: Final = 2026
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 PROGRESS_FILE: Final = "progress.csv"
-NETWORK, AVERAGE, OPTIMISER = "network/", "average/", "optimiser/"
+NETWORK, AVERAGE, OPTIMIZER = "network/", "average/", "optimizer/"
 """Prefixes of the names of tensors in a checkpoint."""
 
 
@@ -99,7 +99,7 @@ class TrainingRun:
         self.average = KeypointNetwork(settings.encoder).to(self.device)
         self.average.load_state_dict(self.network.state_dict())
         self.average.eval()
-        self.optimiser = create_optimiser(self.network)
+        self.optimizer = create_optimizer(self.network)
         self.step = 0
         self._examples = examples
         self._saved = time.monotonic()
@@ -152,7 +152,7 @@ class TrainingRun:
     def _step(self, step: int, batch: TrainingBatch, bits: TeacherBits | None) -> dict[str, Tensor]:
         self.network.train()
         rate = learning_rate(self.settings, step)
-        parts = training_step(self.network, self.optimiser, batch, self.settings, step, rate, bits)
+        parts = training_step(self.network, self.optimizer, batch, self.settings, step, rate, bits)
         self._average(step)
         return parts
 
@@ -189,13 +189,13 @@ class TrainingRun:
     def _load(self, checkpoint: Checkpoint) -> None:
         self.network.load_state_dict(checkpoint.part(NETWORK))
         self.average.load_state_dict(checkpoint.part(AVERAGE))
-        restore_optimiser_state(self.optimiser, checkpoint.part(OPTIMISER))
+        restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
         self.step = checkpoint.step
 
     def _save(self) -> None:
         tensors = {f"{NETWORK}{name}": value for name, value in self.network.state_dict().items()}
         tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
-        tensors |= {f"{OPTIMISER}{name}": value for name, value in get_optimiser_state(self.optimiser).items()}
+        tensors |= {f"{OPTIMIZER}{name}": value for name, value in get_optimizer_state(self.optimizer).items()}
         settings = self.settings.model_dump(mode="json")
         checkpoint = Checkpoint(self.stage, self.step, settings, tensors, self._examples)
         write_checkpoint(self.folder / CHECKPOINT_FILE, checkpoint)

@@ -51,19 +51,19 @@ def reduced_precision(device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, torch.bfloat16, enabled=native)
 
 
-def create_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
-    """An optimiser without moments; ``training_step`` sets its learning rate."""
+def create_optimizer(network: KeypointNetwork) -> torch.optim.Optimizer:
+    """An optimizer without moments; ``training_step`` sets its learning rate."""
     return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
 
 
-def get_optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The optimiser's step counts and moments as tensors, by parameter number and name."""
-    states = optimiser.state_dict()["state"]
+def get_optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """The optimizer's step counts and moments as tensors, by parameter number and name."""
+    states = optimizer.state_dict()["state"]
     return {f"{index}/{name}": value for index, entries in states.items() for name, value in entries.items()}
 
 
-def restore_optimiser_state(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Let a new optimiser continue from the tensors of ``get_optimiser_state``.
+def restore_optimizer_state(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Let a new optimizer continue from the tensors of ``get_optimizer_state``.
 
     Raises:
         ValueError: the tensors belong to another network.
@@ -72,18 +72,18 @@ def restore_optimiser_state(optimiser: torch.optim.Optimizer, tensors: Mapping[s
     for name, tensor in tensors.items():
         index, key = name.split("/")
         state.setdefault(int(index), {})[key] = tensor
-    shapes = [tuple(value.shape) for group in optimiser.param_groups for value in group["params"]]
+    shapes = [tuple(value.shape) for group in optimizer.param_groups for value in group["params"]]
     for number, entries in state.items():
         found = {key: tuple(value.shape) for key, value in entries.items()}
         shape = shapes[number] if 0 <= number < len(shapes) else None
         if found != {"step": (), "exp_avg": shape, "exp_avg_sq": shape}:
-            raise ValueError("the optimiser's state belongs to other parameters")
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+            raise ValueError("the optimizer's state belongs to other parameters")
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
 def training_step(
     network: KeypointNetwork,
-    optimiser: torch.optim.Optimizer,
+    optimizer: torch.optim.Optimizer,
     batch: TrainingBatch,
     settings: TrainingSettings,
     step: int,
@@ -91,11 +91,11 @@ def training_step(
     bits: TeacherBits | None = None,
     legacy: LegacyDetector | None = None,
 ) -> dict[str, Tensor]:
-    """Do one step in place; batch, network and optimiser are on one device.
+    """Do one step in place; batch, network and optimizer are on one device.
 
     Args:
         network: in training mode.
-        optimiser: of the network's parameters.
+        optimizer: of the network's parameters.
         batch: of this step.
         settings: of the whole run.
         step: number of the step in the whole run, from 0.
@@ -109,7 +109,7 @@ def training_step(
     Raises:
         TrainingError: the losses are not finite; the step changed nothing.
     """
-    for group in optimiser.param_groups:
+    for group in optimizer.param_groups:
         group["lr"] = rate
     with reduced_precision(batch.images.device):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
@@ -118,22 +118,22 @@ def training_step(
     if legacy is not None:
         losses["former"] = legacy.loss(maps, batch)
         total = total + legacy.strength * losses["former"]
-    descend(network, optimiser, total, step)
+    descend(network, optimizer, total, step)
     return {name: loss.detach() for name, loss in losses.items()}
 
 
-def descend(network: KeypointNetwork, optimiser: torch.optim.Optimizer, total: Tensor, step: int) -> None:
-    """Follow the gradient of a step's sum of losses in place, with the rate that the optimiser has.
+def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int) -> None:
+    """Follow the gradient of a step's sum of losses in place, with the rate that the optimizer has.
 
     Raises:
         TrainingError: the sum is not finite; the step changed nothing.
     """
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
-    optimiser.zero_grad(set_to_none=True)
+    optimizer.zero_grad(set_to_none=True)
     total.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
-    optimiser.step()
+    optimizer.step()
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:

@@ -53,7 +53,7 @@ class LidarBackend:
         self._graph = PoseGraph()
         self._factors = FactorCache(self._graph)
         self._poses = np.empty((0, 3))
-        """``T_map_base`` of each anchor, optimised."""
+        """``T_map_base`` of each anchor, optimized."""
         self._window: list[MappedKeyscan] = []
         """The newest keyscans, as far back as the next submaps need them."""
         self._T_local_base: list[FloatArray] = []

@@ -37,9 +37,9 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
     """
     side = occupancy.resolution_m
     if side > COARSEST_M:
-        raise SourceError(f"{name}: cells of {side:g} m are too coarse; localisation needs {COARSEST_M:g} m or finer")
+        raise SourceError(f"{name}: cells of {side:g} m are too coarse; localization needs {COARSEST_M:g} m or finer")
     if side < FINEST_M:
-        raise SourceError(f"{name}: cells of {side:g} m are too fine; localisation needs {FINEST_M:g} m or coarser")
+        raise SourceError(f"{name}: cells of {side:g} m are too fine; localization needs {FINEST_M:g} m or coarser")
     surface = _surface(occupancy)
     if not len(surface):
         raise SourceError(f"{name}: shows no wall beside free space; is it the right map?")

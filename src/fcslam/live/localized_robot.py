@@ -31,7 +31,7 @@ from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Packet
 
 _NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)
-"""The estimate of a robot that is not localised."""
+"""The estimate of a robot that is not localized."""
 
 
 class LocalizedRobot(LiveTracker):
@@ -120,7 +120,7 @@ class LocalizedRobot(LiveTracker):
     def status(self) -> RobotStatus:
         """Return the state of the robot: whether it knows its pose, and counts since its start."""
         estimate, failure = self._estimate(), self._frontend.backend_failure
-        broken = f"not localised any more, as the search failed: {failure}" if failure else None
+        broken = f"not localized any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
             scans=self._scans,
@@ -148,7 +148,7 @@ class LocalizedRobot(LiveTracker):
         return np.empty((0, 2, 2))
 
     def trajectory(self) -> RobotTrajectory:
-        """The poses of the scans at which the robot was localised, as ``add_scan`` returned them."""
+        """The poses of the scans at which the robot was localized, as ``add_scan`` returned them."""
         with self._lock:
             return self._drive.poses(self.name).believed()
 
@@ -205,8 +205,8 @@ class LocalizedRobot(LiveTracker):
         estimate, was_localized = self._estimate(), self._was_localized
         self._was_localized = estimate is not None
         if estimate is not None and not was_localized:
-            self._event(EventKind.LOCALISED, f"localised, quality {estimate.quality:.2f}")
+            self._event(EventKind.LOCALIZED, f"localized, quality {estimate.quality:.2f}")
         elif estimate is None and was_localized:
-            self._event(EventKind.LOST, "not localised any more: the walls are others than in the map")
+            self._event(EventKind.LOST, "not localized any more: the walls are others than in the map")
         if self._frontend.backend_failure:
-            self._tell_failure(f"not localised from now on, as the search failed: {self._frontend.backend_failure}")
+            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.backend_failure}")

@@ -29,13 +29,13 @@ class RobotPose:
     T_map_base: FloatArray
     """Pose (x, y, theta) of ``base`` in the robot's map, shape (3,), metres and radians. It jumps when a correction
     arrives; ``T_map_odom`` holds the jump, so a controller that works in ``odom`` sees none. NaN in a finished map
-    where the robot is not localised."""
+    where the robot is not localized."""
     T_odom_base: FloatArray | None
     """The odometry that was given with the scan, shape (3,); None without odometry."""
     quality: float
     """Share of the scan's points in known area that lie on known surfaces, in [0, 1]; NaN if the scan was not
     compared: it is the first one, or the robot stands still. In a finished map: that of the walls seen lately; 0 where
-    the robot is not localised."""
+    the robot is not localized."""
     is_localized: bool
     """False while the scans contradict the map, and after that until the robot's place in the map is found again; in a
     finished map also until it is found first."""
@@ -88,7 +88,7 @@ class RobotPose:
     @property
     def T_map_odom(self) -> FloatArray | None:
         """Where the frame of the given odometry lies in the map, shape (3,): the transform ``map -> odom`` of ROS
-        REP 105. None without odometry, and in a finished map where the robot is not localised."""
+        REP 105. None without odometry, and in a finished map where the robot is not localized."""
         if self.T_odom_base is None or np.isnan(self.T_map_base[0]):
             return None
         return frozen(se2.compose(self.T_map_base, se2.inverse(self.T_odom_base)))
@@ -101,11 +101,11 @@ class LocalizationState(StrEnum):
     """It was never lost on this floor."""
     LOST = "lost"
     """It maps in a new session, whose transform to the map and to its earlier sessions is not known yet."""
-    RELOCALISED = "relocalised"
+    RELOCALIZED = "relocalized"
     """It was lost, and its new session is joined to the map."""
-    LOCALISED = "localised"
+    LOCALIZED = "localized"
     """It knows its pose in a finished map."""
-    NOT_LOCALISED = "not localised"
+    NOT_LOCALIZED = "not localized"
     """It does not know its pose in a finished map."""
 
 
@@ -147,10 +147,10 @@ class RobotStatus:
     def localization(self) -> LocalizationState:
         """Whether the robot knows its pose."""
         if self.is_localized is not None:
-            return LocalizationState.LOCALISED if self.is_localized else LocalizationState.NOT_LOCALISED
+            return LocalizationState.LOCALIZED if self.is_localized else LocalizationState.NOT_LOCALIZED
         if not self.times_lost:
             return LocalizationState.MAPPING
-        return LocalizationState.RELOCALISED if self.quality > 0.0 else LocalizationState.LOST
+        return LocalizationState.RELOCALIZED if self.quality > 0.0 else LocalizationState.LOST
 
 
 class EventKind(StrEnum):
@@ -161,9 +161,9 @@ class EventKind(StrEnum):
     searched for again."""
     FLOOR = "floor"
     """The robot is on another floor, and maps in a new session."""
-    LOCALISED = "localised"
+    LOCALIZED = "localized"
     """The place of the robot in a finished map is found."""
-    RELOCALISED = "relocalised"
+    RELOCALIZED = "relocalized"
     """The place of a lost robot in the map is found."""
     JOINED = "joined"
     """The robot's map got another index: it joined another map, or maps were renumbered."""

@@ -582,7 +582,7 @@ class Robot(LiveTracker):
 
     def _tell_correction(self, before: Correction | None, now: Correction) -> None:
         if self._part not in self._floors and now.quality > 0.0 and (before is None or before.quality == 0.0):
-            self._event(EventKind.RELOCALISED, f"relocalised in map {now.map_index}, quality {now.quality:.2f}")
+            self._event(EventKind.RELOCALIZED, f"relocalized in map {now.map_index}, quality {now.quality:.2f}")
         elif (before is None and self._uplink is not None) or (before and now.map_index != before.map_index):
             self._event(EventKind.JOINED, f"now in map {now.map_index}")
         T_smooth_base = self._frontend.scan_poses.in_odom(self._newest().pose)

@@ -29,8 +29,8 @@ QUIET = (
     EventKind.ONLINE,
     EventKind.JOINED,
     EventKind.FLEET,
-    EventKind.RELOCALISED,
-    EventKind.LOCALISED,
+    EventKind.RELOCALIZED,
+    EventKind.LOCALIZED,
 )
 """Events that are logged as information; the others are warnings."""
 

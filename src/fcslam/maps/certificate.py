@@ -100,7 +100,7 @@ def certify(
     """The certificate of one map, as ``quality.json`` has it; lengths in metres.
 
     Args:
-        graph: the pose graph of all maps, at its optimised poses.
+        graph: the pose graph of all maps, at its optimized poses.
         paths: the sessions of the map, at least one keyscan in all; the first one begins its frame.
         occupancy: the map.
         bar_m: a cell is good if 95 % of such cells have a smaller error relative to their surroundings.

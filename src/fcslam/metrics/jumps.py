@@ -10,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
 SLACK_M = 0.2
-"""Length allowed to any step, metres: the optimised map corrects by small steps."""
+"""Length allowed to any step, metres: the optimized map corrects by small steps."""
 SLACK_RAD = 0.3
 """Turn allowed to any step, radians."""
 

@@ -34,7 +34,7 @@ class Repeatability:
         return self.found / self.points if self.points else float("nan")
 
     @property
-    def localisation_error_px(self) -> float:
+    def localization_error_px(self) -> float:
         """Mean distance of repeated keypoints; NaN without any."""
         return self.distance_px / self.found if self.found else float("nan")
 

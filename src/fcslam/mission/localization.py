@@ -1,6 +1,6 @@
-"""Localisation of one recorded robot in a finished map: a recording and a map in, believed poses out.
+"""Localization of one recorded robot in a finished map: a recording and a map in, believed poses out.
 
-sources -> robot (LiDAR tracking) -> localisation in the map -> run folder
+sources -> robot (LiDAR tracking) -> localization in the map -> run folder
 """
 
 import csv
@@ -46,12 +46,12 @@ _ROW: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class LocalizationProgress:
-    """Progress of a localisation."""
+    """Progress of a localization."""
 
     scans: int
     is_localized: bool
     quality: float
-    """Quality of the newest pose; 0 where the robot is not localised."""
+    """Quality of the newest pose; 0 where the robot is not localized."""
 
 
 def read_map(path: Path, floor: str = "") -> OccupancyMap:
@@ -145,7 +145,7 @@ def run_localization(
     progress: Callable[[LocalizationProgress], None] = lambda _: None,
     update: bool = False,
 ) -> Run:
-    """Localise a robot in a map, which does not change meanwhile.
+    """Localize a robot in a map, which does not change meanwhile.
 
     Args:
         source: the robot's recording.
@@ -227,7 +227,7 @@ class LocalizedDrive:
             stamp: seconds.
             travel_m: path length so far.
             T_odom_base: its pose in the session's ``odom``, shape (3,), metres and radians.
-            estimate: where that lies in the map; None: the robot is not localised.
+            estimate: where that lies in the map; None: the robot is not localized.
         """
         if estimate is None:
             self._rows.extend((stamp, *6 * (np.nan,), 0.0))
@@ -251,7 +251,7 @@ class LocalizedDrive:
             occupancy: the map.
             config: the settings of the robot.
             fixes: how often it was found.
-            losses: how often it was localised and then was not.
+            losses: how often it was localized and then was not.
         """
         poses = self.poses(robot)
         believed = poses.believed()

@@ -1,6 +1,6 @@
 """The front end of one robot: sensor records in, packets out. It knows no network and no other robot.
 
-It localises every scan at once. Everything else is the work of the back end (``fcslam.robot.backend``), which may run
+It localizes every scan at once. Everything else is the work of the back end (``fcslam.robot.backend``), which may run
 beside it: packets then come out later, but in the same order and with the same contents.
 
 While scans are doubtful (``fcslam.lidar.lost``), records are deferred. If they show the same place as before, they are

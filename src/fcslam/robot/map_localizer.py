@@ -1,10 +1,10 @@
-"""Localisation of one robot in a finished map, which does not change.
+"""Localization of one robot in a finished map, which does not change.
 
 The robot tracks its scans as always (``fcslam.robot.frontend``); this takes the place of the back end. Until the pose
 in the map is known, the walls around the newest keyscans are aligned with the map exhaustively. An alignment counts
 only if it is clearly better than the best one elsewhere, and the less clear it is, the more stretches must agree. So a
 robot in a building that the map does not show stays without a pose. From then on every keyscan is matched with the
-map, and the walls are compared with it now and then. A robot that sees other walls than the map is not localised any
+map, and the walls are compared with it now and then. A robot that sees other walls than the map is not localized any
 more, and the search begins again.
 """
 
@@ -64,7 +64,7 @@ LOST_EXPLAINED = 0.60
 LOST_VIOLATION = 0.20
 """And a larger share of its walls in free space of the map."""
 LARGEST_UNSEEN_M = 20.0
-"""Travel without known walls after which the robot is not localised any more, metres."""
+"""Travel without known walls after which the robot is not localized any more, metres."""
 INITIAL_ERROR_M = 1.5
 """Largest error of a given initial position, metres."""
 INITIAL_ERROR_RAD = 0.5
@@ -97,7 +97,7 @@ class _Vote:
 
 
 class MapLocalizer:
-    """Localises one robot by its keyscans; a ``BackendRunner`` for ``RobotFrontend``. It sends nothing."""
+    """Localizes one robot by its keyscans; a ``BackendRunner`` for ``RobotFrontend``. It sends nothing."""
 
     def __init__(self, frozen_map: Submap, initial: FloatArray | None = None) -> None:
         """Begin without a pose.
@@ -112,7 +112,7 @@ class MapLocalizer:
         self.fixes = 0
         """How often a search found the robot."""
         self.losses = 0
-        """How often the robot was localised and is not any more, ends of sessions included."""
+        """How often the robot was localized and is not any more, ends of sessions included."""
         self._suggested: tuple[FloatArray, float] | None = None
         """``T_map_odom`` that somebody gave, and the travel at which it was given."""
         self._begin()

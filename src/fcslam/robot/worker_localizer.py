@@ -1,4 +1,4 @@
-"""Localisation in a finished map beside the tracker of a live robot: no pose of a scan waits for a search of the map.
+"""Localization in a finished map beside the tracker of a live robot: no pose of a scan waits for a search of the map.
 
 The tracker gives the pose in ``odom`` at once. Where ``odom`` lies in the map is known at the newest keyscan that
 the worker has handled; the robot's own motion carries it on until the next one.
@@ -24,7 +24,7 @@ class MapState:
     session: int
     """Number of the session, from 0; ``odom`` is another frame in each."""
     estimate: MapEstimate | None
-    """None: the robot was not localised."""
+    """None: the robot was not localized."""
     fixes: int
     losses: int
 
@@ -36,7 +36,7 @@ class WorkerLocalizer:
         """Load the map into the worker; arguments as for ``MapLocalizer``.
 
         Raises:
-            SourceError: nothing can be localised in the map.
+            SourceError: nothing can be localized in the map.
         """
         self._robot, self._executor = robot, executor
         self.state = MapState(0, None, 0, 0)

@@ -340,7 +340,7 @@ class RobotNode:
             trouble = "" if pose.is_localized else "lost: the scans contradict the map"
         else:
             since = f"for {max(0.0, pose.stamp - state[1]):.0f} s"
-            trouble, well = "" if state[0] else f"not localised {since}", f"localised {since}"
+            trouble, well = "" if state[0] else f"not localized {since}", f"localized {since}"
         values: dict[str, object] = {"scans": self.scans, "messages lost": self._lost_messages}
         if pose is not None:
             values |= {"quality": f"{pose.quality:.3f}", "map": pose.map_index, "stamp": f"{pose.stamp:.3f}"}
@@ -441,7 +441,7 @@ class RobotNode:
     def _take_floor(self, payload: bytes) -> None:
         """Begin a session on another floor, as a lift's controller says."""
         if self._change_floor is None:
-            self._tell_once("a floor is ignored: the robot localises in one finished map")
+            self._tell_once("a floor is ignored: the robot localizes in one finished map")
             return
         try:
             self._change_floor(self._codec.decode(payload, STRING).data)

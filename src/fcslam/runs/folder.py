@@ -3,14 +3,14 @@
     trajectories/<robot>.tum   stamp x y z qx qy qz qw: pose of base in the robot's map at every laser scan
     robots.csv                 robot, map, path_length_m, scans, floor
     closures.csv               every loop closure considered, with its status and reason
-    pose_graph.g2o             the optimised pose graph
+    pose_graph.g2o             the optimized pose graph
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
     quality.json, .png         the certificate: expected error of each square metre, open stretches, what to drive again
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
     mission.state              what this program made of them, so that its user's next run need not apply them again
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
-    localization/<robot>.csv   instead of local: of a robot that was localised in a finished map, pose, standard
+    localization/<robot>.csv   instead of local: of a robot that was localized in a finished map, pose, standard
                                deviations and quality at every laser scan
     local/<robot>.tum          as trajectories/, in the robot's own map, which nothing but its own measurements made
     local/<robot>.pgm, .yaml   that map
@@ -75,7 +75,7 @@ class Run:
     config_yaml: str = ""
     """The complete configuration."""
     pose_graph_g2o: str = ""
-    """All keyscans at their optimised poses with the constraints in use, in the g2o format."""
+    """All keyscans at their optimized poses with the constraints in use, in the g2o format."""
     map_files: Mapping[str, bytes] = field(default_factory=dict)
     """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)

@@ -39,12 +39,12 @@ class LocalizedPoses:
     stamps: FloatArray
     """Shape (N,), seconds of the recording's own clock."""
     T_map_base: FloatArray
-    """Poses (x, y, theta) of ``base``, metres and radians, shape (N, 3); NaN where the robot was not localised."""
+    """Poses (x, y, theta) of ``base``, metres and radians, shape (N, 3); NaN where the robot was not localized."""
     sigma: FloatArray
-    """Standard deviations of x, y (m) and theta (rad), shape (N, 3); NaN where the robot was not localised."""
+    """Standard deviations of x, y (m) and theta (rad), shape (N, 3); NaN where the robot was not localized."""
     quality: FloatArray
     """Share of the walls that lie on walls of the map, where the map knows the area, shape (N,); 0 where the robot was
-    not localised. It is the smaller of two shares: of the last metres and of the newest keyscan.
+    not localized. It is the smaller of two shares: of the last metres and of the newest keyscan.
     """
 
     @property

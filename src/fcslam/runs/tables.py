@@ -63,7 +63,7 @@ def read_closures(path: Path, within: Path | None = None) -> tuple[ClosureRow, .
 
 
 def write_localized(path: Path, poses: LocalizedPoses) -> None:
-    """Write localization/<robot>.csv: nine digits after the point, empty cells where the robot was not localised."""
+    """Write localization/<robot>.csv: nine digits after the point, empty cells where the robot was not localized."""
     table = np.column_stack((poses.stamps, poses.T_map_base, poses.sigma, poses.quality)).tolist()
     fields = (["" if math.isnan(value) else f"{value:.9f}" for value in row] for row in table)
     _write_csv(path, _LOCALIZED_COLUMNS, fields)

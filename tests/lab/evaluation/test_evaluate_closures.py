@@ -219,7 +219,7 @@ def test_a_run_without_closures_and_a_foreign_recording(tmp_path, relations):
         evaluate_closures(tmp_path / "run", tmp_path / "empty_handed")
 
 
-def test_the_optimised_graph_averages_what_scatters():
+def test_the_optimized_graph_averages_what_scatters():
     """Many noisy relations between two rounds: the optimum is nearer to the truth than one of them is."""
     rng = np.random.default_rng(9)
     ends = [((0, int(a)), (0, int(b))) for a, b in rng.integers(0, 2 * ROUND, (3000, 2)) if a != b]

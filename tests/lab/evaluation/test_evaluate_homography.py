@@ -172,7 +172,7 @@ def test_features_of_the_file_are_brought_into_the_framed_picture(scenes, tmp_pa
     perfect = choose_detectors([], [], [tmp_path / "perfect"])
     (pair,) = evaluate_homography(find_scenes([scenes / "v_turn"]), perfect).pairs
     assert pair.repeatability.repeatability > 0.95  # NMS may take another of two neighbours
-    assert pair.repeatability.localisation_error_px < 1e-3
+    assert pair.repeatability.localization_error_px < 1e-3
     assert pair.matching[0].corner_error_px < 1e-2
     assert pair.matching[0].accuracy[0] > 0.8  # some of the nearest are not in the cropped picture
     assert pair.matching[0].score == pytest.approx(1.0, abs=0.02)

@@ -91,7 +91,7 @@ def test_a_robot_labels_no_more_images_than_asked(folder, start, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_optimiser_goes_on_from_the_robots_last_round(folder, start, tmp_path):
+def test_the_optimizer_goes_on_from_the_robots_last_round(folder, start, tmp_path):
     def train(cache, round_number, run="run"):
         return robot(folder, tmp_path / cache).train(start, round_number, run, settings(rounds=9)).weights
 
@@ -126,11 +126,11 @@ def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
     with pytest.raises(TrainingError, match="cannot be read"):
         robot(folder, tmp_path).train(start, 1, "run", settings())
     moments.write_bytes(b"broken")
-    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimiser's state cannot be read"):
+    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimizer's state cannot be read"):
         robot(folder, tmp_path).train(start, 1, "run", settings())
     moments.unlink()
     moments.mkdir()
-    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimiser's state cannot be kept"):
+    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimizer's state cannot be kept"):
         robot(folder, tmp_path).train(start, 0, "run", settings())
 
 

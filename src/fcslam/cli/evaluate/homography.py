@@ -91,7 +91,7 @@ def _repeatability_table(report: "HomographyReport") -> "Table":
     from fcslam.lab.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="I. Repeatability", title_justify="left")
-    for heading in ("", "illumination", "viewpoint", "all", "localisation error, px", "ms 320x240", "ms 640x480"):
+    for heading in ("", "illumination", "viewpoint", "all", "localization error, px", "ms 320x240", "ms 640x480"):
         table.add_column(heading)
     for name in report.detectors:
         pairs = report.of(name)
@@ -101,7 +101,7 @@ def _repeatability_table(report: "HomographyReport") -> "Table":
             name,
             *map(_share, kinds),
             _interval(interval(pairs, "repeatability", SEED)),
-            _number(mean(pairs, "localisation_error_px"), 2),
+            _number(mean(pairs, "localization_error_px"), 2),
             *(_number(time, 1) for time in times),
         )
     return table

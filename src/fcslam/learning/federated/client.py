@@ -68,7 +68,7 @@ class RobotClient:
     folder: Path
     """Contains the images."""
     cache: Path
-    """Folder for what must survive a round: labels, the optimiser's state, private layers, and the weights of the
+    """Folder for what must survive a round: labels, the optimizer's state, private layers, and the weights of the
     legacy detector.
     """
     device: str = "cpu"
@@ -117,15 +117,15 @@ class RobotClient:
         device, on_step = torch.device(self.device), partial(self.on_step, self.name)
         if settings.on_revisits:
             trained = train_codes(
-                start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
+                start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimizer_state=moments
             )
         else:
             images = self._labelled_images(weights, settings).train
-            trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)
+            trained = local_training(start, images, training, plan, device, on_step, legacy, optimizer_state=moments)
         found = network_to_weights(trained.network)
         shared = shared_weights(found, settings.private)
         own = {name: array for name, array in found.items() if name not in shared}
-        save_robot_state(self.cache, run_id, round_number, trained.optimiser_state, own)
+        save_robot_state(self.cache, run_id, round_number, trained.optimizer_state, own)
         return ClientUpdate(found, trained.losses)
 
     def own_weights(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> Weights:

@@ -1,4 +1,4 @@
-"""State of a robot from round to round: weights of the legacy detector, state of its optimiser, private layers.
+"""State of a robot from round to round: weights of the legacy detector, state of its optimizer, private layers.
 
 File names contain a checksum of the run's number and nothing else that a server sends. So no server can make a robot
 write outside its folder.
@@ -22,7 +22,7 @@ from fcslam.learning.federated.weights import Weights
 from fcslam.untrusted import read_arrays
 
 _PRIVATE: Final = "private/"
-"""Prefix of the private layers among the arrays of the optimiser."""
+"""Prefix of the private layers among the arrays of the optimizer."""
 
 
 def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights) -> Weights:
@@ -41,7 +41,7 @@ def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights
 def load_robot_state(
     cache: Path, run_id: str, round_number: int
 ) -> tuple[dict[str, Tensor] | None, dict[str, NDArray[np.float32]]]:
-    """The optimiser's state and the private layers after the latest earlier round in which the robot trained.
+    """The optimizer's state and the private layers after the latest earlier round in which the robot trained.
 
     Without such a round these are None and no layers.
 
@@ -52,7 +52,7 @@ def load_robot_state(
     if not earlier:
         return None, {}
     path = _state_path(cache, run_id, max(earlier))
-    with translate_errors(path, "the optimiser's state cannot be read"):
+    with translate_errors(path, "the optimizer's state cannot be read"):
         arrays = read_arrays(path)
         moments = {name: torch.from_numpy(array) for name, array in arrays.items() if not name.startswith(_PRIVATE)}
         own = {name.removeprefix(_PRIVATE): array for name, array in arrays.items() if name.startswith(_PRIVATE)}
@@ -60,7 +60,7 @@ def load_robot_state(
 
 
 def save_robot_state(cache: Path, run_id: str, round_number: int, moments: Mapping[str, Tensor], own: Weights) -> None:
-    """Save the optimiser's state and the private layers after a round, and keep those of the round before.
+    """Save the optimizer's state and the private layers after a round, and keep those of the round before.
 
     A server that was killed may repeat the round.
 
@@ -68,7 +68,7 @@ def save_robot_state(cache: Path, run_id: str, round_number: int, moments: Mappi
         TrainingError: the file cannot be written.
     """
     path = _state_path(cache, run_id, round_number)
-    with translate_errors(path, "the optimiser's state cannot be kept"):
+    with translate_errors(path, "the optimizer's state cannot be kept"):
         kept = {f"{_PRIVATE}{name}": array for name, array in own.items()}
         write_arrays(path, {name: value.cpu().numpy() for name, value in moments.items()} | kept)
         before = [each for each in _saved_rounds(cache, run_id) if each < round_number]

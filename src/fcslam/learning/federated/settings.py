@@ -52,7 +52,7 @@ class FederatedSettings(Settings):
     local_steps: int = Field(
         default=10,
         ge=1,
-        description="optimiser steps of each robot in a round",
+        description="optimizer steps of each robot in a round",
     )
     judge_every: int = Field(
         default=5,

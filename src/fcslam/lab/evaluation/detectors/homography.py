@@ -2,7 +2,7 @@
 
 Each measure follows its original definition:
 
-- repeatability and localisation error at 320 x 240, NMS 4, the 300 strongest in common view (SuperPoint);
+- repeatability and localization error at 320 x 240, NMS 4, the 300 strongest in common view (SuperPoint);
 - homography from mutual nearest neighbours at 640 x 480 among the 1000 strongest in common view (SuperPoint);
 - mean matching accuracy (D2-Net) and matching score (KP2D) at 640 x 480 among the 1000 strongest of each image.
 

@@ -20,12 +20,12 @@ Measures = Mapping[str, float]
 
 
 def pair_measures(pair: PairResult) -> dict[str, float]:
-    """All measures of a pair: ``repeatability``, ``localisation_error_px``, and for each NMS n in pixels
+    """All measures of a pair: ``repeatability``, ``localization_error_px``, and for each NMS n in pixels
     ``homography_<e>px_nms<n>`` (0 or 1), ``accuracy_<t>px_nms<n>``, ``score_nms<n>``, ``matches_nms<n>`` and
     ``corner_error_px_nms<n>``."""
     measures = {
         "repeatability": pair.repeatability.repeatability,
-        "localisation_error_px": pair.repeatability.localisation_error_px,
+        "localization_error_px": pair.repeatability.localization_error_px,
     }
     for nms_px, result in pair.matching.items():
         measures |= {f"{name}_nms{nms_px}": value for name, value in _matching_measures(result).items()}

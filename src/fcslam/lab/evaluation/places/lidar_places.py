@@ -1,6 +1,6 @@
-"""LiDAR places of one robot's recording, with ground truth from its own optimised poses.
+"""LiDAR places of one robot's recording, with ground truth from its own optimized poses.
 
-The places come from the robot's front end, online. Optimised poses are accurate to centimetres according to reference
+The places come from the robot's front end, online. Optimized poses are accurate to centimetres according to reference
 relations, which is small compared to the 1 m of a match.
 """
 
@@ -74,7 +74,7 @@ def planar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
 
 
 def _corrected(packets: list[Packet]) -> FloatArray:
-    """Optimised poses of all keyscans, shape (N, 3)."""
+    """Optimized poses of all keyscans, shape (N, 3)."""
     cloud = Cloud(FleetConfig(join_maps=False), 0)
     for packet in packets:
         cloud.receive(encode(packet))

@@ -1,6 +1,6 @@
 """Robots that are picked up and put down elsewhere: do they notice, and does the fleet find them again?
 
-    python benchmarks/relocalisation.py
+    python benchmarks/relocalization.py
 
 Two robots map a simulated building by LiDAR. Half-way through its drive one is put down at least 10 m away, turned by
 at least 30 degrees; its wheels never notice (odometry goes on), and it drives on there. Per building and seed:

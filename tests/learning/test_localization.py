@@ -1,4 +1,4 @@
-"""The localisation loss: zero for the same points, the Huber loss of a known shift, and a gradient that undoes it."""
+"""The localization loss: zero for the same points, the Huber loss of a known shift, and a gradient that undoes it."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.features.dense import find_peaks  # noqa: E402
 from fcslam.features.detector import OnnxConfig  # noqa: E402
-from fcslam.learning.localisation import HUBER_PX, MOST_PEAKS, localisation_loss, peaks  # noqa: E402
+from fcslam.learning.localization import HUBER_PX, MOST_PEAKS, localization_loss, peaks  # noqa: E402
 
 HEIGHT, WIDTH = 96, 120
 WIDTH_OF_A_POINT_PX = 1.5
@@ -31,7 +31,7 @@ def drawn(points, shift=(0.0, 0.0)):
 
 
 def loss_of(first, second, homography=IDENTITY):
-    return localisation_loss(torch.stack((first, second)), torch.from_numpy(homography)[None])
+    return localization_loss(torch.stack((first, second)), torch.from_numpy(homography)[None])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -77,13 +77,13 @@ def test_descending_moves_points_together():
     points = points_apart(5)
     first, second = drawn(points), drawn(points, (0.6, 0.0))
     logits = torch.logit(torch.stack((first, second)), eps=1e-3).requires_grad_()
-    optimiser = torch.optim.Adam([logits], lr=0.05)
+    optimizer = torch.optim.Adam([logits], lr=0.05)
     homography = torch.from_numpy(IDENTITY)[None]
     losses = []
     for _ in range(30):
-        optimiser.zero_grad()
-        loss = localisation_loss(logits.sigmoid(), homography)
+        optimizer.zero_grad()
+        loss = localization_loss(logits.sigmoid(), homography)
         loss.backward()
-        optimiser.step()
+        optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.3 * losses[0]

@@ -1,4 +1,4 @@
-"""The localisation loss: keypoints that two views of an image share must lie at the same point, to a part of a pixel.
+"""The localization loss: keypoints that two views of an image share must lie at the same point, to a part of a pixel.
 
 The cross entropy of the keypoint maps knows whole pixels only. This loss differentiates the parabola by which a
 detector refines its peaks, so it moves them by parts of a pixel.
@@ -27,7 +27,7 @@ _NOWHERE_PX: Final = 1e6
 """Where a peak lies that there is not."""
 
 
-def localisation_loss(scores: Tensor, homographies: Tensor) -> Tensor:
+def localization_loss(scores: Tensor, homographies: Tensor) -> Tensor:
     """Mean Huber loss of the distances [px] between keypoints that both views of a pair show; 0 if there are none.
 
     Keypoints are the same if they are mutual nearest neighbours within ``SAME_POINT_PX`` in the second view.
