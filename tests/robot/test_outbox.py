@@ -332,7 +332,7 @@ def test_a_damaged_packet_is_told_by_its_number(path):
         damaged = bytearray(content)
         damaged[content.index(data) + at] ^= 4
         path.write_bytes(damaged)
-        with pytest.raises(StateError, match=r"packet 2 of epoch 0 is damaged; .*: give another --state") as told:
+        with pytest.raises(StateError, match=r"packet 2 of epoch 0 is damaged, .*; give another --state") as told:
             Outbox(path, "alice", LIMIT)
         assert "\n" not in str(told.value)
 
