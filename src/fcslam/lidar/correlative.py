@@ -24,6 +24,8 @@ CELL_M = 0.1
 """Side of a cell of the likelihood grid, metres."""
 SMEAR_M = 0.1
 """Standard deviation of the likelihood around a surface, metres."""
+SMEARED_CELLS: Final = math.ceil(2.5 * SMEAR_M / CELL_M)
+"""Cells on each side of a surfel's own that are drawn."""
 MOST_LEVELS = 6
 """Most levels of the pyramid; a step on the coarsest one of them is 2^5 cells."""
 MOST_POINTS = 120
@@ -88,7 +90,7 @@ def likelihood_pyramid(
     corner = np.asarray(T_field_guess[:2]) - half_side_m
     surfels, count = field.arrays.surfels, int(field.arrays.used[1])
     viewpoint = np.array(T_field_guess[:2]) if visible_only else np.full(2, np.nan)
-    base = _draw(surfels, count, viewpoint, corner, size, CELL_M, SMEAR_M)
+    base = _draw(surfels, count, viewpoint, corner, size)
     return LikelihoodPyramid(_pyramid(base, MOST_LEVELS if levels is None else levels), corner, CELL_M)
 
 
@@ -163,28 +165,29 @@ def _quantile(values: FloatArray, share: float) -> float:
 
 
 @njit
-def _draw(surfels, count, viewpoint, corner, size, cell, smear):  # type: ignore[no-untyped-def]
+def _draw(surfels, count, viewpoint, corner, size):  # type: ignore[no-untyped-def]
     """Likelihood of the surfels that face the viewpoint, or of all if it is NaN."""
-    grid = np.zeros((size, size), np.uint8)
-    half = int(np.ceil(2.5 * smear / cell))
+    half, margin = SMEARED_CELLS, 2 * SMEARED_CELLS
+    grid = np.zeros((size + 2 * margin, size + 2 * margin), np.uint8)  # with a margin on each side: no cell is outside
     across = np.empty(2 * half + 1)
     for i in range(count):
         x, y = surfels[i, 0], surfels[i, 1]
         if surfels[i, 2] * (viewpoint[0] - x) + surfels[i, 3] * (viewpoint[1] - y) < 0.0:
             continue
-        cx, cy = int(np.floor((x - corner[0]) / cell)), int(np.floor((y - corner[1]) / cell))
+        cx, cy = int(np.floor((x - corner[0]) / CELL_M)), int(np.floor((y - corner[1]) / CELL_M))
         if cx < -half or cy < -half or cx >= size + half or cy >= size + half:
             continue
         for k in range(2 * half + 1):
-            dx = corner[0] + (cx - half + k + 0.5) * cell - x
-            across[k] = 255.0 * np.exp(-0.5 * dx * dx / (smear * smear))
-        for gy in range(max(0, cy - half), min(size, cy + half + 1)):
-            dy = corner[1] + (gy + 0.5) * cell - y
-            factor = np.exp(-0.5 * dy * dy / (smear * smear))
-            for gx in range(max(0, cx - half), min(size, cx + half + 1)):
-                value = np.uint8(factor * across[gx - cx + half])
-                grid[gy, gx] = max(grid[gy, gx], value)
-    return grid
+            dx = corner[0] + (cx - half + k + 0.5) * CELL_M - x
+            across[k] = 255.0 * np.exp(-0.5 * dx * dx / (SMEAR_M * SMEAR_M))
+        for j in range(2 * half + 1):
+            dy = corner[1] + (cy - half + j + 0.5) * CELL_M - y
+            factor = np.exp(-0.5 * dy * dy / (SMEAR_M * SMEAR_M))
+            row = grid[cy - half + j + margin]
+            for k in range(2 * half + 1):
+                cell = cx - half + k + margin
+                row[cell] = max(row[cell], np.uint8(factor * across[k]))
+    return grid[margin:-margin, margin:-margin].copy()
 
 
 @njit

@@ -124,9 +124,9 @@ def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # ty
         for k in range(steps + 1):
             x = int(np.floor(x0 / FREE_CELL_M + k * ux))
             y = int(np.floor(y0 / FREE_CELL_M + k * uy))
-            if x >= 0 and y >= 0 and x < columns and y < rows and latest[0, y, x] != number:
+            if x >= 0 and y >= 0 and x < columns and y < rows:
+                passes[y, x] += latest[0, y, x] != number  # a branch here would take as long as all the rest
                 latest[0, y, x] = number
-                passes[y, x] += 1
 
 
 def spaced(surfels: PointScan) -> PointScan:
