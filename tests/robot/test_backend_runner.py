@@ -106,6 +106,25 @@ def test_a_back_end_that_breaks_at_once_leaves_a_map(scans):
     assert len(contents(packets)) == 2 * len(keyscans)
 
 
+def test_an_input_that_a_breaking_executor_loses_is_not_waited_for(scans):
+    class Losing(Held):
+        def submit(self, function, /, *arguments):
+            if self._left > 0:
+                return super().submit(function, *arguments)
+            self._left -= 1
+            if self._left == -1:
+                return Future()
+            raise BrokenExecutor("it was killed")
+
+    expected = driven(scans)[1]
+    _, packets = driven(scans, WorkerBackend("r", CONFIG, Losing(breaks_after=3)))
+    assert keyscans(packets) == keyscans(expected)
+
+
+def keyscans(packets):
+    return sum(isinstance(packet.body, Keyscan) for packet in packets)
+
+
 def is_closure(body):
     return isinstance(body, Constraint) and body.kind is ConstraintKind.CLOSURE
 
@@ -127,4 +146,4 @@ def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothi
         os.kill(worker, signal.SIGKILL)
         robot, packets = driven(scans, backend)
         assert "BrokenProcessPool" in robot.backend_failure
-        assert sum(isinstance(p.body, Keyscan) for p in packets) == sum(isinstance(p.body, Keyscan) for p in expected)
+        assert keyscans(packets) == keyscans(expected)

@@ -394,6 +394,9 @@ class RobotFrontend:
         try:
             output = self._backend.submit(input)
         except BrokenExecutor as error:
+            # An input that came while the executor broke may be lost (Python 3.11): nothing else completes its future.
+            for waiting in self._waiting:
+                waiting.output.cancel()
             output = Future()
             output.set_exception(error)
         self._waiting.append(_Waiting(input, output, len(self.tracks) - 1, self._time))
