@@ -250,7 +250,7 @@ def test_what_convert_refuses(tmp_path, bag, capsys):
     assert "a.zip: unknown format" in refused(capsys, "record", bag, "-o", tmp_path / "a.zip")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
-    assert "no recording" in refused(capsys, "record", bag, "-o", tmp_path / "thesis", "--force")
+    assert "not a recording" in refused(capsys, "record", bag, "-o", tmp_path / "thesis", "--force")
     assert (tmp_path / "thesis" / "main.tex").exists()
     (tmp_path / "dir.bag").mkdir()
     assert "is a folder" in refused(capsys, "record", bag, "-o", tmp_path / "dir.bag", "--force")

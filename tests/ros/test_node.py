@@ -318,7 +318,7 @@ def test_an_initial_pose_that_cannot_be_used_is_refused(network, own_map, messag
         network.say(f"/robot1/{INITIAL_POSE}", POSE, message)
         network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
     assert reason in said[0]
-    assert "no message of this type" in said[1]
+    assert "not a message of this type" in said[1]
 
 
 def test_silence_is_told_once_and_the_robot_goes_on(network, robot, scans, monkeypatch):

@@ -388,7 +388,7 @@ ROBOTS = {
     ),
     "odometry in millimetres": (
         lambda: with_odometry(lambda _, x, y, a: (1000.0 * x, 1000.0 * y, a)),
-        "or in another unit",
+        "or another unit",
     ),
     "NaN in the odometry": (lambda: with_odometry(lambda k, x, y, a: (NAN if k % 7 == 0 else x, y, a)), ""),
     "gaps in the odometry": (lambda: with_odometry(lambda k, *its: None if 75 < k < 90 else its), ""),
