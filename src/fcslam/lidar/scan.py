@@ -77,12 +77,12 @@ def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) 
     """
     if ranges_m.shape != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {ranges_m.shape}")
-    rays = rays_of(laser, sweep)
-    points, normals, solitary, kept = _project(
-        ranges_m, rays.origins, rays.directions, abs(laser.angle_increment_rad), laser.max_range_m
-    )
-    times_s = AT_ONCE if sweep is None else rays.times_s[kept]
-    return PointScan(points, normals, solitary, rays.origins[laser.beam_count // 2], times_s)
+    origins, directions, _ = _rays(laser)
+    spacing_rad = abs(laser.angle_increment_rad)
+    if sweep is None:
+        points, normals, solitary, _ = _project(ranges_m, origins, directions, spacing_rad, laser.max_range_m)
+        return PointScan(points, normals, solitary, origins[laser.beam_count // 2], AT_ONCE)
+    return PointScan(*_project_swept(ranges_m, origins, directions, sweep, spacing_rad, laser.max_range_m))
 
 
 def keyscan_points(keyscan: Keyscan, lasers: Sequence[LaserModel]) -> PointScan:
@@ -106,8 +106,7 @@ def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> Rays:
     if sweep is None:
         return _rays(laser)
     origins, directions, _ = _rays(laser)
-    first_s, last_s, velocity, acceleration = sweep
-    return Rays(*_swept(origins, directions, first_s, last_s, velocity, acceleration))
+    return Rays(*_swept(origins, directions, sweep))
 
 
 def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
@@ -124,8 +123,9 @@ def _rays(laser: LaserModel) -> Rays:
 
 
 @njit
-def _swept(origins, directions, first, last, velocity, acceleration):  # type: ignore[no-untyped-def]
+def _swept(origins, directions, sweep):  # type: ignore[no-untyped-def]
     """Each beam where the robot was at its time, and these times, as ``beam_times``."""
+    first, last, velocity, acceleration = sweep
     moved, turned, times = np.empty_like(origins), np.empty_like(directions), np.empty(len(origins))
     step = (last - first) / max(1, len(times) - 1)
     for i in range(len(times)):
@@ -149,6 +149,14 @@ def ray_at(origin, direction, t, velocity, acceleration):  # type: ignore[no-unt
         cos * direction[0] - sin * direction[1],
         sin * direction[0] + cos * direction[1],
     )
+
+
+@njit
+def _project_swept(ranges, origins, directions, sweep, spacing, max_range):  # type: ignore[no-untyped-def]
+    """The fields of the ``PointScan`` of a sweep, from the beams as they are at its stamp."""
+    origins, directions, times = _swept(origins, directions, sweep)
+    points, normals, solitary, kept = _project(ranges, origins, directions, spacing, max_range)
+    return points, normals, solitary, origins[len(origins) // 2].copy(), times[kept]
 
 
 @njit

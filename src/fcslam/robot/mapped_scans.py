@@ -42,7 +42,7 @@ class MappedScans:
             rays = rays_of(laser)  # the body moves with the laser
             points = rays.origins + np.minimum(ranges_m, laser.max_range_m)[:, None] * rays.directions
             ranges_m = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), ranges_m)
-        sweep = None if scan.sweep is None else _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
+        sweep = _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
         ranges_m = rounded(ranges_m, laser.max_range_m)
         return LaserScan(scan.stamp, ranges_m, laser, scan.T_odom_base, sweep, scan.on_teammates)
 
@@ -57,7 +57,9 @@ def _mapped_laser(laser: LaserModel, step: int) -> LaserModel:
     return replace(every, max_range_m=MAXIMUM_LASER_RANGE_M)
 
 
-def _mapped_sweep(sweep: Sweep, beam_count: int, step: int) -> Sweep:
+def _mapped_sweep(sweep: Sweep | None, beam_count: int, step: int) -> Sweep | None:
     """The sweep of every ``step``-th beam from the first on."""
+    if sweep is None or step == 1:
+        return sweep
     share = (beam_count - 1) // step * step / (beam_count - 1)
     return sweep._replace(last_s=sweep.first_s + share * (sweep.last_s - sweep.first_s))
