@@ -299,7 +299,7 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams
     sweeps = [scan.sweep or _AT_ONCE for scan in keyscans]
     return _Beams(
         ranges_m,
-        *rays_of(laser)[:2],
+        *rays_of(laser),
         beam_times(laser, times),
         poses,
         np.array([sweep.velocity for sweep in sweeps]),

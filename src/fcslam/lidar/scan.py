@@ -77,7 +77,7 @@ def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) 
     """
     if ranges_m.shape != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {ranges_m.shape}")
-    origins, directions, _ = _rays(laser)
+    origins, directions = _rays(laser)
     spacing_rad = abs(laser.angle_increment_rad)
     if sweep is None:
         points, normals, solitary, _ = _project(ranges_m, origins, directions, spacing_rad, laser.max_range_m)
@@ -97,16 +97,14 @@ class Rays(NamedTuple):
     """Where the laser was at each beam, shape (beam_count, 2), metres."""
     directions: FloatArray
     """Unit vectors, shape (beam_count, 2)."""
-    times_s: FloatArray
-    """Time of each beam after the stamp, shape (beam_count,); shape (0,): all are measured at the stamp."""
 
 
 def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> Rays:
-    """The beams of a scan of ``laser``. This is the only place where beams get positions and directions."""
+    """The beams of a scan of ``laser``, as ``point_scan`` places its returns on them."""
     if sweep is None:
         return _rays(laser)
-    origins, directions, _ = _rays(laser)
-    return Rays(*_swept(origins, directions, sweep))
+    origins, directions, _ = _swept(*_rays(laser), sweep)
+    return Rays(origins, directions)
 
 
 def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
@@ -116,10 +114,10 @@ def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
 def _rays(laser: LaserModel) -> Rays:
-    """The beams if all are measured at the stamp."""
+    """The beams if all are measured at the stamp. Only here and in ``_swept`` beams get positions and directions."""
     angles = laser.angles_rad() + laser.T_base_laser[2]
     origins = np.tile(laser.T_base_laser[:2], (laser.beam_count, 1))
-    return Rays(origins, np.stack((np.cos(angles), np.sin(angles)), axis=1), AT_ONCE)
+    return Rays(origins, np.stack((np.cos(angles), np.sin(angles)), axis=1))
 
 
 @njit

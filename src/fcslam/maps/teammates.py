@@ -103,7 +103,7 @@ def _suspects(
         reached = (ranges_m > 0.0) & (ranges_m < scan.laser.max_range_m) & (ranges_m > apart_m[k] - radius_m - 1.0)
         if not reached.any():
             continue
-        origins, directions, _ = rays_of(scan.laser, scan.sweep)
+        origins, directions = rays_of(scan.laser, scan.sweep)
         returns = origins[reached] + ranges_m[reached, None] * directions[reached]
         in_map = se2.transform(scan.T_map_base, returns)
         on_robot = _distance(in_map, begin[k], end[k]) <= radius_m
