@@ -49,6 +49,11 @@ def test_robots_side_by_side(no_semaphores, tmp_path):
         drive(tmp_path)
 
 
+def test_a_single_robot_does_without(no_semaphores, logs):
+    with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,):
+        assert list(legs)[-1].tracks
+
+
 def test_too_many_open_files_say_so(monkeypatch):
     let_semaphores_fail(monkeypatch, errno.EMFILE)
     with pytest.raises(OSError, match="refused"):

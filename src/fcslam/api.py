@@ -71,7 +71,8 @@ def map_recordings(
         bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
         progress: called every 50 scans, and before the maps are fused, with the state of the mission.
         force: replace a run that is at ``output``.
-        processes: number of robots that are mapped at a time, each in a process of its own; it does not change the run.
+        processes: number of robots that are mapped at a time, each in a process of its own. With 2 or more, closures of
+            a single robot are found in a process beside it. The number does not change the run.
         onto: mission file, or run folder with one, of an earlier mission that goes on. The run is that of all
             recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
             the cloud. Without recordings it is mapped again, with the edits that it has.

@@ -115,14 +115,19 @@ def start_method() -> Any:
     return multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
-def worker_pool(start: Callable[[], None]) -> ProcessPoolExecutor:
+def worker_pool(start: Callable[[], None], is_copy: bool = False) -> ProcessPoolExecutor:
     """An executor with one worker, another process that calls ``start`` first.
+
+    Args:
+        start: called in the worker.
+        is_copy: the worker shares the code that this process has loaded, where copies are safe; see ``start_method``.
+            A process with threads, such as those of ROS, must not be copied.
 
     Raises:
         InputError: the host gives processes no semaphores.
     """
     with needing_semaphores():
-        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start)
+        return ProcessPoolExecutor(1, start_method() if is_copy else multiprocessing.get_context("spawn"), start)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Robots side by side in processes: the same run as one by one, and errors arrive."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fcslam.errors import FcslamError, SourceError
@@ -70,8 +72,32 @@ def test_legs_are_the_same_and_their_arrays_read_only(logs):
     assert legs[-1].faults == expected[-1].faults
 
 
-def test_one_robot_needs_no_process(monkeypatch):
-    monkeypatch.setattr(driving, "start_method", lambda: pytest.fail("a process"))
+def test_the_back_end_of_a_single_robot_runs_beside_it_and_changes_no_packet(logs, monkeypatch):
+    monkeypatch.setattr(driving, "MOST_WAITING", 3)  # so that the robot waits
+    source = open_source(logs[0])
+    with one_by_one([source], RobotConfig()) as (here,):
+        expected = list(here)
+    with side_by_side(2)([source], RobotConfig()) as (there,):
+        legs = [next(there)]
+        assert len(multiprocessing.active_children()) == 1
+        legs += there
+    assert not multiprocessing.active_children()
+    sent, wanted = ([sized.data for leg in found for sized in leg.packets] for found in (legs, expected))
+    assert sent == wanted
+    assert legs[-1].faults == expected[-1].faults
+    for session, track in expected[-1].tracks.items():
+        np.testing.assert_array_equal(legs[-1].tracks[session].T_keyscan_base, track.T_keyscan_base)
+
+
+def test_a_back_end_that_is_killed_ends_the_run(logs):
+    with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,):
+        next(legs)
+        multiprocessing.active_children()[0].kill()
+        with pytest.raises(FcslamError, match="the process of its back end failed"):
+            list(legs)
+
+
+def test_an_error_of_a_single_robot_is_raised_here():
     with side_by_side(4)([Broken("a", refuse)], RobotConfig()) as (legs,), pytest.raises(SourceError):
         next(legs)
 

@@ -1,6 +1,6 @@
 """The robots of a mission, each over its own recording: one after another in this process, or side by side in others.
 
-Either way a robot gives the same packets, as it knows no other robot.
+Either way a robot gives the same packets, as it knows no other robot. The back end of a single robot runs beside it.
 """
 
 import pickle
@@ -8,7 +8,7 @@ import queue
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from itertools import cycle
 from multiprocessing.process import BaseProcess
@@ -19,6 +19,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError, InputError
 from fcslam.processes import needing_semaphores, obey_parent, start_method, trim_memory
 from fcslam.records import Keyscan, LaserScan
+from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
@@ -29,6 +30,8 @@ from fcslam.wire.packets import SizedPacket, decode, measure, readdress
 SCANS_PER_LEG: Final = 50
 LEGS_PER_TRIM: Final = 4
 """Legs after which freed memory goes back to the system: the arrays of a submap leave gaps that others do not fill."""
+MOST_WAITING: Final = 64
+"""Inputs that wait for a back end beside the robot; with more, the robot waits."""
 _POLL_S: Final = 1.0
 """Interval at which the cloud's process looks whether one that owes it something still runs."""
 
@@ -64,7 +67,8 @@ def one_by_one(sources: Sequence[Source], config: RobotConfig) -> AbstractContex
 def side_by_side(processes: int) -> Drive:
     """Drive every robot in a process of its own, ``processes`` at a time.
 
-    One robot, or one process, needs none. A robot's error is raised where its legs are read.
+    A single robot drives in this process, with its back end in another. One process does everything itself. A robot's
+    error is raised where its legs are read.
 
     Raises:
         InputError: there is no process.
@@ -74,9 +78,13 @@ def side_by_side(processes: int) -> Drive:
 
     @contextmanager
     def drive(sources: Sequence[Source], config: RobotConfig) -> Iterator[Sequence[Iterator[Leg]]]:
-        if min(processes, len(sources)) <= 1:
+        if processes == 1 or not sources:
             with one_by_one(sources, config) as robots:
                 yield robots
+            return
+        if len(sources) == 1:
+            with _with_backend_beside(sources[0], config) as robot:
+                yield [robot]
             return
         context = start_method()
         with needing_semaphores():
@@ -99,13 +107,30 @@ def side_by_side(processes: int) -> Drive:
     return drive
 
 
+@contextmanager
+def _with_backend_beside(source: Source, config: RobotConfig) -> Iterator[Iterator[Leg]]:
+    """Drive one robot in this process, with its back end in another if the host allows one."""
+    with ExitStack() as stack:
+        backend = None
+        with suppress(InputError):
+            backend = stack.enter_context(backend_process(source.name, config, is_copy=True))
+        yield legs(source, RobotFrontend(source.name, config, backend))
+
+
 def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
-    """Drive one robot over its whole recording."""
+    """Drive one robot over its whole recording.
+
+    Raises:
+        SourceError: the recording cannot be read.
+        FcslamError: the process of the robot's back end ended.
+    """
     packets: list[SizedPacket] = []
     stamps: list[float] = []
     turns = cycle(range(LEGS_PER_TRIM))
     for record in source.records():
         packets += map(measure, robot.process(record))
+        if robot.backlog > MOST_WAITING:
+            packets += map(measure, robot.ready(wait=True))
         if isinstance(record, LaserScan):
             stamps.append(record.stamp)
         if len(stamps) == SCANS_PER_LEG:
@@ -114,6 +139,8 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
             if next(turns) == 0:
                 trim_memory()
     packets += map(measure, robot.finish())
+    if robot.backend_failure is not None:
+        raise FcslamError(f"{robot.robot}: the process of its back end failed: {robot.backend_failure}")
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)

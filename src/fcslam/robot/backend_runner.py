@@ -1,7 +1,8 @@
 """Where a robot's back end runs: in the process of the front end, or in another one beside it.
 
-A recording waits for the back end at every keyscan. A live robot must not: the pose of a scan is due before the next
-scan comes, and a solve of a large graph takes longer than that. Both get the same records in the same order.
+A live robot must not wait for the back end: the pose of a scan is due before the next scan comes, and a solve of a
+large graph takes longer than that. A recording may wait, and does so on one core. Both get the same records in the same
+order.
 """
 
 import os
@@ -63,19 +64,19 @@ class WorkerBackend:
         return self._executor.submit(_process, self._robot, input)
 
 
-def worker_process() -> ProcessPoolExecutor:
-    """An executor with one worker, another process with a lower priority than this one.
+def worker_process(is_copy: bool = False) -> ProcessPoolExecutor:
+    """An executor with one worker, another process with a lower priority than this one; see ``worker_pool``.
 
     Raises:
         InputError: the host gives processes no semaphores.
     """
-    return worker_pool(_start_worker)
+    return worker_pool(_start_worker, is_copy)
 
 
 @contextmanager
-def backend_process(robot: str, config: SessionConfig) -> Iterator[WorkerBackend]:
-    """A back end in a process of its own, which ends with this block."""
-    executor = worker_process()
+def backend_process(robot: str, config: SessionConfig, is_copy: bool = False) -> Iterator[WorkerBackend]:
+    """A back end in a process of its own, which ends with this block; ``is_copy`` as in ``worker_pool``."""
+    executor = worker_process(is_copy)
     try:
         yield WorkerBackend(robot, config, executor)
     finally:
