@@ -13,7 +13,7 @@ from fcslam.errors import InputError
 from fcslam.mission.driving import side_by_side
 from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.frontend import RobotConfig
-from fcslam.sources import Recording
+from fcslam.sources import Recording, open_source
 
 
 def let_semaphores_fail(monkeypatch, number):
