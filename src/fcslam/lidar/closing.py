@@ -6,9 +6,9 @@ the whole window by branch and bound. Where the error may exceed the largest win
 earlier submaps and the motions to them.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import compress
 from typing import Protocol
 
 import numpy as np
@@ -276,7 +276,7 @@ class LoopCloser:
             for guess in self._recognizer.motions(self.submaps[earlier].keyscan, newest.keyscan)
             if (closure := self._check(earlier, later, anchors, paths[earlier], guess)) is not None
         ]
-        if not all(self._are_consistent(a, b, anchors) for a, b in combinations(found, 2)):
+        if len(found) > 1 and not consistency(found, self._travel, anchors).all():
             return []
         return sorted(found, key=lambda c: (c.check.support, c.check.worse.overlap))[-1:]
 
@@ -321,7 +321,7 @@ class LoopCloser:
         self._pending = [
             c for c in self._pending if self.submaps[-1].travel_m - self.submaps[c.later].travel_m < PENDING_M
         ]
-        cluster = self._cluster(anchors)
+        cluster = supported(self._pending, self._travel, anchors)
         accepted += cluster
         self._pending = [c for c in self._pending if c not in cluster]
         self._accepted += [(c.earlier, c.later) for c in accepted]
@@ -339,31 +339,57 @@ class LoopCloser:
         near = closure.innovation_m < CONCLUSIVE_SHARE * closure.drift_m + CONCLUSIVE_M
         return closure.check.strict and closure.check.informative and overlap > CONCLUSIVE_OVERLAP and near
 
-    def _cluster(self, anchors: FloatArray) -> list[LocalClosure]:
-        """The pending closures that are consistent with the newest one, if they are enough to be accepted."""
-        if not self._pending:
-            return []
-        newest = self._pending[-1]
-        consistent = [c for c in self._pending if self._are_consistent(c, newest, anchors)]
-        spread_m = np.ptp([self.submaps[c.later].travel_m for c in consistent])
-        support = sum(c.check.support for c in consistent)
-        informative = any(c.check.informative for c in consistent)
-        if support >= MINIMUM_SUPPORT and spread_m >= MINIMUM_SPREAD_M and informative:
-            return consistent
-        return []
 
-    def _are_consistent(self, a: LocalClosure, b: LocalClosure, anchors: FloatArray) -> bool:
-        """Whether the loop over both closures and the estimated motions between their ends closes."""
-        earlier = se2.between(anchors[a.earlier], anchors[b.earlier])
-        later = se2.between(anchors[a.later], anchors[b.later])
-        round_trip = se2.compose(se2.compose(a.check.T_a_b, later), se2.inverse(b.check.T_a_b))
-        residual = se2.between(earlier, round_trip)
-        path_m = abs(self.submaps[a.later].travel_m - self.submaps[b.later].travel_m)
-        path_m += float(np.hypot(earlier[0], earlier[1]))
-        return bool(
-            np.hypot(residual[0], residual[1]) < LOOP_M + LOOP_PER_M * path_m
-            and abs(residual[2]) < LOOP_RAD + LOOP_RAD_PER_M * path_m
-        )
+def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> list[LocalClosure]:
+    """The closures that support each other enough to be accepted, whatever their order.
+
+    A cluster is a closure with all those consistent with it. If several are large enough, the one with the most
+    support counts; of equal ones, the latest.
+
+    Args:
+        pending: verified closures that need support.
+        travel: path length up to each submap, shape (S,), metres.
+        anchors: ``T_map_base`` of the anchors of all submaps, shape (S, 3).
+    """
+    if len(pending) < MINIMUM_SUPPORT:
+        return []
+    consistent = consistency(pending, travel, anchors)
+    clusters = [list(compress(pending, row)) for row in consistent[::-1]]
+    enough = [cluster for cluster in clusters if _is_enough(cluster, travel)]
+    return max(enough, key=_support, default=[])
+
+
+def _support(cluster: Sequence[LocalClosure]) -> float:
+    """At most the number of the closures."""
+    return sum(c.check.support for c in cluster)
+
+
+def _is_enough(cluster: Sequence[LocalClosure], travel: FloatArray) -> bool:
+    """Whether consistent closures are enough, from enough places, and fix the pose in every direction."""
+    spread_m = np.ptp(travel[[c.later for c in cluster]])
+    informative = any(c.check.informative for c in cluster)
+    return bool(_support(cluster) >= MINIMUM_SUPPORT and spread_m >= MINIMUM_SPREAD_M and informative)
+
+
+def consistency(closures: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> NDArray[np.bool_]:
+    """Whether the loop over two closures and the estimated motions between their ends closes, shape (C, C).
+
+    Arguments as for ``supported``.
+    """
+    ends = np.array([(c.earlier, c.later) for c in closures], dtype=np.int64).reshape(-1, 2)
+    T_a_b = np.array([c.check.T_a_b for c in closures]).reshape(-1, 1, 3)
+    T_earlier, T_later = anchors[ends[:, 0]], anchors[ends[:, 1]]
+    earlier = se2.between(T_earlier[:, None], T_earlier[None])
+    later = se2.between(T_later[:, None], T_later[None])
+    round_trip = se2.compose(se2.compose(T_a_b, later), se2.inverse(T_a_b[:, 0])[None])
+    residual = se2.between(earlier, round_trip)
+    between_later_m = np.abs(np.subtract.outer(travel[ends[:, 1]], travel[ends[:, 1]]))
+    path_m = between_later_m + np.hypot(earlier[..., 0], earlier[..., 1])
+    off_m, off_rad = np.hypot(residual[..., 0], residual[..., 1]), np.abs(residual[..., 2])
+    consistent: NDArray[np.bool_] = (off_m < LOOP_M + LOOP_PER_M * path_m) & (
+        off_rad < LOOP_RAD + LOOP_RAD_PER_M * path_m
+    )
+    return consistent
 
 
 @njit
