@@ -120,8 +120,7 @@ def worker_pool(start: Callable[[], None], is_copy: bool = False) -> ProcessPool
 
     Args:
         start: called in the worker.
-        is_copy: the worker shares the code that this process has loaded, where copies are safe; see ``start_method``.
-            A process with threads, such as those of ROS, must not be copied.
+        is_copy: the worker is a copy of this process when it begins its first task, where copies are safe.
 
     Raises:
         InputError: the host gives processes no semaphores.

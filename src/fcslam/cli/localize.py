@@ -1,5 +1,6 @@
 """`fcslam localize`: a robot and a finished map in, the poses of the robot in the map out."""
 
+import gc
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -94,9 +95,21 @@ def localize(
     if live:
         from fcslam.cli.live import drive_live, live_source
         from fcslam.live.localized_robot import LocalizedRobot
+        from fcslam.live.records import Wiring
+        from fcslam.robot.backend_runner import copied_worker
 
-        start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
-        drive_live(live_source(source, sensors, ros_parameters, use_sim_time), start, output, console)
+        robot = live_source(source, sensors, ros_parameters, use_sim_time)
+        gc.freeze()
+        with copied_worker() as worker:
+            start = partial(
+                LocalizedRobot,
+                map=map_path,
+                initial_pose=initial,
+                config=settings,
+                floor=floor,
+                wiring=Wiring(worker),
+            )
+            drive_live(robot, start, output, console)
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)

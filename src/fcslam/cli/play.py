@@ -1,5 +1,6 @@
 """`fcslam play`: a recording played to a cloud service, as if its robot drove now."""
 
+import gc
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -64,6 +65,7 @@ def play(
     from fcslam.errors import InputError
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
+    from fcslam.robot.backend_runner import copied_worker
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
@@ -81,16 +83,21 @@ def play(
     print_notes(console, survey.notes)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
-    live = Robot(
-        opened.name,
-        server=cloud,
-        state=state,
-        config=settings,
-        own_map=False,
-        floor=floor,
-        wiring=Wiring(playback=Playback(fingerprint, resume), keeps_keyframes=learn),
-    )
-    with closing(live):
+    gc.freeze()
+    with (
+        copied_worker() as worker,
+        closing(
+            Robot(
+                opened.name,
+                server=cloud,
+                state=state,
+                config=settings,
+                own_map=False,
+                floor=floor,
+                wiring=Wiring(worker, playback=Playback(fingerprint, resume), keeps_keyframes=learn),
+            )
+        ) as live,
+    ):
         _play(live, opened, survey.scan_count, pace, plan, state, console)
         print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
         _report(live, state, cloud.url)

@@ -1,5 +1,6 @@
 """`fcslam robot`: a live robot, which maps and sends to a cloud service."""
 
+import gc
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -46,6 +47,7 @@ def robot(
     from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
+    from fcslam.robot.backend_runner import copied_worker
     from fcslam.storage.files import keep_private
 
     keep_private()
@@ -57,13 +59,9 @@ def robot(
         )
     live = live_source(address, sensors, ros_parameters, use_sim_time)
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
-    start = partial(
-        Robot,
-        server=cloud,
-        state=state,
-        config=settings,
-        floor=floor,
-        wiring=Wiring(keeps_keyframes=learn),
-    )
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
-    drive_live(live, start, output, notices(quiet), plan)
+    gc.freeze()
+    with copied_worker() as worker:
+        wiring = Wiring(worker, keeps_keyframes=learn)
+        start = partial(Robot, server=cloud, state=state, config=settings, floor=floor, wiring=wiring)
+        drive_live(live, start, output, notices(quiet), plan)

@@ -8,6 +8,7 @@ earlier submaps and the motions to them.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import compress
 from typing import Protocol
 
@@ -20,7 +21,7 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
-from fcslam.lidar.submap import Submap
+from fcslam.lidar.submap import PackedSubmap, Submap
 from fcslam.lidar.verification import VERIFICATION, Verification, verify
 from fcslam.records import FloatArray
 
@@ -31,6 +32,8 @@ NARROW_M = 0.8
 DISTANCE_PENALTY, ANGLE_PENALTY = 0.2, 0.1
 """Shares of a search's score that are lost at the edges of its window: of equal poses, the one near the prediction
 counts."""
+UNPACKED = 32
+"""Submaps that are kept ready for comparison, 0.2 MB each."""
 PENDING_M = 60.0
 """Travel after which a pending closure without enough support is dropped, metres."""
 
@@ -160,8 +163,9 @@ class LoopCloser:
         """All submaps so far."""
         self._travel = np.empty(0)
         """Path length up to each of them, metres."""
-        self._held: dict[int, Submap] = {}
+        self._held: dict[int, PackedSubmap] = {}
         """The submaps that others are compared with, by index; the oldest of a well-known area are forgotten."""
+        self._submap = lru_cache(UNPACKED)(lambda index: self._held[index].unpack())
         self._accepted: list[tuple[int, int]] = []
         """Earlier and later submap of each accepted closure."""
         self._pending: list[LocalClosure] = []
@@ -185,7 +189,7 @@ class LoopCloser:
         later = len(self.submaps)
         self.submaps.append(anchored)
         self._travel = np.append(self._travel, anchored.travel_m)
-        self._held[later] = submap
+        self._held[later] = PackedSubmap.of(submap)
         is_known = self._forget_surplus(anchors)
         paths = self._paths_from(later)
         candidates = self._candidates(later, anchors, paths)
@@ -241,7 +245,7 @@ class LoopCloser:
 
     def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
         """Search where the drift allowance is wide, then verify; None if the submaps do not show the same place."""
-        a, b = self._held[earlier], self._held[later]
+        a, b = self._submap(earlier), self._submap(later)
         predicted = se2.between(anchors[earlier], anchors[later])
         radius, angle = self._drift_allowance(path_m).tolist()
         guess = predicted
@@ -269,7 +273,7 @@ class LoopCloser:
         if self._recognizer is None:
             return []
         newest = self.submaps[later]
-        self._recognizer.store(newest.keyscan, self._held[later].surface.points)
+        self._recognizer.store(newest.keyscan, self._submap(later).surface.points)
         found = [
             closure
             for earlier in self._lookalikes(self._recognizer, later, anchors, paths)
@@ -301,7 +305,7 @@ class LoopCloser:
         self, earlier: int, later: int, anchors: FloatArray, path_m: float, guess: FloatArray
     ) -> LocalClosure | None:
         """Verify a recognised place; None if it is another one, or if no drift explains where it is."""
-        check = verify(self._held[earlier], self._held[later], guess, VERIFICATION)
+        check = verify(self._submap(earlier), self._submap(later), guess, VERIFICATION)
         innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
         off_m = float(np.hypot(innovation[0], innovation[1]))
         if not (check.loose or check.support) or off_m > RECOGNIZED_DRIFT * path_m:

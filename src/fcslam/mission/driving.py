@@ -113,7 +113,7 @@ def _with_backend_beside(source: Source, config: RobotConfig) -> Iterator[Iterat
     with ExitStack() as stack:
         backend = None
         with suppress(InputError):
-            backend = stack.enter_context(backend_process(source.name, config, is_copy=True))
+            backend = stack.enter_context(backend_process(source.name, config))
         yield legs(source, RobotFrontend(source.name, config, backend))
 
 

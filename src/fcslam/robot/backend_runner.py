@@ -64,23 +64,38 @@ class WorkerBackend:
         return self._executor.submit(_process, self._robot, input)
 
 
-def worker_process(is_copy: bool = False) -> ProcessPoolExecutor:
-    """An executor with one worker, another process with a lower priority than this one; see ``worker_pool``.
+def worker_process() -> ProcessPoolExecutor:
+    """An executor with one worker, another process with a lower priority than this one.
 
     Raises:
         InputError: the host gives processes no semaphores.
     """
-    return worker_pool(_start_worker, is_copy)
+    return worker_pool(_start_worker)
 
 
 @contextmanager
-def backend_process(robot: str, config: SessionConfig, is_copy: bool = False) -> Iterator[WorkerBackend]:
-    """A back end in a process of its own, which ends with this block; ``is_copy`` as in ``worker_pool``."""
-    executor = worker_process(is_copy)
+def copied_worker() -> Iterator[ProcessPoolExecutor]:
+    """A ``worker_process`` that shares the memory of the code loaded so far, until the end of this block.
+
+    It is a copy of this process, made at once: begin this block before threads start, such as those of ROS. Objects
+    that ``gc.freeze`` has frozen before stay shared.
+
+    Raises:
+        InputError: the host gives processes no semaphores.
+    """
+    executor = worker_pool(_start_worker, is_copy=True)
     try:
-        yield WorkerBackend(robot, config, executor)
+        executor.submit(os.getpid).result()
+        yield executor
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def backend_process(robot: str, config: SessionConfig) -> Iterator[WorkerBackend]:
+    """A back end in a process of its own, which ends with this block."""
+    with copied_worker() as executor:
+        yield WorkerBackend(robot, config, executor)
 
 
 _backends: dict[str, RobotBackend] = {}
