@@ -9,12 +9,14 @@
   free cores the wall time includes that of the other process: CPU is that of the front end's thread.
 
 Inline, a pass over mit-csail before compiles (or loads) every kernel and is not counted; live, the warm-up of
-`fcslam robot` does. Memory is the resident set: with
-the reader, the robot and its map inline; of each process live.
+`fcslam robot` does. Memory inline is the resident set, with
+the reader, the robot and its map. Live it is the proportional set of each process: of a page that both share, each
+counts half, so their sum is what both hold. Run it while no other Python program runs, which would share pages too.
 """
 
 import gc
 import os
+import re
 import time
 from collections.abc import Iterator
 from multiprocessing import active_children
@@ -103,7 +105,7 @@ def drive_live(log: Path, rounds: int, back: Any) -> tuple[list[tuple], list[tup
             timed.append(part)
             wall = part[:, 1]
             keyscans = robot.scan_poses[-1].keyscan + 1
-            memory = resident_mb(), resident_mb(worker.pid)
+            memory = proportional_mb(), proportional_mb(worker.pid)
             rows.append((number, len(part), keyscans, wall.mean(), np.percentile(wall, 99), wall.max(), *memory))
     cpu_ms, wall_ms = np.concatenate(timed).T
     return [scan_row("CPU", cpu_ms), scan_row("wall", wall_ms)], rows
@@ -169,6 +171,11 @@ def tenths(cpu_ms: np.ndarray, state: np.ndarray) -> list[tuple]:
 def resident_mb(process: int | str = "self") -> float:
     pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def proportional_mb(process: int | str = "self") -> float:
+    rollup = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii")
+    return sum(map(int, re.findall(r"^Pss:\s+(\d+)", rollup, re.MULTILINE))) * 1024 / 1e6
 
 
 if __name__ == "__main__":
