@@ -2,8 +2,7 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/relations.py
 
-Each `fcslam map` is a process of its own. CPU seconds are user and system, all threads and children; warm runs find
-numba's compiled code in its cache (a run before them is not counted), cold ones compile everything. Errors follow
+Each `fcslam map` has one core, as the peers below. CPU seconds are user and system; warm runs find numba's compiled code in its cache (a run before them is not counted), cold ones compile everything. Errors follow
 Kuemmerle et al. 2009 over all relations; "across robots" are those whose stamps belong to different robots and lie
 more than 20 s apart, and the run of one robot is measured by the very same ones.
 
@@ -12,6 +11,7 @@ more than 20 s apart, and the run of one robot is measured by the very same ones
 This maps each log once, as one robot, with another scan matcher; the report is `relations_karto` and has errors alone.
 """
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--tracker", type=Tracker, choices=list(Tracker), default=Tracker.SURFELS, help="scan matcher")
     chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     if chosen.tracker is not Tracker.SURFELS:
         report_tracker(chosen, folder)
         return

@@ -1,4 +1,4 @@
-"""Cost of the real command beside that of another checkout: CPU, wall time of three robots on all cores, first run.
+"""Cost of the real command beside that of another checkout: CPU, wall time on all cores, first run.
 
     FCSLAM_DATA=/path/to/data python benchmarks/speed.py --against /path/to/checkout
 
@@ -64,10 +64,13 @@ def main() -> None:
             (name, *repeated(lambda checkout, work, log=log: run(checkout, work, log).cpu_s))
             for name, log in logs.items()
         ]
-        wall = repeated(lambda checkout, work: run(checkout, work, logs["intel"], "--split", 3).wall_s)
+        wall = [
+            (name, *repeated(lambda checkout, work, parts=parts: run(checkout, work, logs["intel"], *parts).wall_s))
+            for name, parts in (("one robot", ()), ("three robots", ("--split", 3)))
+        ]
     columns = {"": "", "ours, s": ".2f", "theirs, s": ".2f", "ratio": ".2f"}
     report.table("CPU, one robot", columns, cpu)
-    report.table("Wall time, intel as three robots", columns, [(f"{os.cpu_count()} cores", *wall)])
+    report.table(f"Wall time of intel, {os.cpu_count()} cores", columns, wall)
     report.table("Until the first scan is mapped, nothing compiled", columns, [("intel", *first)])
     report.write()
 
