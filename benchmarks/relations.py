@@ -2,8 +2,8 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/relations.py
 
-Each `fcslam map` has one core, as the peers below. CPU seconds are user and system. Warm runs find numba's compiled code
-in its cache (a run before them is not counted), cold ones compile everything. Errors follow Kuemmerle et al. 2009 over
+Each `fcslam map` has one core, as the peers below. CPU seconds are user and system. Warm runs find numba's compiled
+code in its cache, which a run before them fills, cold ones compile everything. Errors follow Kuemmerle et al. 2009 over
 all relations; "across robots" are those whose stamps belong to different robots and lie more than 20 s apart, and the
 run of one robot is measured by the very same ones.
 
