@@ -34,7 +34,7 @@ BUNDLED_VERSION: Final = "light-723cb7f52404"
 """Its version. A robot without a camera names it and never loads ONNX Runtime."""
 
 MATCHING_SCALES: Final = (1.0, 0.71, 0.5)
-"""Scales at which two views match best. Robots recognise places as well with one scale, in half the time."""
+"""Scales at which two views match best. Robots recognise places as well with one scale, in a third of the time."""
 
 GreyImage = NDArray[np.uint8]
 """Shape (height, width)."""
