@@ -41,7 +41,7 @@ OTHER_PROGRAMS: dict[str, str] = LISTED["other programs"]
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGES_WITH_COMMANDS = [page for page in PAGES if page.name not in {"CHANGELOG.md", "CONTRIBUTING.md", "commands.md"}]
 
-SCANS, LONG_SCANS = 60, 120
+SCANS, LONG_SCANS = 45, 100
 """Of a sample log that the commands get. The long one has relations over 20 s."""
 ANNA, BEN, CLEO, LONG = "anna.clf", "ben.clf", "cleo.clf", "long.clf"
 LOGS = {
