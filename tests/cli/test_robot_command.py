@@ -43,6 +43,12 @@ def log(tmp_path_factory):
     return path
 
 
+@pytest.fixture(autouse=True)
+def same_thread(monkeypatch):
+    """No process beside a robot; tests/test_commands_of_docs.py plays with one."""
+    monkeypatch.setattr("fcslam.live.records.worker_process", SameThread)
+
+
 @pytest.fixture
 def cloud():
     with serving(FakeCloud(correction=4)) as cloud:
