@@ -11,6 +11,7 @@ from hypothesis import settings
 from fcslam.cloud import recognition
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
+from fcslam.features import network_check
 from fcslam.lab.simulation.ground_truth import write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
@@ -63,6 +64,21 @@ def no_wait_for_the_disk():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "_connected", connected)
         patch.setattr("os.fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def networks_tried_once():
+    """A network that ran in a process with limits does so again, so it is not tried once more."""
+    passed = set()
+
+    def try_once(path, run=network_check._try):
+        if (content := path.read_bytes()) not in passed:
+            run(path)
+            passed.add(content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network_check, "_try", try_once)
         yield
 
 
