@@ -11,9 +11,11 @@ from hypothesis import settings
 from fcslam.cloud import recognition
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
+from fcslam.features import network_check
 from fcslam.lab.simulation.ground_truth import write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
+from fcslam.storage import database
 from fcslam.wire.messages import Packet
 from tests import small_fleet
 from tests.postgres import HAS_POSTGRES, WHY_NOT, Server
@@ -47,6 +49,36 @@ def state_home(tmp_path_factory):
     """A folder for the user's state, so that no test writes to the real one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_wait_for_the_disk():
+    """No test cuts the power, so none waits until the disk has what was written."""
+
+    def connected(*arguments, connect=database._connected, **options):
+        connection = connect(*arguments, **options)
+        connection.execute("PRAGMA synchronous=OFF")
+        return connection
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(database, "_connected", connected)
+        patch.setattr("os.fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def networks_tried_once():
+    """A network that ran in a process with limits does so again, so it is not tried once more."""
+    passed = set()
+
+    def try_once(path, run=network_check._try):
+        if (content := path.read_bytes()) not in passed:
+            run(path)
+            passed.add(content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network_check, "_try", try_once)
         yield
 
 

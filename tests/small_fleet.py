@@ -1,6 +1,7 @@
 """A small simulated fleet, what its robots send, and a result as bytes, for the tests of robot, cloud and mission."""
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
 
+@lru_cache
 def draw(robots: int, path_length_m: float = 15.0, seed: int = 1) -> SimulatedFleet:
     lidar = LidarSettings(beams=180, rate_hz=3.0)
     settings = SimulationSettings(robots=robots, path_length_m=path_length_m, lidar=lidar, camera=None)

@@ -1,7 +1,9 @@
 """`fcslam demo`: everything in one command, its own folder replaced, nobody else's touched."""
 
 import csv
+import io
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import cv2
@@ -14,7 +16,7 @@ from fcslam.runs import open_run
 from fcslam.sources import open_source
 from tests.lab.simulation.gl import require_gl
 
-TINY = ["demo", "--robots", "2", "--path-length", "20"]
+TINY = ["demo", "--robots", "2", "--path-length", "12"]
 TINIEST = ["--no-camera", "--robots", "1", "--path-length", "3"]
 
 
@@ -30,20 +32,22 @@ def told(output):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
-    """A demo with LiDARs alone, run twice into one folder, in which something was left in between."""
+    """A demo with LiDARs alone, run twice into one folder, in which something was left in between; and what it said."""
     output = tmp_path_factory.mktemp("shown") / "demo"
     assert run_demo(output, *TINIEST) == 0
     (output / "notes").write_text("mine")
     (output / "recordings" / "stale").write_text("of the first run")
-    assert run_demo(output, "--no-camera") == 0
-    return output
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert run_demo(output, "--no-camera") == 0
+    return output, out.getvalue().splitlines(), err.getvalue().splitlines()
 
 
 @pytest.mark.slow
 def test_it_ends_with_a_run_a_figure_and_a_table(shown):
+    shown, _, _ = shown
     run = open_run(shown / "run")
     assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
-    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 15.0
+    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 10.0
     assert cv2.imread(str(shown / "figure.png")).shape[1] == 2000
     figures = told(shown)
     assert figures["maps"] == 1
@@ -54,22 +58,21 @@ def test_it_ends_with_a_run_a_figure_and_a_table(shown):
 
 @pytest.mark.slow
 def test_it_replaces_itself_and_nothing_else(shown):
+    shown, _, _ = shown
     assert (shown / "notes").read_text() == "mine"
     assert not (shown / "recordings" / "stale").exists()
-    assert "path_length_m: 20.0" in (shown / "recordings" / "simulation.yaml").read_text()
+    assert "path_length_m: 12.0" in (shown / "recordings" / "simulation.yaml").read_text()
 
 
 @pytest.mark.slow
-def test_it_says_where_everything_is(tmp_path, capsys):
-    assert run_demo(tmp_path / "demo", *TINIEST) == 0
-    said = capsys.readouterr()
-    last = said.out.splitlines()[-3:]
-    assert last == [
-        f"run folder: {tmp_path / 'demo' / 'run'}",
-        f"figure: {tmp_path / 'demo' / 'figure.png'}",
-        f"all numbers: {tmp_path / 'demo' / 'evaluation.csv'}",
+def test_it_says_where_everything_is(shown):
+    output, out, err = shown
+    assert out[-3:] == [
+        f"run folder: {output / 'run'}",
+        f"figure: {output / 'figure.png'}",
+        f"all numbers: {output / 'evaluation.csv'}",
     ]
-    assert [line[:6] for line in said.err.splitlines() if " of 4 " in line] == [f"{k} of 4" for k in range(1, 5)]
+    assert [line[:6] for line in err if " of 4 " in line] == [f"{k} of 4" for k in range(1, 5)]
 
 
 def refused(output, capsys, *more):
@@ -89,6 +92,7 @@ def test_what_is_no_demo_is_left_alone(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_without_a_gl_library_one_line_says_what_to_install_and_an_earlier_demo_stays(shown, capsys, monkeypatch):
+    shown, _, _ = shown
     monkeypatch.setattr(engine, "_BACKENDS", ("none",))
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     line = refused(shown, capsys)

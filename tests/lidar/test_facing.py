@@ -115,7 +115,7 @@ def test_without_odometry_nothing_is_compared():
     assert contradicted_facing(replace(scan, T_odom_base=frozen((math.nan,) * 3)) for scan in scans) is None
 
 
-@pytest.mark.parametrize(("turned_deg", "upside_down"), [(180, False), (0, True), (-90, True)])
+@pytest.mark.parametrize(("turned_deg", "upside_down"), [(180, False), (-90, True)])
 def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg, upside_down):
     scans = drive(NARROW)
     path = tmp_path / "wrong.mcap"

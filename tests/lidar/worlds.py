@@ -67,18 +67,26 @@ def ring():
 def ranges(poses, segments, laser=LASER, noise_m=0.0, rng=None):
     """Ranges (N, B) from the base's poses (N, 3); ``max_range_m`` where a ray meets nothing."""
     rays = se2.compose(np.atleast_2d(poses), laser.T_base_laser)
-    angles = rays[:, 2:] + laser.angles_rad()
-    directions = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, :, None, :]
-    start, side = segments[:, :2] - rays[:, None, None, :2], segments[:, 2:] - segments[:, :2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = directions[..., 0] * side[:, 1] - directions[..., 1] * side[:, 0]
-        along = (start[..., 0] * side[:, 1] - start[..., 1] * side[:, 0]) / scale
-        share = (start[..., 0] * directions[..., 1] - start[..., 1] * directions[..., 0]) / scale
-        hit = (along > 0) & (share >= 0) & (share <= 1)
-    found = np.where(hit, along, laser.max_range_m).min(axis=2)
+    found = np.stack([np.minimum(_nearest(ray, segments, laser), laser.max_range_m) for ray in rays])
     if noise_m:
         found = np.where(found < laser.max_range_m, found + rng.normal(0, noise_m, found.shape), found)
     return np.minimum(found, laser.max_range_m).astype(np.float32)
+
+
+def _nearest(ray, segments, laser):
+    """Distance (B,) of the nearest segment from the laser's pose along each beam; infinite where there is none.
+
+    Pose by pose: an array of all poses, beams and segments does not fit into the cache.
+    """
+    angles = ray[2] + laser.angles_rad()
+    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    start, side = segments[:, :2] - ray[:2], segments[:, 2:] - segments[:, :2]
+    scale = directions @ np.stack((side[:, 1], -side[:, 0]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (start[:, 0] * side[:, 1] - start[:, 1] * side[:, 0]) / scale
+        share = (directions @ np.stack((-start[:, 1], start[:, 0]))) / scale
+    hit = (along > 0) & (share >= 0) & (share <= 1)
+    return np.where(hit, along, np.inf).min(axis=1)
 
 
 def scan_at(pose, segments, laser=LASER, noise_m=0.0, rng=None):

@@ -44,19 +44,26 @@ def walk(index, codes):
     vocabulary = index._vocabulary
     tree = vocabulary.tree
     centres = tree.centres.view(np.uint8).reshape(-1, 32)
-    words = []
-    for code in codes:
-        vertex = 0
-        while tree.child_count[vertex]:
+    vertices = np.zeros(len(codes), np.int64)
+    while tree.child_count[vertices].any():
+        for vertex in np.unique(vertices[tree.child_count[vertices] > 0]):
+            here = np.flatnonzero(vertices == vertex)
             children = np.arange(tree.first_child[vertex], tree.first_child[vertex] + tree.child_count[vertex])
-            vertex = children[np.bitwise_count(centres[children] ^ code).sum(axis=1, dtype=int).argmin()]
-        words.append(vocabulary.words[vertex])
-    return np.array(words, np.int64)
+            apart = np.bitwise_count(centres[children] ^ codes[here, None]).sum(axis=2, dtype=int)
+            vertices[here] = children[apart.argmin(axis=1)]
+    return vocabulary.words[vertices].astype(np.int64)
+
+
+def walks(index, places):
+    """The words of each place."""
+    ends = np.cumsum([len(place) for place in places.values()], dtype=int)
+    found = walk(index, np.concatenate([EMPTY, *places.values()]))
+    return dict(zip(places, np.split(found, ends)[:-1], strict=True))
 
 
 def words_oracle(index, places, query):
     """Eq. (4) on [0, 1] of the query with every place, with document frequencies counted again."""
-    words = {number: walk(index, place) for number, place in places.items()}
+    words = walks(index, places)
     own = walk(index, query)
     top = max(int(w.max(initial=0)) for w in (*words.values(), own)) + 1
     documents = np.zeros(top)
@@ -81,7 +88,7 @@ def matches_oracle(places, query, near_bits):
 def check_stored(index, places):
     """Words, document frequencies and norms are those of a description from scratch."""
     entries = index._postings.entries
-    words = {number: walk(index, place) for number, place in places.items()}
+    words = walks(index, places)
     assert set(words) == set(index._row_of)
     sizes, documents = {}, {}
     for number, of_place in words.items():

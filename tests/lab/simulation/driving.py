@@ -17,6 +17,9 @@ def distances(points, segments):
     """Distance of every point from its nearest segment, shape (N,)."""
     a, b = segments[:, :2], segments[:, 2:]
     along = b - a
-    share = np.einsum("nsk,sk->ns", points[:, None] - a, along) / np.sum(along**2, axis=1)
-    nearest = a + np.clip(share, 0.0, 1.0)[..., None] * along
-    return np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1)
+    found = np.empty(len(points))
+    for k, point in enumerate(points):  # an array of all points and segments does not fit into the cache
+        share = np.sum((point - a) * along, axis=1) / np.sum(along**2, axis=1)
+        off = a + np.clip(share, 0.0, 1.0)[:, None] * along - point
+        found[k] = np.hypot(off[:, 0], off[:, 1]).min()
+    return found

@@ -42,9 +42,9 @@ def route_of(seed, building=Building.DEFAULT, length_m=60.0):
 def test_robots_touch_nothing_wherever_furniture_stands(building):
     rng = np.random.default_rng(0)
     plan = draw_floor_plan(rng, building)
-    for goals in draw_goals(plan, 3, 60.0, rng):
+    for goals in draw_goals(plan, 3, 30.0, rng):
         moved = move_furniture(plan, 0.5, rng)
-        _, poses = drive(plan_route(moved, goals, 60.0, rng), 0.2)
+        _, poses = drive(plan_route(moved, goals, 30.0, rng), 0.2)
         assert distances(poses[:, :2], moved.segments).min() > ROBOT_RADIUS_M
 
 
