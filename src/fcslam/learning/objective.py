@@ -10,10 +10,10 @@ from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
 from fcslam.learning.batches import TrainingBatch
-from fcslam.learning.localization import localization_loss
 from fcslam.learning.network import Description, Maps, sample_codes
 from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import Encoder, LossSettings
+from fcslam.learning.subpixel_loss import localization_loss
 
 MIN_NEGATIVE_DISTANCE_PX = 8.0
 """Points closer to a match than this are not negatives, because their codes should be similar."""
