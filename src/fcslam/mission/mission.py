@@ -194,7 +194,7 @@ class MissionCloud:
         """Take over the state after all packets of the earlier mission, so that they need not be applied again.
 
         Args:
-            first: the first packet of the new ones; None: there are none.
+            first: the first packet of the new ones; None if no packets were added.
 
         Returns:
             Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.

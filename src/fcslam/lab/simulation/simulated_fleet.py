@@ -117,7 +117,7 @@ class SimulationSettings(Settings):
     )
     lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
     drift: OdometryNoiseSettings | None = Field(
-        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: there is none"
+        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: robots record no odometry"
     )
     camera: CameraSettings | None = CameraSettings()
 

@@ -306,7 +306,7 @@ def _or_404() -> Iterator[None]:
 def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
     """The closure with this channel, robot and stamp of i, robot and stamp of j.
 
-    Refuses (HTTPException 404): there is none.
+    Refuses (HTTPException 404): the run has no such closure.
     """
     for c in run.closures:
         if named == (c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j):
@@ -317,7 +317,7 @@ def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
 def _folder_of(state: ViewerState) -> Path:
     """The run folder as it is now.
 
-    Refuses (HTTPException 404): there is none yet.
+    Refuses (HTTPException 404): no run folder is written yet.
     """
     folder = state.mission.run_folder
     if folder is None:
@@ -332,7 +332,7 @@ def _file(state: ViewerState, name: str, media_type: str) -> FileResponse:
 def _existing(state: ViewerState, name: str) -> Path:
     """A file of the run folder.
 
-    Refuses (HTTPException 404): there is none.
+    Refuses (HTTPException 404): the file is missing or cannot be read.
     """
     folder = _folder_of(state)
     try:
