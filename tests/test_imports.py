@@ -28,7 +28,6 @@ ROOMS = [
     "sources",
     "graph",
     "lidar",
-    "cluster",
     "features",
     "maps",
     "places",
