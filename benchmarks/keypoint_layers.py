@@ -8,7 +8,7 @@ Every arm has the cross entropy to the bundled network's own probabilities, and 
 
 - agreement: the keypoint maps of both views agree in windows (`agreement_loss` in `learning/losses.py`)
 - localization: keypoints of both views that are mutual nearest neighbours within 2.5 px lie, by the parabola through
-  each peak, at the same point (`localization_loss` in `learning/subpixel_loss.py`)
+  each peak, at the same point (`localization_loss` in `benchmarks/subpixel_loss.py`)
 - both
 
 Measured on 25 pairs of photographs of other places (corrected, NMS 8 px; needs FCSLAM_DATA), and in the unseen
@@ -37,6 +37,7 @@ from closure_learning import (
     photograph_rows,
     recorded,
 )
+from subpixel_loss import localization_loss
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK
@@ -53,7 +54,6 @@ from fcslam.learning.network import cell_probabilities
 from fcslam.learning.objective import grid_shift, shift_grid, views_aligned
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.subpixel_loss import localization_loss
 from fcslam.learning.trainer import ExecutionOptions
 
 PHOTOGRAPHS = ("bsds500", "coco_subset", "sun_hays80", "openimages_doors")

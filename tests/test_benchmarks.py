@@ -29,6 +29,7 @@ SHARED = (
     "vocabulary_growth",
     "wall_tags",
     "relation_closures",
+    "subpixel_loss",
 )
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
