@@ -26,7 +26,6 @@ SHARED = (
     "map_search",
     "processes",
     "training_fleet",
-    "vocabulary_growth",
     "wall_tags",
     "relation_closures",
     "subpixel_loss",

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.metrics.bootstrap import measure_interval
-from fcslam.metrics.retrieval import (
+from benchmarks.place_recognition.retrieval import (
     PairTruth,
     mismatches,
     multi_match_curve,
@@ -17,6 +16,7 @@ from fcslam.metrics.retrieval import (
     significance,
     single_best,
 )
+from fcslam.metrics.bootstrap import measure_interval
 
 MATCH, DIFFERENT, IGNORED = 1, -1, 0
 

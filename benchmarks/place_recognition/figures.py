@@ -7,7 +7,8 @@ from typing import Any, Final
 import numpy as np
 
 from fcslam.errors import OutputError
-from fcslam.lab.evaluation.places.report import SetResult
+
+from .report import SetResult
 
 COLOURS: Final = (
     "#000000",

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.vocabulary_growth import (
+from benchmarks.place_recognition.features import choose_features, describe_sets
+from benchmarks.place_recognition.growth import (
     BATCH,
     MEASURES,
     ahead_of,
@@ -12,10 +13,9 @@ from benchmarks.vocabulary_growth import (
     group_measures,
     grow_vocabulary,
 )
-from fcslam.lab.evaluation.places.features import choose_features, describe_sets
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
-from tests.lab.evaluation import place_folders
+from tests.place_recognition import place_folders
 
 GROUPS, SEED = 12, 3
 
