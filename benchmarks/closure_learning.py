@@ -47,7 +47,6 @@ from federated_study.mapped_drives import MappedDrive, map_drives
 from federated_study.poison import PoisonedClient
 from matplotlib.figure import Figure
 from place_recognition.retrieval import PairTruth, multi_match_curve
-from place_recognition.simulated_views import EVERY_M, EVERY_RAD
 
 from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
@@ -88,6 +87,7 @@ from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan
 from fcslam.robot.frontend import RobotConfig
+from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.sources import Recording
 
 TRAIN, TEST, SEEDS = tuple(range(301, 311)), tuple(range(411, 421)), (1, 2, 3)

@@ -170,10 +170,8 @@ def _speed(text: str) -> float | None:
 def _check_name(name: str) -> None:
     from fcslam.cloud.sessions import check_robot
     from fcslam.errors import PacketError, SourceError
-    from fcslam.wire.checks import check_name
 
     try:
-        check_name(name, "robot")
         check_robot(name)
     except PacketError as error:
         raise SourceError(f"{error}; give another one: NAME=LOG") from error

@@ -53,7 +53,6 @@ class RobotLearningSettings(Settings):
     time_s: float = Field(
         default=14_400.0, gt=0.0, description="time after the drive for which a recorded robot stays to learn [s]"
     )
-    most_keyframes: int = Field(default=400, ge=2, description="newest keyframes that are compared with one another")
     held_out: HeldOutSettings = Field(
         default_factory=HeldOutSettings, description="keyframes that the robot never trains on"
     )
