@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.place_recognition.report import measure_interval
 from benchmarks.place_recognition.retrieval import (
     PairTruth,
     mismatches,
@@ -16,7 +17,6 @@ from benchmarks.place_recognition.retrieval import (
     significance,
     single_best,
 )
-from fcslam.metrics.bootstrap import measure_interval
 
 MATCH, DIFFERENT, IGNORED = 1, -1, 0
 

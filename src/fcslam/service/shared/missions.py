@@ -1,6 +1,5 @@
 """The missions of a store, as each of its instances serves all of them."""
 
-import logging
 import math
 import secrets
 import shutil
@@ -38,8 +37,6 @@ _SEEN: Final = "seen"
 
 _JOINT_LOOK_S: Final = 1.0
 """Between two looks for joint maps that a worker elsewhere shared."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
