@@ -14,8 +14,8 @@ from typing import Any
 
 import common
 import numpy as np
+from g2o_files import read_g2o
 
-from fcslam.graph.g2o import read_g2o
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import PoseGraph

@@ -36,13 +36,13 @@ from pathlib import Path
 import common
 import gtsam
 import numpy as np
+from g2o_files import read_g2o
 from numpy.random import Generator
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.consistency import PROBABILITY, ConsistencySettings
 from fcslam.graph.factors import FactorCache, from_values, to_values
-from fcslam.graph.g2o import read_g2o
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.joint import JointEvidence, solve_jointly
 from fcslam.graph.optimizer import Solution, SolveStats, optimize, optimize_gnc
