@@ -80,7 +80,7 @@ _SHAPES = TypeAdapter(list[MapShape])
 
 
 def fleet_router(state: ViewerState) -> APIRouter:
-    """Robots, closures and vocabularies."""
+    """Robots, closures, edits and learning."""
     router = APIRouter(
         tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503, 507)
     )
@@ -144,13 +144,6 @@ def fleet_router(state: ViewerState) -> APIRouter:
     def get_learning() -> list[LearningRound]:
         """The rounds of the federated training, oldest first; none if the service knows of no training."""
         return [] if state.learning is None else read_rounds(state.learning)
-
-    @router.get("/vocabulary")
-    def get_vocabulary() -> dict[str, float]:
-        """Words by channel and detector version."""
-        prefix = "words_"
-        metrics = run_of(state.mission).metrics
-        return {name.removeprefix(prefix): m.value for name, m in metrics.items() if name.startswith(prefix)}
 
     return router
 
