@@ -25,7 +25,7 @@ HAS_BROWSER := $(BIN)/python -c "import playwright, shutil, sys; sys.exit(not sh
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 HAS_MKDOCS := $(BIN)/python -c "import material, mkdocs, mkdocstrings_handlers.python" 2>/dev/null
-HAS_SCALE := $(BIN)/python -c "import psycopg" 2>/dev/null
+HAS_SCALE := $(BIN)/python -c "import distributed, psycopg" 2>/dev/null
 HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
 # One worker per core. Workers share cores, so a library that starts its own threads gains nothing and slows the others.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
@@ -47,7 +47,7 @@ help:
 	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
 	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
 	@echo "make browser-test install a browser for the tests of the page, if permitted"
-	@echo "make scale-test   install what tests of several instances need, and run them"
+	@echo "make scale-test   install what tests of a cluster and of several instances need, and run them"
 	@echo "make check        linter, formatting, types, spelling"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
@@ -126,15 +126,15 @@ browser-test: $(INSTALLED)
 	@test -e $(VENV)/axe/package/axe.min.js || { mkdir -p $(VENV)/axe && cd $(VENV)/axe && npm pack --silent $(AXE) >/dev/null 2>&1 && \
 	    tar xzf axe-core-*.tgz package/axe.min.js; } || echo "No axe-core from npm, so accessibility is not tested."
 
-# Without PostgreSQL the tests of a store that instances share are skipped.
+# Without Dask the tests of a cluster are skipped, without PostgreSQL those of a store that instances share.
 scale-test: $(INSTALLED)
-	@$(HAS_SCALE) || $(PIP) -e ".[$(EXTRAS),postgres]" || echo "No psycopg for this Python."
+	@$(HAS_SCALE) || $(PIP) -e ".[$(EXTRAS),distributed,postgres]" || echo "No Dask or no psycopg for this Python."
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { \
 	    echo "Installing PostgreSQL for the tests of several instances."; \
 	    $(AS_ROOT) true 2>/dev/null && command -v apt-get >/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends postgresql; } >/dev/null 2>&1 || \
 	    echo "No PostgreSQL. To have it: sudo apt-get install postgresql"; \
 	}
-	@$(PYTEST) -rs tests/service/shared tests/mission/test_mission_store.py tests/cli/test_serve_shared.py tests/test_scale_page.py
+	@$(PYTEST) -rs tests/cluster tests/service/shared tests/mission/test_mission_store.py tests/cli/test_serve_shared.py tests/test_scale_page.py
 
 fuzz: $(INSTALLED)
 	@folder=$$(mktemp -d) && trap 'rm -r "$$folder"' EXIT && \

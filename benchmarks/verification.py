@@ -1,20 +1,25 @@
 """Verification of closures on a pool of processes: 10,000 pairs, one process against two.
 
-    python benchmarks/verification.py [--pairs 10000]
+    python benchmarks/verification.py [--pairs 10000] [--dask 2]
 
 The pairs are those that a mission of simulated robots in one building compares, again and again until they are enough.
 A call has as many as there are places to compare while the fleet is small (`fleet.matcher.small_fleet`), or all. One
-process is this one; of two, this one and another share the pairs. Both are started and have loaded their code before
-the clock runs. Wall-clock time: the machine must be quiet. The last column needs no quiet machine: CPU of one process,
-against that of the busiest.
+process is this one; of two, this one and another share the pairs. Dask's local workers are processes of this machine
+beside it. All of them are started and have loaded their code before the clock runs. Wall-clock time: the machine must
+be quiet. The last column needs no quiet machine: CPU of one process, against that of the busiest.
 """
 
 import itertools
+import json
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from multiprocessing import get_context
+from pathlib import Path
 
 import common
 
@@ -34,16 +39,18 @@ def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--pairs", type=int, default=10_000, help="number of pairs")
     parser.add_argument("--processes", nargs="+", type=int, default=[2], help="numbers of processes")
+    parser.add_argument("--dask", nargs="*", type=int, default=[2], help="numbers of Dask's local workers")
     chosen = parser.parse_args()
     from fcslam.lidar.pair_verification import VerificationPool, verify_here
 
     report = common.Report(__file__, __doc__, chosen)
     setups = [("1", pool(0)), *((f"{count}", pool(count - 1)) for count in chosen.processes)]
+    setups += [(f"1 and {count} of Dask", dask(count)) for count in chosen.dask]
     batches, rows, alone, expected = compared(chosen.pairs), [], {}, []
     at_once = {AT_ONCE: batches, chosen.pairs: [list(itertools.chain.from_iterable(batches))]}
     for name, setup in setups:
         with setup as executors:
-            verify = VerificationPool(executors) if executors else verify_here
+            verify = VerificationPool(lambda executors=executors: executors) if executors else verify_here
             timed(verify, executors, batches[:8])
             for count, calls in at_once.items():
                 took_s, cpu_s, found = timed(verify, executors, calls)
@@ -62,6 +69,33 @@ def pool(count: int) -> Iterator[Sequence[Executor]]:
     """Processes beside this one."""
     with ExitStack() as stack:
         yield [stack.enter_context(ProcessPoolExecutor(1, get_context("spawn"))) for _ in range(count)]
+
+
+@contextmanager
+def dask(count: int) -> Iterator[Sequence[Executor]]:
+    """Workers of a cluster on this machine, each a process as the scheduler is."""
+    from fcslam.cluster.dask_cluster import DaskCluster
+    from fcslam.cluster.workers import Workers
+
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        file = Path(folder) / "scheduler.json"
+        where = ("--no-dashboard", "--scheduler-file", str(file))
+        _start(stack, "scheduler", "--host", "127.0.0.1", "--port", "0", *where)
+        while not file.exists():
+            time.sleep(0.1)
+        for _ in range(count):
+            _start(stack, "worker", "--nthreads", "1", "--local-directory", folder, *where)
+        time.sleep(5.0)
+        with DaskCluster(Workers(json.loads(file.read_text())["address"])) as cluster:
+            while len(cluster.executors()) < count:
+                time.sleep(0.1)
+            yield cluster.executors()
+
+
+def _start(stack: ExitStack, kind: str, *options: str) -> None:
+    command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options]
+    process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+    stack.callback(process.terminate)
 
 
 def compared(count: int) -> list[list]:

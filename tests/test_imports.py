@@ -28,6 +28,7 @@ ROOMS = [
     "sources",
     "graph",
     "lidar",
+    "cluster",
     "features",
     "maps",
     "places",

@@ -7,8 +7,9 @@ from multiprocessing import synchronize
 
 import pytest
 
+from fcslam.cluster.verifying import verifying
+from fcslam.cluster.workers import Workers
 from fcslam.errors import InputError
-from fcslam.lidar.pair_verification import verifying
 from fcslam.mission.driving import side_by_side
 from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.frontend import RobotConfig
@@ -28,7 +29,7 @@ def no_semaphores(monkeypatch):
 
 
 def verify():
-    with verifying(2):
+    with verifying(Workers("2")):
         pass
 
 

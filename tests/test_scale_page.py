@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.cluster.clusters import needs_dask
 from tests.postgres import HAS_POSTGRES, OWNER, PROGRAMS, WHY_NOT
 from tests.test_docs import ROOT
 
@@ -35,6 +36,7 @@ def commands() -> list[str]:
 
 @pytest.mark.system
 @pytest.mark.slow
+@needs_dask
 @pytest.mark.skipif(not HAS_POSTGRES, reason=WHY_NOT)
 def test_the_commands_of_the_page_start_three_instances_that_survive_a_kill():
     with tempfile.TemporaryDirectory(prefix="fcslam-scale-") as place:
@@ -45,9 +47,12 @@ def run_page(folder):
     folder.chmod(0o755)  # the database's user must reach its folder
     programs = folder / "bin"
     programs.mkdir()
-    (programs / "fcslam").write_text(
-        f"#!/bin/sh\nexec {sys.executable} -c 'from fcslam.cli import main; raise SystemExit(main())' \"$@\"\n"
-    )
+    for name in ("fcslam", "dask"):
+        module = "fcslam.cli" if name == "fcslam" else "dask.__main__"
+        shim = programs / name
+        shim.write_text(
+            f"#!/bin/sh\nexec {sys.executable} -c 'from {module} import main; raise SystemExit(main())' \"$@\"\n"
+        )
     for name in ("initdb", "pg_ctl", "createdb"):
         program = f"{PROGRAMS}/{name}"
         text = SHIM.format(owner=OWNER, program=program) if os.getuid() == 0 else f'#!/bin/sh\nexec {program} "$@"\n'
@@ -58,7 +63,7 @@ def run_page(folder):
     environment = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
     script = "set -e\n" + "\n".join(commands())
     log = folder / "shell.log"
-    with log.open("wb") as output:  # a pipe would stay open as long as what the page leaves running
+    with log.open("wb") as output:  # a pipe would stay open as long as Dask, which the page leaves running
         shell = subprocess.Popen(
             ["bash", "-c", script], cwd=folder, env=environment, stdout=output, stderr=output, start_new_session=True
         )

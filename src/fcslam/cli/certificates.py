@@ -23,13 +23,19 @@ def certificates(
     admin: Annotated[
         list[str] | None, typer.Option(help="Name of a user who may also manage missions. Can be repeated.")
     ] = None,
+    cluster: Annotated[
+        bool,
+        typer.Option(
+            "--cluster", help="Also make an authority and a certificate for a Dask cluster, see `fcslam map --workers`."
+        ),
+    ] = False,
 ) -> None:
     """Make a certificate authority, certificates of the service and of robots, and tokens for robots and users."""
     import datetime
 
     from fcslam.cloud.sessions import check_robot
     from fcslam.errors import InputError, PacketError
-    from fcslam.service.credentials import folder_of, make_credentials
+    from fcslam.service.credentials import folder_of, make_cluster_credentials, make_credentials
     from fcslam.service.http.authentication import Role
     from fcslam.wire.checks import check_name
 
@@ -43,8 +49,14 @@ def certificates(
             check_robot(name)
         except PacketError as error:
             raise InputError(str(error)) from error
-    make_credentials(output, host or [], dict(names), datetime.datetime.now(datetime.UTC))
+    now = datetime.datetime.now(datetime.UTC)
+    make_credentials(output, host or [], dict(names), now)
+    if cluster:
+        make_cluster_credentials(output, now)
     typer.echo(f"authority, for all clients: {output / 'ca.pem'}")
     typer.echo(f"for the service: {output / 'cloud.pem'}, {output / 'cloud.key'}, {output / 'tokens.yaml'}")
     for name, role in names:
         typer.echo(f"for {role} {name}: {folder_of(output, name, role)}")
+    if cluster:
+        stem = output / "cluster"
+        typer.echo(f"for a cluster, robots excepted: {stem / 'ca.pem'}, {stem / 'member.pem'}, {stem / 'member.key'}")

@@ -108,14 +108,15 @@ def map_recordings(
     live: Live = False,
     force: Force = False,
     quiet: Quiet = False,
-    workers: WorkersOption = 1,
+    workers: WorkersOption = "1",
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
         from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import split_recordings
+        from fcslam.cluster.verifying import verifying
+        from fcslam.cluster.workers import Workers
         from fcslam.errors import InputError
-        from fcslam.lidar.pair_verification import verifying
         from fcslam.mission.mission import Beginning, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
@@ -133,7 +134,8 @@ def map_recordings(
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
-    with verifying(workers) as verify, live_page(output) if live else nullcontext() as page:
+    chosen = Workers(workers)
+    with verifying(chosen) as verify, live_page(output) if live else nullcontext() as page:
         beginning = Beginning(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
         map_sources(sources, settings, beginning, output, notices(quiet), force, page)
 

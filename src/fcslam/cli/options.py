@@ -19,14 +19,15 @@ PathLength = Annotated[
 ]
 NoCamera = Annotated[bool, typer.Option("--no-camera", help="Simulate LiDARs only. This needs no GL library.")]
 
+_WORKERS = "Workers"
 WorkersOption = Annotated[
-    int,
+    str,
     typer.Option(
         "--workers",
-        min=1,
-        max=256,
-        metavar="N",
-        help="Processes that verify closures, this one included. The result is the same.",
+        metavar="N|ADDRESS",
+        help="Processes that verify closures, this one included, or the Dask scheduler of a cluster: "
+        "tls://HOST:PORT or tcp://HOST:PORT, with the certificates of Dask's configuration. The result is the same.",
+        rich_help_panel=_WORKERS,
     ),
 ]
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from fcslam.cloud.settings import CloudConfig
+    from fcslam.cluster.workers import Workers
     from fcslam.service.http.authentication import Authenticator
     from fcslam.service.http.state import ServiceState
 
@@ -70,7 +71,7 @@ def serve(
             rich_help_panel=_INSTANCES,
         ),
     ] = None,
-    workers: WorkersOption = 1,
+    workers: WorkersOption = "1",
 ) -> None:
     """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
     import gc
@@ -78,6 +79,8 @@ def serve(
 
     from fcslam.cli.serve_learning import learning_plan, learning_process
     from fcslam.cli.shared_service import shared_state
+    from fcslam.cluster.verifying import verifying
+    from fcslam.cluster.workers import Workers
     from fcslam.page.routes import page_router, report_router
     from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.app import create_app
@@ -89,6 +92,11 @@ def serve(
     check_tls(certificate, key, client_ca)
     if tokens is None and client_ca is None and not insecure:
         _check_open(host, credentials)
+    chosen = Workers(workers)
+    chosen.check()
+    if chosen.is_cluster:
+        with verifying(chosen):  # refused here, not by the worker of each mission
+            pass
     plan = learning_plan(learn, data, store)
     keep_private()
     keep_memory_trimmed()
@@ -96,9 +104,9 @@ def serve(
     with ExitStack() as stack, listen(host, port) as listening:
         authenticator, given = _authenticator(tokens, client_ca), mission_config(config).cloud
         if store is None:
-            state = _state(data, authenticator, given, workers)
+            state = _state(data, authenticator, given, chosen)
         else:
-            state = shared_state(store, listening.getsockname()[1], data, authenticator, given, workers)
+            state = shared_state(store, listening.getsockname()[1], data, authenticator, given, chosen)
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
@@ -201,7 +209,7 @@ def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
     signal.signal(signal.SIGHUP, reload)
 
 
-def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", workers: int) -> "ServiceState":
+def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", workers: "Workers") -> "ServiceState":
     import sys
     import time
 
@@ -213,7 +221,7 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", wo
     from fcslam.service.supervisor import Supervisor
 
     events = EventStream()
-    command = (sys.executable, "-m", "fcslam.service.worker", "--workers", str(workers))
+    command = (sys.executable, "-m", "fcslam.service.worker", *workers.options())
     missions = Missions(
         data,
         config,

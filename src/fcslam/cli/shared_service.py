@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fcslam.cloud.settings import CloudConfig
+from fcslam.cluster.workers import Workers
 from fcslam.errors import ServiceError
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.http.events import EventStreams
@@ -36,7 +37,7 @@ LONGEST_HOST = 58
 
 
 def shared_state(
-    store: str, port: int, data: Path, authenticator: "Authenticator", config: CloudConfig, workers: int
+    store: str, port: int, data: Path, authenticator: "Authenticator", config: CloudConfig, workers: Workers
 ) -> ServiceState:
     """The state of an instance of the store; who closes its missions closes all that it holds.
 
@@ -60,7 +61,7 @@ def shared_state(
         def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
             folder = MissionFolder(data / "missions" / mission.name)
             folder.path.mkdir(parents=True, exist_ok=True)
-            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), "--workers", str(workers))
+            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), *workers.options())
             return Supervisor(folder.path, time.monotonic, _ignore, options, spares.start)
 
         missions: SharedMissions

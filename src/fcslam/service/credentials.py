@@ -5,6 +5,7 @@ cloud.pem, cloud.key    the cloud's certificate
 tokens.yaml             name, role and SHA-256 of every token: for the cloud
 robots/<name>/          what a robot gets: ca.pem, its token, and a certificate that a service may take instead
 users/<name>/           what a viewer or admin gets: ca.pem and a token
+cluster/                an authority of its own, and the certificate of a cluster's scheduler, workers and clients
 """
 
 import datetime
@@ -63,6 +64,23 @@ def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Rol
 def folder_of(folder: Path, name: str, role: Role) -> Path:
     """What a robot or a user gets of a folder of credentials."""
     return folder / ("robots" if role is Role.ROBOT else "users") / name
+
+
+def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
+    """Make what a cluster needs for TLS, in the folder ``cluster``; its authority stays if it is there.
+
+    Whoever has a certificate of this authority can run programs on the whole cluster, so it signs no robot's.
+
+    Raises:
+        OutputError: the folder cannot be used, or what is in it cannot be read.
+    """
+    cluster = folder / "cluster"
+    try:
+        cluster.mkdir(parents=True, exist_ok=True)
+        purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        _make_leaf(cluster / "member", "fcslam cluster", purposes, (), _authority(cluster, now), now)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{cluster}: cannot write credentials ({error}); name a new folder") from error
 
 
 def _authority(folder: Path, now: datetime.datetime) -> Authority:

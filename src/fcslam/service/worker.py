@@ -4,7 +4,7 @@ It reads the store by turn and keeps the fleet in memory. It writes its results 
 live run folder, and the run folders that users request. From time to time it also writes its state. If it is killed,
 the next worker continues from that state, or from turn 0, and reports nothing new before it has caught up.
 
-    python -m fcslam.service.worker [--workers N] [--store ... --lease MISSION FENCE] MISSION_FOLDER
+    python -m fcslam.service.worker [--workers ...] [--store ... --lease MISSION FENCE] MISSION_FOLDER
     python -m fcslam.service.worker --spare
 
 A spare worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
@@ -41,9 +41,11 @@ from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
+from fcslam.cluster.verifying import verifying
+from fcslam.cluster.workers import Workers
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
-from fcslam.lidar.pair_verification import VerifyPairs, verify_here, verifying
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.processes import RecurringTask, Start, start_copy, trim_memory
 from fcslam.records import Edit
@@ -517,7 +519,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     chosen = _chosen(arguments)
     folder, alone = chosen.folder, _alone(chosen.folder)
-    with verifying(chosen.workers) as verify_pairs, _mission(chosen) as (store, share):
+    with verifying(chosen.workers, must_connect=False) as verify_pairs, _mission(chosen) as (store, share):
         try:
             worker = Worker(folder, store, time.monotonic, tell, start_copy, verify_pairs, share)
             tell(READY, 0)
@@ -559,8 +561,7 @@ def _mission(chosen: "_Chosen") -> Iterator[tuple[MissionStore, Share]]:
 
 class _Chosen(NamedTuple):
     folder: MissionFolder
-    workers: int
-    """Processes that verify closures, this one included."""
+    workers: Workers
     store: str | None
     lease: Lease | None
 
@@ -575,10 +576,10 @@ def _chosen(arguments: Sequence[str]) -> _Chosen:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--store")
     parser.add_argument("--lease", type=int, nargs=2, metavar=("MISSION", "FENCE"))
-    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--workers", default=Workers().where)
     given = parser.parse_args(arguments)
-    lease = Lease(*given.lease) if given.lease else None
-    return _Chosen(MissionFolder(given.folder), given.workers, given.store, lease)
+    workers = Workers(given.workers)
+    return _Chosen(MissionFolder(given.folder), workers, given.store, Lease(*given.lease) if given.lease else None)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:

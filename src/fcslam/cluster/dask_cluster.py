@@ -1,0 +1,321 @@
+"""The workers of a Dask cluster as executors: those that compute, bit by bit, what this process computes.
+
+Everything of Dask runs on one thread of its own. It follows the cluster: workers that join are checked before they get
+work, and a scheduler that went away is looked for until it is back. Nobody waits for that.
+"""
+
+import asyncio
+import hashlib
+import logging
+import ssl
+import threading
+from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import Executor, Future
+from functools import cache
+from importlib.metadata import version
+from typing import Any, Final, NamedTuple, Self, TypeVar
+
+import numpy as np
+
+import fcslam
+from fcslam.cluster.workers import Workers
+from fcslam.errors import InputError
+from fcslam.lidar.pair_verification import align_batch
+from fcslam.lidar.scan import point_scan
+from fcslam.lidar.submap import build_submap
+from fcslam.lidar.submap_bytes import submap_bytes
+from fcslam.records import LaserModel
+from fcslam.storage.state_file import code_version
+
+CONNECT_S: Final = 10.0
+"""Longest wait for the scheduler."""
+ANSWER_S: Final = 5.0
+"""Longest wait for a scheduler that answered before."""
+CHECK_S: Final = 120.0
+"""Longest wait for the check of a worker, which compiles its code first."""
+LOOK_EVERY_S: Final = 1.0
+"""Between two looks at which workers there are, and for a scheduler that went away."""
+
+_log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class DaskCluster:
+    """A connection to a cluster; a context."""
+
+    def __init__(self, workers: Workers, must_connect: bool = True) -> None:
+        """Connect, and check all workers.
+
+        Raises:
+            InputError: there is no Dask. With ``must_connect`` also: there is no cluster, it has no worker, or one of
+                them is refused.
+        """
+        try:
+            import distributed  # noqa: F401
+        except ImportError as error:
+            raise InputError(
+                f"{workers.where}: needs Dask; install it: pip install 'fcslam[distributed]' ({error})"
+            ) from error
+        _quiet()
+        self._workers = workers
+        self._client: Any = None
+        self._executors: dict[str, DaskWorker] = {}
+        """By address, of the workers that passed the check."""
+        self._refused: set[str] = set()
+        """Addresses of workers that did not."""
+        self._is_gone = False
+        self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(_note)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="dask cluster", daemon=True)
+        self._thread.start()
+        try:
+            self._run(self._begin(must_connect))
+        except BaseException:
+            self._end()
+            raise
+        self._following = asyncio.run_coroutine_threadsafe(self._follow(), self._loop)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._following.cancel()
+        self._end()
+
+    def executors(self) -> "Sequence[DaskWorker]":
+        """The workers that take batches now."""
+        return list(self._executors.values())
+
+    def submit(self, address: str, function: Callable[..., T], arguments: Sequence[Any]) -> "Future[T]":
+        """Run a function on one worker."""
+        return asyncio.run_coroutine_threadsafe(self._compute(address, function, arguments), self._loop)
+
+    async def _compute(self, address: str, function: Callable[..., T], arguments: Sequence[Any]) -> T:
+        client = self._client
+        if client is None:
+            raise ConnectionError("the cluster does not answer any more")
+        # Not pure: Dask would look for a result of the same arguments, and hash all of them.
+        future = client.submit(function, *arguments, workers=[address], pure=False)
+        try:
+            result: T = await future
+        finally:
+            future.release()
+        return result
+
+    async def _begin(self, must_connect: bool) -> None:
+        try:
+            await self._connect()
+            await self._look(must_connect)
+        except InputError:
+            if must_connect:
+                raise
+        except Exception as error:
+            await self._disconnect()
+            if must_connect:
+                raise InputError(
+                    f"{self._workers.where}: no Dask scheduler answers ({_text(error)}); start one: dask scheduler"
+                ) from error
+        if must_connect and not self._executors:
+            raise InputError(f"{self._workers.where}: the cluster has no worker; start one: dask worker ADDRESS")
+        if not self._executors:
+            self._warn("no worker of it answers")
+
+    async def _follow(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_EVERY_S)
+            try:
+                if self._client is None:
+                    await self._connect()
+                elif self._client.status != "running":
+                    raise ConnectionError("the scheduler closed the connection")
+                await self._look(must_fit=False)
+            except Exception as error:
+                self._executors = {}
+                await self._disconnect()
+                self._warn(_text(error))
+            else:
+                if self._executors and self._is_gone:
+                    self._is_gone = False
+                    _log.info("the cluster %s is back", self._workers.where)
+                elif not self._executors:
+                    self._warn("it has no worker")
+
+    def _warn(self, reason: str) -> None:
+        """Say once that it is gone, until it is back."""
+        if not self._is_gone:
+            _log.warning(
+                "the cluster %s is gone (%s); this process verifies closures alone, which is slower",
+                self._workers.where,
+                reason,
+            )
+        self._is_gone = True
+
+    async def _connect(self) -> None:
+        from distributed import Client
+
+        client = Client(
+            self._workers.where,
+            asynchronous=True,
+            timeout=CONNECT_S,
+            set_as_default=False,
+            security=self._security(),
+            name="fcslam",
+        )
+        self._client = client
+        await client
+
+    def _security(self) -> Any:
+        """TLS as Dask is configured (``distributed.comm.tls``)."""
+        from distributed.security import Security
+
+        try:
+            return Security(require_encryption=self._workers.where.startswith("tls://"))
+        except (OSError, ssl.SSLError, ValueError) as error:
+            raise InputError(f"{self._workers.where}: the certificates cannot be used ({_text(error)})") from error
+
+    async def _look(self, must_fit: bool) -> None:
+        """Follow which workers there are.
+
+        Raises:
+            InputError: with ``must_fit``, a worker is refused.
+        """
+        identity = await asyncio.wait_for(self._client.scheduler.identity(n_workers=-1), ANSWER_S)
+        names = {address: str(about["name"]) for address, about in identity["workers"].items()}
+        self._refused &= names.keys()
+        self._executors = {address: worker for address, worker in self._executors.items() if address in names}
+        new = [address for address in names if address not in self._executors and address not in self._refused]
+        refusals = await asyncio.gather(*map(self._refusal, new))
+        for address, refusal in zip(new, refusals, strict=True):
+            if refusal is None:
+                self._executors = {**self._executors, address: DaskWorker(self, address)}
+                continue
+            self._refused.add(address)
+            named = address if names[address] == address else f"'{names[address]}' ({address})"
+            if must_fit:
+                raise InputError(f"{self._workers.where}: worker {named} {refusal}")
+            _log.warning("worker %s of the cluster gets no work: it %s", named, refusal)
+
+    async def _refusal(self, address: str) -> str | None:
+        """Why a worker may not verify closures; None: it may."""
+        try:
+            there = await self._ask(address, version, "fcslam")
+        except Exception as error:
+            return f"has no fcslam ({_text(error)}); install fcslam {fcslam.__version__} there"
+        other = f"has fcslam {there}, and this is {fcslam.__version__}; install the same version there"
+        try:
+            identity = CodeIdentity(*await self._ask(address, identify))
+        except Exception as error:
+            return other if there != fcslam.__version__ else f"cannot verify closures ({_text(error)})"
+        here = identify()
+        if identity.version != here.version:
+            return f"has fcslam {identity.version}, and this is {here.version}; install the same version there"
+        if identity.code != here.code:
+            return f"has an fcslam {here.version} of other sources or with other libraries; install the same ones there"
+        if identity.proof != here.proof:
+            return "computes other digits, as its processor differs; the map would depend on who verifies"
+        return None
+
+    async def _ask(self, address: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """The result of a function on one worker, beside its tasks."""
+        asked = self._client.run(function, *arguments, workers=[address])
+        return (await asyncio.wait_for(asked, CHECK_S))[address]
+
+    async def _disconnect(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            try:
+                await asyncio.wait_for(client.close(), CONNECT_S)
+            except Exception as error:  # whatever it was, it is gone
+                _log.debug("the client of the cluster was not closed: %s", _text(error))
+            client.status = "closed"  # or its end would try again, on no loop
+
+    async def _finish(self) -> None:
+        await asyncio.sleep(0)  # who follows the cluster ends first
+        await self._disconnect()
+        others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+    def _run(self, task: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(task, self._loop).result()
+
+    def _end(self) -> None:
+        self._executors = {}
+        self._run(self._finish())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+class DaskWorker(Executor):
+    """One worker of a cluster."""
+
+    def __init__(self, cluster: DaskCluster, address: str) -> None:
+        self._cluster, self._address = cluster, address
+
+    def submit(self, function: Callable[..., T], /, *arguments: Any, **named: Any) -> "Future[T]":
+        """Run a function there; it takes no named arguments."""
+        if named:
+            raise TypeError("a worker of a cluster takes no named arguments")
+        return self._cluster.submit(self._address, function, arguments)
+
+
+class CodeIdentity(NamedTuple):
+    """Properties that must be equal in all processes that verify closures."""
+
+    version: str
+    code: str
+    proof: str
+    """Hash of the alignments of two submaps of a made-up room."""
+
+
+@cache
+def identify() -> CodeIdentity:
+    """The identity of the process that runs this; it compiles what a batch needs."""
+    return CodeIdentity(fcslam.__version__, code_version(), hashlib.blake2b(_proof(), digest_size=16).hexdigest())
+
+
+def _proof() -> bytes:
+    """The alignments of two views of a made-up room, at guesses that are off by up to a metre."""
+    laser = LaserModel(360, 0.001 - np.pi, 2.0 * np.pi / 360, 20.0)  # no beam along a wall
+    poses = np.array([(0.0, 0.0, 0.0), (0.9, -0.4, 0.3)])
+    submaps = [submap_bytes(build_submap([(point_scan(_ranges(laser, pose), laser), np.zeros(3))])) for pose in poses]
+    names = [hashlib.blake2b(data, digest_size=16).digest() for data in submaps]
+    rng = np.random.default_rng(0)
+    guesses = poses[1] + rng.normal(0.0, (0.3, 0.3, 0.05), (20, 3))
+    priors = [np.zeros((3, 3)), np.diag((10.0, 10.0, 100.0))]
+    rows = np.array([(0, 1, *guess, *priors[k % 2].ravel()) for k, guess in enumerate(guesses)])
+    answer = align_batch(names, dict(zip(names, submaps, strict=True)), rows.tobytes())
+    assert isinstance(answer, bytes), "it was sent all submaps"
+    return answer
+
+
+def _ranges(laser: LaserModel, pose: np.ndarray) -> np.ndarray:
+    """Distance to the walls of a room of 9 m x 6 m with a round pillar, along every beam from a pose, shape (B,)."""
+    angles = laser.angles_rad() + pose[2]
+    along = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    walls = np.min((np.sign(along) * (4.5, 3.0) - pose[:2]) / along, axis=1)
+    to_pillar = np.array((2.0, 1.0)) - pose[:2]
+    nearest = along @ to_pillar
+    inside = 0.6**2 - (to_pillar @ to_pillar - nearest**2)
+    pillar = np.where((inside > 0.0) & (nearest > 0.0), nearest - np.sqrt(np.maximum(inside, 0.0)), np.inf)
+    return np.asarray(np.minimum(walls, pillar))
+
+
+def _quiet() -> None:
+    """Silence Dask: this module logs a lost connection once, and a batch may be large."""
+    import dask
+
+    dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GiB"})
+    for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log errors of connections that Dask gave up, which asyncio would print."""
+    _log.debug("%s: %s", context["message"], context.get("exception"))
+
+
+def _text(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,247 @@
+"""A real Dask cluster: the same bytes, whatever happens to it."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from fcslam.cli import main
+from fcslam.cluster.verifying import verifying
+from fcslam.cluster.workers import Workers
+from fcslam.errors import InputError
+from fcslam.geometry import se2
+from fcslam.lidar import pair_verification
+from fcslam.lidar.pair_verification import Pair, verify_here
+from fcslam.lidar.scan import point_scan
+from fcslam.lidar.submap import build_submap
+from fcslam.lidar.verification import VerificationConfig
+from fcslam.mission.mission_store import MissionStore
+from fcslam.service.credentials import make_cluster_credentials
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.supervisor import READY
+from tests import small_fleet
+from tests.cluster.clusters import Cluster, needs_dask, wait_for
+
+pytestmark = [needs_dask, pytest.mark.slow]
+
+CONFIG = VerificationConfig()
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    (robot,) = small_fleet.draw(1, path_length_m=12.0).robots
+    kept = list(robot.scans())[::2]
+    poses = small_fleet.truth_at(robot, [scan.stamp for scan in kept])
+    submaps = [build_submap([(point_scan(scan.ranges_m, scan.laser), np.zeros(3))]) for scan in kept]
+    rng = np.random.default_rng(4)
+    rows = [(a, b, off) for a in range(len(kept)) for b in range(a) for off in (0.02, 0.5)]
+    return [
+        Pair(submaps[a], submaps[b], se2.between(poses[a], poses[b]) + rng.normal(0.0, (off, off, 0.1 * off)))
+        for a, b, off in rows[:300]
+    ]
+
+
+@pytest.fixture(scope="module")
+def expected(pairs):
+    return written(verify_here(pairs, CONFIG))
+
+
+def written(checks):
+    return [
+        (check.T_a_b.tobytes(), check.information.tobytes(), check.strict, check.loose, check.partial, check.reason)
+        for check in checks
+    ]
+
+
+@pytest.fixture
+def warnings_of(caplog):
+    caplog.set_level(logging.INFO, "fcslam")
+    return lambda: [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+
+
+def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
+    tmp_path, pairs, expected, warnings_of, caplog, monkeypatch
+):
+    monkeypatch.setattr(pair_verification, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(pair_verification, "REST_S", 0.5)
+    with Cluster(tmp_path) as cluster:
+        one, two = cluster.start_worker("one"), cluster.start_worker("two")
+        time.sleep(3.0)
+        with verifying(Workers(cluster.address)) as verify:
+            wait_for(lambda: len(verify._processes()) == 2)
+            done = []
+            monkeypatch.setattr(
+                pair_verification,
+                "_read_aligned",
+                lambda *given, read=pair_verification._read_aligned: done.append(1) or read(*given),
+            )
+            wait_for(lambda: written(verify(pairs, CONFIG)) == expected and len(done) > 4)
+
+            os.kill(one.pid, signal.SIGSTOP)  # it neither works nor ends
+            assert written(verify(pairs, CONFIG)) == expected
+            one.kill()
+            assert written(verify(pairs, CONFIG)) == expected
+            assert written(verify(pairs[::-1], CONFIG)) == expected[::-1]
+            wait_for(lambda: len(verify._processes()) == 1)
+            assert not warnings_of(), "a cluster may shrink"
+
+            done.clear()
+            wait_for(lambda: written(verify(pairs, CONFIG)) == expected and done)
+            cluster.scheduler.kill()
+            for _ in range(3):
+                assert written(verify(pairs, CONFIG)) == expected
+            wait_for(lambda: not verify._processes())
+            assert written(verify(pairs, CONFIG)) == expected
+            (warning,) = wait_for(warnings_of)
+            assert warning.startswith(f"the cluster {cluster.address} is gone")
+
+            two.kill()
+            cluster.scheduler.wait()
+            cluster.start_scheduler(int(cluster.address.rpartition(":")[2]))
+            cluster.start_worker("three")
+            wait_for(verify._processes)
+            done.clear()
+            wait_for(lambda: written(verify(pairs, CONFIG)) == expected and done)
+            wait_for(lambda: "is back" in caplog.text)
+        assert len(warnings_of()) == 1
+
+
+def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expected, warnings_of):
+    """At the start by one line, later by no work."""
+    with Cluster(tmp_path) as cluster:
+        with (
+            pytest.raises(InputError, match=f"{cluster.address}: the cluster has no worker; start one: dask worker"),
+            verifying(Workers(cluster.address)),
+        ):
+            pass
+        old = cluster.start_worker("old", preload="import fcslam; fcslam.__version__ = '0.0.9'")
+        refused = wait_for(lambda: refusal(cluster))
+        assert refused.startswith(f"{cluster.address}: worker 'old' (tcp://127.0.0.1:")
+        assert refused.endswith(") has fcslam 0.0.9, and this is 0.1.0; install the same version there")
+        old.kill()
+
+        cluster.start_worker("good")
+        wait_for(lambda: refusal(cluster) is None)
+        with verifying(Workers(cluster.address)) as verify:
+            cluster.start_worker(
+                "changed", preload="import fcslam.storage.state_file as file; file.code_version = lambda: 'other'"
+            )
+            (warning,) = wait_for(warnings_of)
+            assert warning.startswith("worker 'changed' (tcp://127.0.0.1:")
+            assert warning.endswith(
+                "has an fcslam 0.1.0 of other sources or with other libraries; install the same ones there"
+            )
+            assert len(verify._processes()) == 1
+            assert written(verify(pairs, CONFIG)) == expected
+        assert len(warnings_of()) == 1
+
+
+def credentials(folder):
+    make_cluster_credentials(folder, datetime.now(UTC))
+    return [folder / "cluster" / name for name in ("ca.pem", "member.pem", "member.key")]
+
+
+def refusal(cluster):
+    """Why the cluster cannot be used; None: it can."""
+    try:
+        with verifying(Workers(cluster.address)):
+            return None
+    except InputError as error:
+        return "" if "has no worker" in str(error) else str(error)
+
+
+def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypatch, tmp_path, warnings_of, pairs):
+    from fcslam.cluster import dask_cluster
+
+    monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.5)
+    with (
+        pytest.raises(
+            InputError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers .*; start one: dask scheduler"
+        ),
+        verifying(Workers("tcp://127.0.0.1:9")),
+    ):
+        pass
+    with verifying(Workers("tcp://127.0.0.1:9"), must_connect=False) as verify:
+        assert written(verify(pairs[:5], CONFIG)) == written(verify_here(pairs[:5], CONFIG))
+        assert len(warnings_of()) == 1
+
+
+def configured(files):
+    """Dask's configuration with the certificates of a client."""
+    import dask
+    import distributed  # noqa: F401  its defaults must be there before: they would go with these
+
+    keys = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert", "distributed.comm.tls.client.key")
+    return dask.config.set(dict(zip(keys, map(str, files), strict=True)))
+
+
+def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, expected):
+    ours, others = (credentials(tmp_path / name) for name in ("ours", "others"))
+    options = ("--tls-ca-file", ours[0], "--tls-cert", ours[1], "--tls-key", ours[2])
+    with Cluster(tmp_path, "tls", tuple(map(str, options))) as cluster:
+        assert cluster.address.startswith("tls://")
+        cluster.start_worker("one")
+        with (
+            configured(others),
+            pytest.raises(InputError, match="no Dask scheduler answers"),
+            verifying(Workers(cluster.address)),
+        ):
+            pass
+        with (
+            pytest.raises(InputError, match=r"the certificates cannot be used|no Dask scheduler answers"),
+            verifying(Workers(cluster.address)),
+        ):
+            pass
+        wait_for(lambda: "Starting established" in (tmp_path / "scheduler-0.log").read_text())
+        time.sleep(1.0)
+        with configured(ours), verifying(Workers(cluster.address)) as verify:
+            assert len(verify._processes()) == 1
+            assert written(verify(pairs, CONFIG)) == expected
+
+
+def test_the_command_maps_the_same_on_a_cluster_and_on_processes(tmp_path, logs, capsys, monkeypatch):
+    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
+    arguments = ["map", *map(str, logs), "--quiet", "--output"]
+    assert main([*arguments, str(tmp_path / "here")]) == 0
+    assert main([*arguments, str(tmp_path / "processes"), "--workers", "2"]) == 0
+    with Cluster(tmp_path) as cluster:
+        cluster.start_worker("one")
+        wait_for(lambda: refusal(cluster) is None)
+        assert main([*arguments, str(tmp_path / "cluster"), "--workers", cluster.address]) == 0
+    expected = contents(tmp_path / "here")
+    assert contents(tmp_path / "processes") == contents(tmp_path / "cluster") == expected
+    capsys.readouterr()
+    assert main([*arguments, str(tmp_path / "none"), "--workers", "tcp://127.0.0.1:x"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_the_worker_of_a_mission_uses_the_cluster_and_outlives_it(tmp_path):
+    folder = MissionFolder(tmp_path / "mission")
+    folder.path.mkdir()
+    MissionStore(folder.store)
+    with Cluster(tmp_path) as cluster:
+        cluster.start_worker("one")
+        wait_for(lambda: refusal(cluster) is None)
+        options = Workers(cluster.address).options()
+        command = [sys.executable, "-m", "fcslam.service.worker", *options, str(folder.path)]
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
+            while json.loads(process.stdout.readline())["event"] != READY:
+                pass
+            cluster.scheduler.kill()
+            assert b"is gone" in process.stderr.readline()
+            process.stdin.close()
+            assert process.stderr.read() == b""
+            assert process.wait(60) == 0
