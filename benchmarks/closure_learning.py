@@ -46,7 +46,6 @@ import torch
 from federated_study.mapped_drives import MappedDrive, map_drives
 from federated_study.poison import PoisonedClient
 from matplotlib.figure import Figure
-from place_recognition.match_views import OTHER_OVERLAP, SAME_OVERLAP, lidar_overlap
 from place_recognition.retrieval import PairTruth, multi_match_curve
 
 from fcslam.features.codes import mutual_matches
@@ -58,6 +57,7 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import evaluate_homography
 from fcslam.lab.evaluation.detectors.measures import mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
+from fcslam.lab.evaluation.fleet.match_views import OTHER_OVERLAP, SAME_OVERLAP, lidar_overlap
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet

@@ -32,7 +32,6 @@ import cv2
 import numpy as np
 from closure_learning import FORGETTING, Learner, federated, photograph_rows, ranked, trained_here
 from place_recognition.features import FeatureChoice, choose_features, describe_images
-from place_recognition.match_views import DEPTH_AGREEMENT
 from place_recognition.report import evaluate_set
 from place_recognition.retrieval import PairTruth
 from place_recognition.scoring import DescribedSet, strategy_scorer
@@ -44,6 +43,7 @@ from place_recognition.view_overlap import view_overlap
 
 from fcslam.features.detector import BUNDLED_NETWORK, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.files import read_grey
+from fcslam.lab.evaluation.fleet.match_views import DEPTH_AGREEMENT
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.live_settings import LIVE_ROUNDS

@@ -29,9 +29,9 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import EvaluationError
+from fcslam.lab.evaluation.fleet.match_views import OTHER_OVERLAP, SAME_OVERLAP
 from fcslam.untrusted import read_text
 
-from .match_views import OTHER_OVERLAP, SAME_OVERLAP
 from .retrieval import Pairs, PairTruth, excluding_recent
 from .simulated_views import read_fleet_views
 from .tum_sequence import read_sequence

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.ground_truth import GAP_S
+from fcslam.lab.evaluation.fleet.match_views import half_view_rad, lidar_overlap
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import FloatArray, LaserModel, Ranges
 from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.runs import read_tum
 from fcslam.sources.recording.frames import RangesFile, merged_frames
 from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, SCANS_FILE, image_path, read_meta
-
-from .match_views import half_view_rad, lidar_overlap
 
 
 @dataclass(frozen=True, slots=True)

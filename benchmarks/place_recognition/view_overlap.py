@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
+from fcslam.lab.evaluation.fleet.match_views import DEPTH_AGREEMENT
 from fcslam.records import FloatArray
-
-from .match_views import DEPTH_AGREEMENT
 
 STRIDE_PX = 8
 """Sampling step in columns and rows of the depth image."""

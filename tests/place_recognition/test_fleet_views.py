@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.place_recognition.match_views import MatchViews, judge_views, lidar_overlap
 from benchmarks.place_recognition.sets import read_place_set
 from benchmarks.place_recognition.simulated_views import read_fleet_views
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.ground_truth import known_poses
+from fcslam.lab.evaluation.fleet.match_views import MatchViews, lidar_overlap
+from fcslam.lab.evaluation.fleet.report import evaluate_fleet
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -142,7 +142,8 @@ def views_of_matches(fleet, *matches):
             ClosureRow(*ends, Channel.CAMERA, 0.5, frozen(np.zeros(3)), status, Reason(ReasonCode.VERIFIED))
         )
     run = Run(trajectories, closures=tuple(closures))
-    return judge_views(run, known_poses(run, fleet), fleet)
+    run.save(fleet / "run")
+    return evaluate_fleet(fleet / "run", fleet).views
 
 
 def test_matches_are_judged_by_what_both_cameras_see(fleet):

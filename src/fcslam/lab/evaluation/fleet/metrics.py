@@ -1,5 +1,7 @@
 """The metrics of a fleet report by name, for tables and programs."""
 
+from dataclasses import asdict
+
 from fcslam.lab.evaluation.fleet.closure_stages import FleetClosureScore
 from fcslam.lab.evaluation.fleet.relations import relation_metrics
 from fcslam.lab.evaluation.fleet.report import FleetReport, RobotScore
@@ -23,6 +25,9 @@ def fleet_metrics(report: FleetReport) -> tuple[Metric, ...]:
     metrics += _relative_metrics("within_robots", report.within) + _relative_metrics("across_robots", report.across)
     for (within, status, channel), score in report.closures.items():
         metrics += _closure_metrics(f"{within}_{status}_{channel}", score)
+    for status, views in report.views.items():
+        counts = asdict(views).items()
+        metrics += [Metric(f"inter_robot_{status}_camera_views_{name}", count, "1") for name, count in counts]
     if report.agreement is not None:
         shares = ("precision", "recall", "f1", "free_iou")
         metrics += [Metric(f"map_{share}", getattr(report.agreement, share), "1") for share in shares]

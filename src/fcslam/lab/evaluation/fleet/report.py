@@ -9,6 +9,7 @@ import numpy as np
 
 from fcslam.lab.evaluation.fleet.closure_stages import FleetClosures, score_closures
 from fcslam.lab.evaluation.fleet.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
+from fcslam.lab.evaluation.fleet.match_views import MatchViews, judge_views
 from fcslam.metrics.closures import WRONG_DEG, WRONG_M, Mask
 from fcslam.metrics.grid import GridAgreement, grid_agreement
 from fcslam.metrics.relations import RelationErrors
@@ -21,7 +22,7 @@ from fcslam.metrics.trajectory import (
     position_errors,
     relative_errors,
 )
-from fcslam.records import PLACE_CHANNELS, Channel, FloatArray
+from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus, FloatArray
 from fcslam.runs import Run, open_run
 
 
@@ -86,6 +87,8 @@ class FleetReport:
     across: RelationErrors
     """Errors of relative poses of different robots; pairs in different maps are unusable."""
     closures: FleetClosures
+    views: Mapping[ClosureStatus, MatchViews]
+    """Camera matches between robots by what both cameras see, by stage."""
     agreement: GridAgreement | None
     """Agreement of the first map with the true map; None without a true map."""
     places: Mapping[Channel, PlaceTraffic]
@@ -115,6 +118,7 @@ def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
         within=relative_errors(near_pairs(known.truth, rng, across_robots=False), known.truth, known.estimate),
         across=relative_errors(near_pairs(known.truth, rng, across_robots=True), known.truth, known.estimate),
         closures=score_closures(opened, known),
+        views=judge_views(opened, known, folder),
         agreement=_agreement(run, folder, alignments),
         places={channel: _place_traffic(channel, figures) for channel in PLACE_CHANNELS},
     )
