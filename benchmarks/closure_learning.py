@@ -46,7 +46,6 @@ import torch
 from federated_study.mapped_drives import MappedDrive, map_drives
 from federated_study.poison import PoisonedClient
 from matplotlib.figure import Figure
-from place_recognition.retrieval import PairTruth, multi_match_curve
 
 from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
@@ -57,7 +56,8 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import evaluate_homography
 from fcslam.lab.evaluation.detectors.measures import mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.lab.evaluation.fleet.match_views import OTHER_OVERLAP, SAME_OVERLAP, lidar_overlap
+from fcslam.lab.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
+from fcslam.lab.evaluation.places.simulated_views import lidar_overlap
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
@@ -83,6 +83,7 @@ from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.metrics.framing import HomographyGroundTruth
+from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan

@@ -31,19 +31,17 @@ import common
 import cv2
 import numpy as np
 from closure_learning import FORGETTING, Learner, federated, photograph_rows, ranked, trained_here
-from place_recognition.features import FeatureChoice, choose_features, describe_images
-from place_recognition.report import evaluate_set
-from place_recognition.retrieval import PairTruth
-from place_recognition.scoring import DescribedSet, strategy_scorer
-from place_recognition.sets import PlaceSet, read_place_set
-from place_recognition.tum_sequence import Sequence as TumSequence
-from place_recognition.tum_sequence import read_sequence
-from place_recognition.verification import PairVerifier
-from place_recognition.view_overlap import view_overlap
 
 from fcslam.features.detector import BUNDLED_NETWORK, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.files import read_grey
-from fcslam.lab.evaluation.fleet.match_views import DEPTH_AGREEMENT
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_images
+from fcslam.lab.evaluation.places.report import evaluate_set
+from fcslam.lab.evaluation.places.scoring import DescribedSet, strategy_scorer
+from fcslam.lab.evaluation.places.sets import PlaceSet, read_place_set
+from fcslam.lab.evaluation.places.tum_sequence import Sequence as TumSequence
+from fcslam.lab.evaluation.places.tum_sequence import read_sequence
+from fcslam.lab.evaluation.places.verification import PairVerifier
+from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_overlap
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.live_settings import LIVE_ROUNDS
@@ -53,6 +51,7 @@ from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair
 from fcslam.learning.revisits import BORDER_PX, FEWEST_SHARED, correspond_predicted
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.metrics.retrieval import PairTruth
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
 

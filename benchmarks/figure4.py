@@ -17,9 +17,7 @@ from typing import Any
 
 import common
 import numpy as np
-from place_recognition.features import FeatureChoice, choose_features, describe_sets, describe_training
-from place_recognition.figures import COLOURS, panel_figure, save
-from place_recognition.growth import (
+from vocabulary_growth import (
     BATCH,
     MEASURES,
     Arrival,
@@ -31,6 +29,8 @@ from place_recognition.growth import (
     grow_vocabulary,
 )
 
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
+from fcslam.lab.evaluation.places.figures import COLOURS, panel_figure, save
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import FloatArray

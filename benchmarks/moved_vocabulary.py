@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import common
 import numpy as np
-from place_recognition.features import FeatureChoice, choose_features, describe_sets
-from place_recognition.retrieval import recall_at, single_best
-from place_recognition.scoring import DescribedSet, index_scores
-from place_recognition.sets import FLEET
-from place_recognition.simulated_views import read_fleet_views
 
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets
+from fcslam.lab.evaluation.places.scoring import DescribedSet, index_scores
+from fcslam.lab.evaluation.places.sets import FLEET
+from fcslam.lab.evaluation.places.simulated_views import read_fleet_views
 from fcslam.metrics.bootstrap import mean_interval
+from fcslam.metrics.retrieval import recall_at, single_best
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray

@@ -17,12 +17,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import common
-from place_recognition.features import FeatureChoice, choose_features, describe_sets, describe_training
-from place_recognition.figures import curves_figure
-from place_recognition.report import SetResult, evaluate_set
-from place_recognition.scoring import DescribedSet, choose_scorers
-from place_recognition.verification import PairVerifier
 
+from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
+from fcslam.lab.evaluation.places.figures import curves_figure
+from fcslam.lab.evaluation.places.report import SetResult, evaluate_set
+from fcslam.lab.evaluation.places.scoring import DescribedSet, choose_scorers
+from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes

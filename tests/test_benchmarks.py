@@ -26,6 +26,7 @@ SHARED = (
     "map_search",
     "processes",
     "training_fleet",
+    "vocabulary_growth",
     "wall_tags",
     "relation_closures",
     "subpixel_loss",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-RUNS, RECORDINGS, FEATURES, TRAINING = "runs", "recordings", "features", "training"
+RUNS, RECORDINGS, FEATURES, TRAINING, EVALUATIONS = "runs", "recordings", "features", "training", "evaluations"
 CHANGES = "changes"
 """Default parents of output folders."""
 

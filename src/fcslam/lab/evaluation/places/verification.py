@@ -7,9 +7,8 @@ import numpy as np
 
 from fcslam.features.codes import hamming_matrix
 from fcslam.features.matching import mutual_pairs
+from fcslam.lab.evaluation.places.scoring import DescribedSet, PlaceFeatures
 from fcslam.records import FloatArray
-
-from .scoring import DescribedSet, PlaceFeatures
 
 RATIO: Final = 0.9
 """Ratio test (Lowe 2004): largest ratio of the nearest to the second nearest distance."""

@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.place_recognition.sets import read_place_set
-from benchmarks.place_recognition.simulated_views import read_fleet_views
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.match_views import MatchViews, lidar_overlap
+from fcslam.lab.evaluation.fleet.match_views import MatchViews
 from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+from fcslam.lab.evaluation.places.sets import read_place_set
+from fcslam.lab.evaluation.places.simulated_views import lidar_overlap, read_fleet_views
 from fcslam.records import (
     CameraImage,
     CameraModel,

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.place_recognition.retrieval import excluding_recent
+from fcslam.metrics.retrieval import excluding_recent
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import VocabularyConfig
 

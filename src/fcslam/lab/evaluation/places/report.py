@@ -1,16 +1,20 @@
 """Place recognition metrics of all scorers, before and after geometric verification."""
 
+import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.errors import OutputError
+from fcslam.lab.evaluation.places.scoring import DescribedSet, Scorer
+from fcslam.lab.evaluation.places.sets import PlaceSet
+from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval, mean_interval
-from fcslam.records import FloatArray
-
-from .retrieval import (
+from fcslam.metrics.retrieval import (
     PairTruth,
     PrecisionRecall,
     RetrievedPlaces,
@@ -21,9 +25,7 @@ from .retrieval import (
     significance,
     single_best,
 )
-from .scoring import DescribedSet, Scorer
-from .sets import PlaceSet
-from .verification import PairVerifier
+from fcslam.records import FloatArray
 
 RANKS: Final = (1, 5, 10)
 DRAWS: Final = 300
@@ -139,3 +141,51 @@ def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, 
         return Interval(whole, np.nan, np.nan)
     low, high = np.quantile(known, (0.025, 0.975))
     return Interval(whole, float(low), float(high))
+
+
+def write_results(folder: Path, results: Sequence[SetResult]) -> None:
+    """Write ``places.csv``, and for each set and scorer ``<set>/<scorer>/similarity.npy``, ``verified.npy`` and
+    ``curve_<question>.csv``; ``<set>/queries.txt`` and ``gallery.txt`` name rows and columns.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_table(folder / "places.csv", results)
+        for result in results:
+            _write_set(folder / result.place_set.name, result)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot write the results ({error}); choose another folder") from error
+
+
+def _write_table(path: Path, results: Sequence[SetResult]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["set", "question", "scorer", "stage", "queries", "measure", "value", "low", "high"])
+        for score in (score for result in results for score in result.scores):
+            stage = "verified" if score.is_verified else "similarity"
+            for name, value in score.measures.items():
+                numbers = ("" if np.isnan(number) else f"{number:.6g}" for number in value)
+                writer.writerow([score.place_set, score.question, score.scorer, stage, score.queries, name, *numbers])
+
+
+def _write_set(folder: Path, result: SetResult) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, paths in (("queries", result.place_set.queries), ("gallery", result.place_set.gallery)):
+        (folder / f"{name}.txt").write_text("".join(f"{path}\n" for path in paths), encoding="utf-8")
+    for scorer, similarity in result.similarities.items():
+        own = folder / scorer.replace(" ", "_")
+        own.mkdir(exist_ok=True)
+        np.save(own / "similarity.npy", similarity, allow_pickle=False)
+        if scorer in result.verified:
+            np.save(own / "verified.npy", result.verified[scorer], allow_pickle=False)
+        for score in result.scores:
+            if score.scorer == scorer:
+                stage = "_verified" if score.is_verified else ""
+                _write_curve(own / f"curve_{score.question.replace(' ', '_')}{stage}.csv", score.curve)
+
+
+def _write_curve(path: Path, curve: PrecisionRecall) -> None:
+    table = np.column_stack((curve.thresholds, curve.precision, curve.recall))
+    np.savetxt(path, table, "%.6g", ",", header="threshold,precision,recall", comments="")

@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from fcslam.errors import OutputError
-
-from .report import SetResult
+from fcslam.lab.evaluation.places.report import SetResult
 
 COLOURS: Final = (
     "#000000",

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.place_recognition.features import choose_features, describe_sets
-from benchmarks.place_recognition.growth import (
+from benchmarks.vocabulary_growth import (
     BATCH,
     MEASURES,
     ahead_of,
@@ -13,9 +12,10 @@ from benchmarks.place_recognition.growth import (
     group_measures,
     grow_vocabulary,
 )
+from fcslam.lab.evaluation.places.features import choose_features, describe_sets
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
-from tests.place_recognition import place_folders
+from tests.lab.evaluation import place_folders
 
 GROUPS, SEED = 12, 3
 

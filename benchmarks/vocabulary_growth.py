@@ -13,19 +13,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fcslam.metrics.bootstrap import Interval, mean_interval
-from fcslam.places.index import PlaceIndex
-from fcslam.places.similarity import similarity
-from fcslam.places.vocabulary import Strategy, VocabularyConfig
-from fcslam.records import Codes, FloatArray
-
-from .scoring import (
+from fcslam.lab.evaluation.places.scoring import (
     BRUTE_FORCE,
     FOREIGN_TREE,
     DescribedSet,
     PretrainedVocabulary,
     matching_descriptors,
 )
+from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.places.index import PlaceIndex
+from fcslam.places.similarity import similarity
+from fcslam.places.vocabulary import Strategy, VocabularyConfig
+from fcslam.records import Codes, FloatArray
 
 BATCH: Final = 40
 """Places of a batch."""

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.features.codes import code_words, mutual_matches
+from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.places.index import PlaceIndex
 from fcslam.places.kmeans_tree import Tree, TreeShape, find_leaves, grow_tree
 from fcslam.places.similarity import BagOfWords, bag_of_words
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray
-
-from .sets import PlaceSet
 
 BRUTE_FORCE_BITS: Final = 48
 """Largest Hamming distance of matching descriptors."""

@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from fcslam.errors import EvaluationError
 from fcslam.features.files import read_grey
+from fcslam.lab.evaluation.places.view_overlap import DepthCamera
 from fcslam.records import FloatArray
 from fcslam.untrusted import read_bytes, read_text
-
-from .view_overlap import DepthCamera
 
 DEPTH_UNITS_PER_M: Final = 5000.0
 GAP_S: Final = 0.2

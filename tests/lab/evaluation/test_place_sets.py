@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.place_recognition.sets import read_place_set
-from benchmarks.place_recognition.view_overlap import DepthCamera, view_overlap
 from fcslam.errors import EvaluationError
-from tests.place_recognition import place_folders
+from fcslam.lab.evaluation.places.sets import read_place_set
+from fcslam.lab.evaluation.places.view_overlap import DepthCamera, view_overlap
+from tests.lab.evaluation import place_folders
 
 
 def test_floors_of_a_tower(tmp_path):

@@ -29,13 +29,11 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import EvaluationError
-from fcslam.lab.evaluation.fleet.match_views import OTHER_OVERLAP, SAME_OVERLAP
+from fcslam.lab.evaluation.places.simulated_views import read_fleet_views
+from fcslam.lab.evaluation.places.tum_sequence import read_sequence
+from fcslam.lab.evaluation.places.view_overlap import view_overlap
+from fcslam.metrics.retrieval import Pairs, PairTruth, excluding_recent
 from fcslam.untrusted import read_text
-
-from .retrieval import Pairs, PairTruth, excluding_recent
-from .simulated_views import read_fleet_views
-from .tum_sequence import read_sequence
-from .view_overlap import view_overlap
 
 LABELLED: Final = "dataset.csv"
 FLEET: Final = "simulation.yaml"
@@ -45,6 +43,7 @@ NEAR_PAIR: Final = 8
 TOUR_GAP: Final = 20
 """Images of a tour that are not retrieved, because they are just before the query."""
 SEQUENCE_GAP_S: Final = 3.0
+SAME_OVERLAP, OTHER_OVERLAP = 0.5, 0.1
 
 _FRAME = re.compile(r"(.+)_frame_(\d+)")
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.ground_truth import GAP_S
-from fcslam.lab.evaluation.fleet.match_views import half_view_rad, lidar_overlap
+from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT
 from fcslam.metrics.trajectory import interpolate
-from fcslam.records import FloatArray, LaserModel, Ranges
+from fcslam.records import CameraModel, FloatArray, LaserModel, Ranges
 from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.runs import read_tum
 from fcslam.sources.recording.frames import RangesFile, merged_frames
@@ -67,6 +67,45 @@ def read_fleet_views(folder: Path) -> FleetViews:
     return FleetViews(tuple(view.image for view in everything), numbers, overlap)
 
 
+def lidar_overlap(
+    T_building_laser: FloatArray, ranges_m: FloatArray, laser: LaserModel, half_view_rad: float
+) -> FloatArray:
+    """Overlap of views: share of the returns of one view that the other view sees, the smaller of both directions.
+
+    The other view sees a return if it is in its field of view and its own return in that direction has the same range,
+    to a tenth. Directions without a return in the other view are ignored.
+
+    Args:
+        T_building_laser: true poses, shape (N, 3).
+        ranges_m: shape (N, beams).
+        laser: the laser of all scans.
+        half_view_rad: half of the camera's field of view.
+
+    Returns:
+        Shape (N, N), in [0, 1].
+    """
+    angles = laser.angles_rad()
+    ahead = np.abs(se2.wrap_angle(angles)) <= half_view_rad
+    returned = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m < laser.max_range_m)
+    turn = max(round(2.0 * np.pi / laser.angle_increment_rad), laser.beam_count)
+    padded = np.pad(
+        np.where(returned, ranges_m, np.nan), ((0, 0), (0, turn - laser.beam_count)), constant_values=np.nan
+    )
+    shares = np.zeros((len(ranges_m), len(ranges_m)))
+    for a, pose in enumerate(T_building_laser):
+        beams = ahead & returned[a]
+        ends = ranges_m[a, beams, None] * np.column_stack((np.cos(angles[beams]), np.sin(angles[beams])))
+        there = se2.transform(se2.inverse(T_building_laser), se2.transform(pose, ends))
+        bearing, distance = np.arctan2(there[..., 1], there[..., 0]), np.hypot(there[..., 0], there[..., 1])
+        beam = np.rint(se2.wrap_angle(bearing - laser.angle_min_rad) / laser.angle_increment_rad).astype(int) % turn
+        met = np.take_along_axis(padded, beam, axis=1)
+        in_view = np.abs(bearing) <= half_view_rad
+        again = in_view & (np.abs(met - distance) <= DEPTH_AGREEMENT * distance)
+        judged = ~in_view | np.isfinite(met)
+        shares[a] = again.sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
+    return np.minimum(shares, shares.T)
+
+
 def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
     """Images with the scan before each, at least a step of distance or turn apart."""
     images, stamps, scans = [], [], []
@@ -95,3 +134,8 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
         if np.hypot(x, y) >= EVERY_M or abs(turn) >= EVERY_RAD:
             last = view.T_building_base
             yield view
+
+
+def half_view_rad(camera: CameraModel) -> float:
+    """Angle from straight ahead to the nearer edge of the image."""
+    return float(np.arctan2(min(camera.cx, camera.width - 1.0 - camera.cx) + 0.5, camera.fx))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.place_recognition.lidar_places import describe_recording, planar_inliers
-from benchmarks.place_recognition.scoring import PlaceFeatures
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
+from fcslam.lab.evaluation.places.lidar_places import describe_recording, planar_inliers
+from fcslam.lab.evaluation.places.scoring import PlaceFeatures
 from fcslam.sources import write_carmen
 from tests import small_fleet
 

@@ -13,7 +13,10 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import EvaluationError
 from fcslam.features.codes import mutual_matches
+from fcslam.lab.evaluation.places.scoring import DescribedSet, PlaceFeatures
+from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.lidar.lost import LostConfig
+from fcslam.metrics.retrieval import PairTruth, excluding_recent
 from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.motions import LARGEST_HAMMING
 from fcslam.records import Channel, FloatArray, Keyscan, Place
@@ -21,10 +24,6 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
-
-from .retrieval import PairTruth, excluding_recent
-from .scoring import DescribedSet, PlaceFeatures
-from .sets import PlaceSet
 
 SAME_M: Final = 1.0
 """Largest distance of a match."""

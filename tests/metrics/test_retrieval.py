@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.place_recognition.report import measure_interval
-from benchmarks.place_recognition.retrieval import (
+from fcslam.lab.evaluation.places.report import measure_interval
+from fcslam.metrics.retrieval import (
     PairTruth,
     mismatches,
     multi_match_curve,

@@ -11,12 +11,11 @@ from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig,
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.extraction import extract, find_files
 from fcslam.features.files import read_features, read_grey
+from fcslam.lab.evaluation.places.lidar_places import describe_recording
+from fcslam.lab.evaluation.places.scoring import DescribedSet, PlaceFeatures
+from fcslam.lab.evaluation.places.sets import PlaceSet, all_images, read_place_set
+from fcslam.lab.evaluation.places.verification import epipolar_inliers
 from fcslam.records import Codes
-
-from .lidar_places import describe_recording
-from .scoring import DescribedSet, PlaceFeatures
-from .sets import PlaceSet, all_images, read_place_set
-from .verification import epipolar_inliers
 
 FEATURES_PER_IMAGE: Final = 500
 LONGEST_SIDE_PX: Final = 400

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.lab.evaluation.fleet.match_views import DEPTH_AGREEMENT
 from fcslam.records import FloatArray
 
+DEPTH_AGREEMENT = 0.1
+"""Largest relative difference of two depths of one surface."""
 STRIDE_PX = 8
 """Sampling step in columns and rows of the depth image."""
 _BEYOND = 1.1

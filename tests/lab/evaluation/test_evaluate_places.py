@@ -1,26 +1,26 @@
-"""The scorers against plain comparison, pair by pair, and all of them on drawn places."""
+"""The scorers against plain comparison, pair by pair, and the command on drawn places."""
+
+import csv
 
 import numpy as np
 import pytest
 
-from benchmarks.place_recognition.features import choose_features, describe_images, describe_sets, describe_training
-from benchmarks.place_recognition.report import evaluate_set
-from benchmarks.place_recognition.retrieval import recall_at
-from benchmarks.place_recognition.scoring import (
+from fcslam.cli import main
+from fcslam.features.codes import hamming_matrix
+from fcslam.lab.evaluation.places.features import choose_features, describe_images, describe_sets
+from fcslam.lab.evaluation.places.scoring import (
     PretrainedVocabulary,
     brute_force,
-    choose_scorers,
     index_scores,
     strategy_scorer,
 )
-from benchmarks.place_recognition.sets import read_place_set
-from benchmarks.place_recognition.verification import ACCEPTED_INLIERS, PairVerifier
-from fcslam.cli import main
-from fcslam.features.codes import hamming_matrix
+from fcslam.lab.evaluation.places.sets import read_place_set
+from fcslam.lab.evaluation.places.verification import ACCEPTED_INLIERS, PairVerifier
+from fcslam.metrics.retrieval import recall_at
 from fcslam.places.index import PlaceIndex
 from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
-from tests.place_recognition import place_folders
+from tests.lab.evaluation import place_folders
 
 WORDS = VocabularyConfig(scoring=Scoring.WORDS, train_batch=3)
 
@@ -102,14 +102,42 @@ def test_extracted_features_are_those_of_the_detector(folders, tmp_path):
 
 
 @pytest.mark.slow
-def test_every_scorer_answers_before_and_after_verification(folders):
-    features = choose_features("orb")
-    training = describe_training([folders[1]], features)
-    scorers = choose_scorers([Strategy.STATIC, Strategy.INCREMENTAL], VocabularyConfig(), training, 1)
-    for described, queries in zip(describe_sets(folders, (), features), (5, 20), strict=True):
-        result = evaluate_set(described, scorers, PairVerifier(described), 1)
-        assert set(result.similarities) == {"brute force", "foreign tree", "static", "incremental"}
-        assert {score.queries for score in result.scores} == {queries}
-        best = next(score for score in result.scores if (score.scorer, score.is_verified) == ("brute force", False))
-        assert best.measures["recall_at_1"].mean == 1.0
-        assert best.curve.precision[-1] == best.curve.recall[-1] == 1.0
+def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    arguments = [*map(str, folders), "--train-on", str(folders[1]), "--verify"]
+    assert main(["evaluate", "places", *arguments, "-o", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "generic, matches: 5 queries" in shown
+    assert "tour, loops: 20 queries" in shown
+    with (tmp_path / "places.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["scorer"] for row in rows} == {"brute force", "foreign tree", "static", "windowed", "incremental"}
+    recalls = {row["scorer"]: row["value"] for row in rows if (row["set"], row["measure"]) == ("tour", "recall_at_1")}
+    assert recalls["brute force"] == "1"
+    matrices = [np.load(tmp_path / "generic" / "incremental" / f"{name}.npy") for name in ("similarity", "verified")]
+    assert [matrix.shape for matrix in matrices] == [(5, 6), (5, 6)]
+    assert (tmp_path / "generic" / "queries.txt").read_text(encoding="utf-8").count("\n") == 5
+    curve = np.loadtxt(tmp_path / "generic" / "brute_force" / "curve_matches.csv", delimiter=",", skiprows=1, ndmin=2)
+    assert curve[-1].tolist() == [curve[:, 0].min(), 1.0, 1.0]
+    assert (tmp_path / "precision_recall.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{nowhere}"], "no set of places"),
+        (["{generic}", "{generic}"], "another set generic"),
+        (["{generic}", "--features", "surf"], "no such features"),
+        (["{generic}", "--features", "{nowhere}"], "cannot read the features"),
+        (["{generic}", "--label", "floor1"], "no labels"),
+        (["{generic}", "--train-on", "{nowhere}"], "no file there"),
+        (["{generic}/matches.csv"], "matches.csv"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(folders, tmp_path, capsys, arguments, message):
+    (tmp_path / "nowhere").mkdir()
+    words = [word.format(generic=folders[0], nowhere=tmp_path / "nowhere") for word in arguments]
+    assert main(["evaluate", "places", *words, "-o", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert message in " ".join(said.split())
+    assert "Traceback" not in said
