@@ -30,12 +30,11 @@ from scipy.spatial import cKDTree
 
 import fcslam
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.quality import judge
 from fcslam.lab.evaluation.fleet.relations import pose_table
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.lidar.scan import point_scan
-from fcslam.maps.certificate import QUANTILE
+from fcslam.maps.certificate import CELL_M, QUANTILE
 from fcslam.metrics.relations import STAMP_TOLERANCE_S, motion_errors, read_relations
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan
@@ -133,9 +132,23 @@ def _simulated(settings, seed):
             robot.T_building_base[np.searchsorted(robot.stamps, run.trajectories[robot.name].stamps - 1e-6)]
             for robot in members
         ])  # fmt: skip
-        judged = judge(certificate, estimate, truth)
-        found.append((judged.bound_m, judged.error_m))
+        found.append(judged(certificate, estimate, truth))
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+
+
+def judged(certificate, estimate, truth):
+    """Bounds and true errors of the cells of one map, given estimated and true poses (N, 3) of its robots."""
+    squares = np.floor(estimate[:, :2] / CELL_M).astype(np.int64)
+    kept = np.unique(squares, axis=0, return_index=True)[1]
+    estimate, truth = estimate[kept], truth[kept]
+    tree = cKDTree(estimate[:, :2])
+    error_m = np.zeros(len(estimate))
+    for k, near in enumerate(tree.query_ball_point(estimate[:, :2], certificate["within"])):
+        wrong = se2.between(estimate[k], estimate[near])[:, :2] - se2.between(truth[k], truth[near])[:, :2]
+        error_m[k] = np.sqrt((wrong**2).sum() / max(len(near) - 1, 1))
+    centres = np.array([(cell["x"], cell["y"]) for cell in certificate["cells"]]).reshape(-1, 2)
+    nearest = tree.query(centres)[1] if len(centres) else np.zeros(0, np.int64)
+    return np.array([cell["bound_95"] for cell in certificate["cells"]]), error_m[nearest]
 
 
 class Log:

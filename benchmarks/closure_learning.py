@@ -57,7 +57,7 @@ from fcslam.lab.evaluation.detectors.homography import evaluate_homography
 from fcslam.lab.evaluation.detectors.measures import mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.lab.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
-from fcslam.lab.evaluation.places.simulated_views import EVERY_M, EVERY_RAD, lidar_overlap
+from fcslam.lab.evaluation.places.simulated_views import lidar_overlap
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
@@ -88,6 +88,7 @@ from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan
 from fcslam.robot.frontend import RobotConfig
+from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.sources import Recording
 
 TRAIN, TEST, SEEDS = tuple(range(301, 311)), tuple(range(411, 421)), (1, 2, 3)

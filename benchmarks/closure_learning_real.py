@@ -44,7 +44,7 @@ from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_overlap
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
-from fcslam.learning.federated.live_settings import LiveRounds
+from fcslam.learning.federated.live_settings import LIVE_ROUNDS
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair
@@ -102,8 +102,8 @@ def main() -> None:
 
 def trained(learners: Mapping[str, Learner], folder: Path) -> dict[str, Path]:
     """The bundled network, that of each robot alone, and that of both."""
-    rounds = LiveRounds()
-    rounds = rounds.model_copy(update={"training": rounds.training.model_copy(update={"seed": SEED})})
+    training = LIVE_ROUNDS.training.model_copy(update={"seed": SEED})
+    rounds = LIVE_ROUNDS.model_copy(update={"training": training})
     networks = {"bundled": BUNDLED_NETWORK}
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:

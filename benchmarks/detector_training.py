@@ -6,9 +6,9 @@ FOLDER keeps the networks; those that it lacks are trained, all at the same time
 table measures, and on --images, such as renders. Pairs are drawn on the device (`device_pairs.py`).
 
 - near, wide, turns: the light network from the bundled one, with the losses of `fcslam tools train` and the
-  localization loss, in float32. Views change as in `fcslam tools train` in `near`. In the others, the scales of a pair
-  differ by up to 4; in `wide` views turn by 26 degrees (standard deviation), in `turns` half of them by any angle.
-  Labels are those of the bundled network and of Harris's measure
+  localization loss of `subpixel_loss.py`, in float32. Views change as in `fcslam tools train` in `near`. In the
+  others, the scales of a pair differ by up to 4; in `wide` views turn by 26 degrees (standard deviation), in `turns`
+  half of them by any angle. Labels are those of the bundled network and of Harris's measure
 - ours, hardest, all: the paper's network from `vgg`. The last two have eqs. (1)-(3) alone for their codes, without a
   margin, with the hardest negative of a pair or the mean over all; `ours` has the losses of `fcslam tools train`. As
   many steps each
@@ -36,6 +36,7 @@ from typing import Any
 import common
 import torch
 from device_pairs import Change, Photographs, draw_on_device
+from subpixel_loss import localization_loss
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK
@@ -82,21 +83,22 @@ class Arm:
 
     settings: TrainingSettings
     change: Change
+    localization: float = 0.0
+    """Weight of the localization loss."""
     start: Path = BUNDLED_NETWORK
     steps: int | None = None
     """None: as many as the time allows."""
 
 
 def light(change: Change) -> Arm:
-    loss = LossSettings(localization=2.0)
-    return Arm(TrainingSettings(pairs=64, side_px=256, points=448, learning_rate=1e-3, loss=loss), change)
+    return Arm(TrainingSettings(pairs=64, side_px=256, points=448, learning_rate=1e-3), change, localization=2.0)
 
 
 def vgg(**loss: Any) -> Arm:
     settings = TrainingSettings(
         encoder="vgg", pairs=32, side_px=192, learning_rate=5e-4, loss=LossSettings(**loss), steps=EQUATIONS_STEPS
     )
-    return Arm(settings, AS_IN_TRAINING, Path("vgg"), EQUATIONS_STEPS)
+    return Arm(settings, AS_IN_TRAINING, start=Path("vgg"), steps=EQUATIONS_STEPS)
 
 
 AS_IN_TRAINING = Change(turn_rad=0.2, any_turn_share=0.1, scale_spread=0.7, tilt=0.12)
@@ -217,6 +219,9 @@ def train_arm(
         maps = network.train()(batch.images.contiguous(memory_format=torch.channels_last))
         shift = grid_shift(settings.encoder, SEED, step)
         total, parts = objective(maps, batch, settings.loss, progress, shift, None)
+        if arm.localization:
+            parts["localization"] = localization_loss(maps.point_logits.float().sigmoid(), batch.homographies)
+            total = total + arm.localization * parts["localization"]
         optimizer.zero_grad(set_to_none=True)
         total.backward()
         if torch.isfinite(torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)):

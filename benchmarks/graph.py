@@ -14,8 +14,8 @@ from typing import Any
 
 import common
 import numpy as np
+from g2o_files import read_g2o
 
-from fcslam.graph.g2o import read_g2o
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import PoseGraph
@@ -56,8 +56,8 @@ def solves(name: str, graph: PoseGraph, repeat: int) -> list[tuple]:
         lm_s, lm = timed(lambda poses=poses: optimize(graph, poses), repeat)
         gnc_s, gnc = timed(lambda poses=poses: optimize_gnc(graph, poses), repeat)
         rejects = int(np.sum(gnc.weights[robust] < 0.5))
-        lm_columns = (lm_s, lm.stats.iterations, 0.5 * graph.chi2(lm.poses).sum())
-        gnc_columns = (gnc_s, gnc.stats.iterations, gnc.stats.final_cost, rejects)
+        lm_columns = (lm_s, lm.iterations, 0.5 * graph.chi2(lm.poses).sum())
+        gnc_columns = (gnc_s, gnc.iterations, gnc.cost, rejects)
         rows.append((name, len(graph), int(robust.sum()), start, start_s, *lm_columns, *gnc_columns))
     return rows
 

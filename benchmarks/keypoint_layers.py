@@ -8,7 +8,7 @@ Every arm has the cross entropy to the bundled network's own probabilities, and 
 
 - agreement: the keypoint maps of both views agree in windows (`agreement_loss` in `learning/losses.py`)
 - localization: keypoints of both views that are mutual nearest neighbours within 2.5 px lie, by the parabola through
-  each peak, at the same point (`localization_loss` in `learning/localization.py`)
+  each peak, at the same point (`localization_loss` in `benchmarks/subpixel_loss.py`)
 - both
 
 Measured on 25 pairs of photographs of other places (corrected, NMS 8 px; needs FCSLAM_DATA), and in the unseen
@@ -37,6 +37,7 @@ from closure_learning import (
     photograph_rows,
     recorded,
 )
+from subpixel_loss import localization_loss
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK
@@ -48,7 +49,6 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.images import find_images, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.local_training import LocalTrainingPlan, train_layers
-from fcslam.learning.localization import localization_loss
 from fcslam.learning.losses import agreement_loss, detector_loss
 from fcslam.learning.network import cell_probabilities
 from fcslam.learning.objective import grid_shift, shift_grid, views_aligned

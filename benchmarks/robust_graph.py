@@ -36,16 +36,16 @@ from pathlib import Path
 import common
 import gtsam
 import numpy as np
+from g2o_files import read_g2o
 from numpy.random import Generator
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.consistency import PROBABILITY, ConsistencySettings
 from fcslam.graph.factors import FactorCache, from_values, to_values
-from fcslam.graph.g2o import read_g2o
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.joint import JointEvidence, solve_jointly
-from fcslam.graph.optimizer import Solution, SolveStats, optimize, optimize_gnc
+from fcslam.graph.optimizer import Solution, optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph, anchors
 from fcslam.graph.single_robot import solve_single_robot
 from fcslam.records import FloatArray
@@ -276,7 +276,7 @@ def decisions(graph: PoseGraph, solution: Solution, truth: FloatArray) -> tuple:
     rejected, lost = int(np.sum(~kept[-FALSE_LOOPS:])), int(np.sum(~kept[:-FALSE_LOOPS]))
     shift_m = np.hypot(*(solution.poses - truth)[:, :2].T).max()
     passed = "yes" if rejected == FALSE_LOOPS and lost <= PASS_LOST else "NO"
-    return rejected, lost, len(kept) - FALSE_LOOPS, shift_m, solution.stats.final_cost, passed
+    return rejected, lost, len(kept) - FALSE_LOOPS, shift_m, solution.cost, passed
 
 
 def with_false_loops(graph: PoseGraph, rng: Generator) -> PoseGraph:
@@ -305,7 +305,7 @@ def gtsam_gnc(graph: PoseGraph, start: FloatArray) -> Solution:
     poses = from_values(solver.optimize())
     weights = np.ones(len(robust))
     weights[robust] = np.asarray(solver.getWeights())[trusted : trusted + int(robust.sum())]
-    return Solution(poses, weights, SolveStats(0, np.nan, np.nan))
+    return Solution(poses, weights, 0, np.nan)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,8 @@ SHARED = (
     "vocabulary_growth",
     "wall_tags",
     "relation_closures",
+    "subpixel_loss",
+    "g2o_files",
 )
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 

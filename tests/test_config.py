@@ -112,3 +112,16 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
 def test_yaml_that_expands_is_refused(text, reason):
     with pytest.raises(ValueError, match=reason):
         parse_yaml(text)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ({"seed": "x"}, r"Outer: seed: [^\n]+ \(given: 'x'\)"),
+        ({"inner": {"reach_m": -1.0}}, r"Outer: inner\.reach_m: [^\n]+ \(given: -1\.0\)"),
+        ({"sed": 3}, "Outer: unknown key 'sed'; did you mean 'seed'\\?"),
+    ],
+)
+def test_a_wrong_value_in_python_is_one_line_too(content, reason):
+    with pytest.raises(ConfigError, match=rf"^{reason}$"):
+        Outer(**content)

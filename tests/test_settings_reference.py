@@ -28,7 +28,7 @@ def test_every_key_of_the_configuration_has_a_row_with_its_default():
     for path in key_paths(yaml.safe_load(dump(MissionConfig()))):
         assert mission.count(f"| `{path}` |") == 1
     assert "| `map.resolution_m` | `0.05` | m | >= 0.001, <= 10 |" in mission
-    assert "| `fleet.fusion` | `joint` | - | `joint`, `n_point`, `two_point`, `first_two` |" in mission
+    assert "| `fleet.fusion` | `joint` | - | `joint`, `two_point` |" in mission
     page = settings_reference.training_page()
     assert "| `loss.margin` |" in page
     assert "| `screening.quorum` |" in page

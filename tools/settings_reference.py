@@ -153,11 +153,15 @@ def training_page() -> str:
     """The settings of training."""
     federated = tables(FederatedSettings(), documented=(TrainingSettings,))
     live = tables(FleetLearningSettings(), documented=(FederatedSettings,))
-    rounds = FleetLearningSettings().federated
+    rounds, defaults = FleetLearningSettings().federated, FederatedSettings()
     changed = [
-        row(f"federated.{key}", field, getattr(rounds, key))
-        for key, field in type(rounds).model_fields.items()
-        if key in type(rounds).__annotations__ and not isinstance(getattr(rounds, key), Settings)
+        row(f"{prefix}{key}", field, getattr(mine, key))
+        for prefix, mine, other in (
+            ("federated.", rounds, defaults),
+            ("federated.training.", rounds.training, defaults.training),
+        )
+        for key, field in type(mine).model_fields.items()
+        if getattr(mine, key) != getattr(other, key) and not isinstance(getattr(mine, key), Settings)
     ]
     head = "| key | default | unit | allowed | effect |\n|---|---|---|---|---|"
     live_tables = [LEARNING, *live, "\n".join([head, *changed, ""])]

@@ -1,13 +1,15 @@
 """Poisoned clients, for studies and tests of how well a fleet tolerates them."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.learning.federated.client import ClientUpdate, FederatedClient
 from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.learning.federated.weights import Weights, apply_update, trained_names, update_vector
+from fcslam.learning.federated.weights import FloatVector, Weights, trained_names, update_vector
 
 Poison = Literal["flipped", "scaled", "reversed", "random", "nan"]
 SCALE = 10.0
@@ -49,3 +51,15 @@ class PoisonedClient:
     ) -> dict[str, float]:
         """As in ``FederatedClient``."""
         return self.client.evaluate(weights, round_number, run_id, settings)
+
+
+def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:
+    """``old`` with ``update`` (N,) of ``update_vector`` added to the named arrays."""
+    arrays = {name: array.copy() for name, array in old.items()}
+    begin = 0
+    for name in names:
+        size = old[name].size
+        step = update[begin : begin + size].reshape(old[name].shape)
+        arrays[name] = (old[name] + step).astype(np.float32)
+        begin += size
+    return arrays

@@ -23,6 +23,21 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def __init__(self, **values: Any) -> None:
+        """Check ``values``; keys that are not given have their defaults.
+
+        Raises:
+            ConfigError: see ``parse``.
+        """
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise _refusal(type(self), error, type(self).__name__) from error
+
+    # For pydantic, this is not a constructor of its own: settings within settings are checked without it, so the
+    # message names the whole key.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
 
 SettingsType = TypeVar("SettingsType", bound=Settings)
 
@@ -64,16 +79,19 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = one_line(".".join(str(part) for part in first["loc"]))
-        if first["type"] == "extra_forbidden":
-            raise ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}") from error
-        if first["type"] == "value_error" and isinstance(first["input"], dict):  # keys that do not fit each other
-            place = f"{where}: {key}" if key else where
-            raise ConfigError(f"{place}: {first['ctx']['error']}") from error
-        raise ConfigError(
-            f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})"
-        ) from error
+        raise _refusal(kind, error, where) from error
+
+
+def _refusal(kind: type[Settings], error: ValidationError, where: str) -> ConfigError:
+    """One line about the first fault that pydantic found in ``kind``."""
+    first = error.errors()[0]
+    key = one_line(".".join(str(part) for part in first["loc"]))
+    if first["type"] == "extra_forbidden":
+        return ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}")
+    if first["type"] == "value_error" and isinstance(first["input"], dict):  # keys that do not fit each other
+        place = f"{where}: {key}" if key else where
+        return ConfigError(f"{place}: {first['ctx']['error']}")
+    return ConfigError(f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})")
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

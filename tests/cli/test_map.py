@@ -368,7 +368,7 @@ def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log
     assert run_map(log, "--config", "paper", "--config", file, "--output", tmp_path / "other") == 2
     assert capsys.readouterr().err.splitlines() == [
         f"fcslam: {file}: fleet: matcher.decision similarity measures no transform, which the joint "
-        "graph needs; set fusion to two_point, first_two or n_point"
+        "graph needs; set fusion to two_point"
     ]
 
 

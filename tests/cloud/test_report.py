@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.g2o_files import read_g2o
 from fcslam.cloud.report import LEAST_DRAWN, keyscan_track, run_of
-from fcslam.graph.g2o import read_g2o
 from fcslam.lidar.occupancy import OccupancyConfig
 from tests.scripted import closures, rectangle, stream
 from tests.small_fleet import feed, in_order

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.packet_log import PacketNumber
-from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.settings import FleetConfig, FusionStrategy
 from fcslam.errors import InputError, PacketError
 from fcslam.places.matcher import MatchDecision, MatcherConfig
 from fcslam.places.words import train_words, write_vocabularies

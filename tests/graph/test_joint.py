@@ -9,7 +9,7 @@ from fcslam.geometry import se2
 from fcslam.graph import joint
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
-from fcslam.graph.optimizer import Solution, SolveStats, optimize
+from fcslam.graph.optimizer import Solution, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import build_trajectory
 from tests.graph.graph_worlds import INFORMATION, measured, walk
@@ -256,7 +256,7 @@ def test_a_link_lasts_on_most_of_its_cluster_from_enough_places(dropped: int, la
     weights = np.ones(len(edges))
     weights[len(edges) - dropped :] = 0.0
     own = [build_trajectory(truth, SETTINGS)] * 2
-    solution = Solution(graph.poses(), weights, SolveStats(0, 0.0, 0.0))
+    solution = Solution(graph.poses(), weights, 0, 0.0)
     assert joint._is_confirmed(link, own, solution, ones, SETTINGS) is lasts
     one_place = np.ones(len(edges))
     one_place[-5:] = 0.0

@@ -27,7 +27,6 @@ def test_optimum_is_that_of_an_independent_solver(seed: int) -> None:
     oracle = gauss_newton(graph, truth)
     assert apart(solution.poses, oracle) < 2e-3
     assert graph.chi2(solution.poses).sum() == pytest.approx(graph.chi2(oracle).sum(), rel=1e-3)
-    assert solution.stats.final_cost < solution.stats.initial_cost
 
 
 @pytest.mark.parametrize("mutate", ["transposed", "sign", "inverse"])
@@ -99,7 +98,7 @@ def test_settling_starts_from_what_is_trusted() -> None:
     settled = refine_inliers(graph, clean.poses, true)
     assert (settled.weights[~true] == 0.0).all()
     assert (settled.weights[true] == 0.0).sum() <= 4
-    assert refine_inliers(graph, clean.poses, ~true).stats.final_cost > settled.stats.final_cost
+    assert refine_inliers(graph, clean.poses, ~true).cost > settled.cost
     with pytest.raises(ValueError, match="weights must be of shape"):
         refine_inliers(graph, clean.poses, true[:-1])
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.metrics.bootstrap import measure_interval
+from fcslam.lab.evaluation.places.report import measure_interval
 from fcslam.metrics.retrieval import (
     PairTruth,
     mismatches,

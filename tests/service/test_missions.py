@@ -6,6 +6,7 @@ import pytest
 
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import ServiceError, StoreError
+from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
 
 
@@ -56,7 +57,7 @@ def test_a_damaged_mission_is_refused_and_the_other_one_stays_open(service):
     missions, workers = service
     missions.create("next")
     missions.open("mission")
-    path = missions.folder("next").store
+    path = MissionFolder.of(missions.root, "next").store
     content = path.read_bytes()
     path.write_bytes(content[:-1000] + bytes(1000))
     for use in (missions.open, lambda name: missions.export(name, missions.root / "backup.sqlite")):
@@ -73,7 +74,7 @@ def test_a_damaged_mission_is_refused_and_the_other_one_stays_open(service):
 def test_a_mission_without_its_file_is_not_a_new_one(service, harm):
     missions, _ = service
     missions.create("next")
-    folder = missions.folder("mission")
+    folder = MissionFolder.of(missions.root, "mission")
     folder.worker_lock.touch()
     folder.store.unlink()
     if harm == "empty":

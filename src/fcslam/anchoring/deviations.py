@@ -85,7 +85,7 @@ class _Wall:
     points: FloatArray
     normals: FloatArray
     off_m: float | None
-    """Median distance of the other map's wall; None if there is none close by."""
+    """Median distance of the other map's wall; None if no wall is close by."""
 
     @property
     def normal(self) -> FloatArray:
@@ -150,7 +150,7 @@ def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
 
 
 def _across(points: FloatArray, normals: FloatArray, field: SurfelField) -> FloatArray:
-    """Distance of the other map's surface from each point (N, 2) along its normal; NaN if there is none close by."""
+    """Distance of the other map's surface from each point (N, 2) along its normal; NaN if no surface is close by."""
     across = np.full(len(points), np.nan)
     for shift_m in sorted(np.arange(-_STEPS, _STEPS + 1) * SPACING_M, key=abs):
         rows = np.flatnonzero(np.isnan(across))

@@ -93,8 +93,6 @@ class _Place:
 
     pose: FloatArray
     """Shape (3,), weighted mean of its sightings."""
-    variance_m2: float
-    """Of its position along each axis."""
     sightings: tuple[TagSighting, ...]
 
 
@@ -151,7 +149,7 @@ class MapTags:
         variances, turns = covariances[:, :2, :2].trace(axis1=1, axis2=2) / 2.0, covariances[:, 2, 2]
         xy = np.average(poses[:, :2], axis=0, weights=1.0 / variances)
         heading = np.arctan2(*((np.sin(poses[:, 2]) / turns).sum(), (np.cos(poses[:, 2]) / turns).sum()))
-        return _Place(np.append(xy, heading), float(1.0 / (1.0 / variances).sum()), tuple(sightings))
+        return _Place(np.append(xy, heading), tuple(sightings))
 
     def report(self, k: int) -> list[dict[str, Any]]:
         """What ``tags.json`` says about the tags of map ``k``."""

@@ -50,7 +50,7 @@ def find_files(folder: Path | None) -> ServiceFiles:
     """The files that are there.
 
     Raises:
-        ServiceError: there is none.
+        ServiceError: no file is there.
     """
     from fcslam.errors import ServiceError
 

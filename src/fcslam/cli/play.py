@@ -175,16 +175,13 @@ def _speed(text: str) -> float | None:
 
 
 def _check_name(name: str) -> None:
+    from fcslam.cloud.sessions import check_robot
     from fcslam.errors import PacketError, SourceError
-    from fcslam.wire.checks import check_name
 
     try:
-        check_name(name, "robot")
+        check_robot(name)
     except PacketError as error:
         raise SourceError(f"{error}; give another one: NAME=LOG") from error
-    stem, plus, number = name.rpartition("+")
-    if plus and number.isdigit():
-        raise SourceError(f"robot: {name!r} is the name of a later session of {stem!r}; give another one: NAME=LOG")
 
 
 def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kBps: float | None, floor: str) -> str:

@@ -47,7 +47,9 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
     if store is not None:
         raise ServiceError("--learn works with missions in --data; leave out --store")
     config = data / LEARNING_FILE
-    settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
+    settings = FleetLearningSettings()
+    if config.exists():
+        settings = load(FleetLearningSettings, config, over=settings)
     if not settings.federated.on_revisits:
         raise ServiceError(f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes")
     require_training_libraries("flwr", extra="federated")

@@ -31,7 +31,7 @@ class Cloud:
         self._packets: dict[PacketNumber, Packet] = {}
         """Those that this cloud applied itself."""
         self._read: Callable[[PacketNumber], Packet] | None = None
-        """Gives the others; None: there are none."""
+        """Gives the others; None if this cloud applied all itself."""
         self._corrections: dict[str, SessionCorrection] = {}
         """The newest that was sent, by session."""
         self._sent = 0

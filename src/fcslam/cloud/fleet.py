@@ -13,7 +13,6 @@ from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
 from fcslam.cloud.edits import floors, is_removed, needs_new_fleet
-from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.placement import T_placed_map
@@ -22,7 +21,7 @@ from fcslam.cloud.result import FleetResult, Fusion, conclude, map_indices
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
-from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.settings import FleetConfig, FusionStrategy
 from fcslam.cloud.shared_words import SharedWords
 from fcslam.cloud.stage_times import StageTimes
 from fcslam.cloud.tags import SeenTags
@@ -230,7 +229,7 @@ class Fleet:
         decisions.restore(self._decisions.state())
         fusion = decisions.reevaluate(final=True)
         if self._config.fusion is not FusionStrategy.JOINT:
-            fusion = fuse_rigidly(decisions.closures, fusion.T_local_base, self._config.fusion)
+            fusion = fuse_rigidly(decisions.closures, fusion.T_local_base)
         result = conclude(self._sessions, graph, decisions.closures, fusion, decisions.version, decisions.changes)
         return replace(result, sightings=self._tags.of(self._present()))
 
@@ -302,7 +301,7 @@ class Fleet:
             return None
         poses = {session: self._graph.trajectory(session) for session in self._present()}
         own: dict[str, FloatArray] = {session: frozen(se2.between(T[0], T)) for session, T in poses.items()}
-        return fuse_rigidly(self._present_closures(), own, self._config.fusion)
+        return fuse_rigidly(self._present_closures(), own)
 
     def _correction(self, session: str, indices: Mapping[str, int], rigid: Fusion | None) -> Correction | None:
         if session not in indices:

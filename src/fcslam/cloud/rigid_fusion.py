@@ -2,10 +2,9 @@
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
 translation between the two, eqs. (5) and (6). The paper does not say which two. Here two points are valid if they lie
-``DIRECTION_M`` or more apart and equally far in both maps, as maps are rigid. ``two_point`` takes the two most similar
-such matches, ``first_two`` the first two to arrive. No other closure is asked and nothing is optimized: two false
-matches that fit each other turn a whole map, and the drift within the robots' maps stays. ``n_point`` is the same with
-all matched points, in the least squares sense. All are here to be compared with the joint graph.
+``DIRECTION_M`` or more apart and equally far in both maps, as maps are rigid, and the two most similar such matches
+count. No other closure is asked and nothing is optimized: two false matches that fit each other turn a whole map, and
+the drift within the robots' maps stays. It is here to be compared with the joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
@@ -18,10 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry
-from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
-from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
+from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.cluster import DIRECTION_M
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
@@ -46,12 +44,10 @@ class _Match:
         return min(apart_a, apart_b) >= DIRECTION_M and abs(apart_a - apart_b) <= EQUAL_M
 
 
-_Links = Mapping[tuple[str, str], Sequence[_Match]]
+_Links = Mapping[tuple[str, str], tuple[_Match, _Match]]
 
 
-def fuse_rigidly(
-    closures: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray], strategy: FusionStrategy
-) -> Fusion:
+def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray]) -> Fusion:
     """Every robot's own map (N, 3) moved as a whole, into the frame of the robot of its map that started first.
 
     ``T_local_base`` has the robots in the order in which they started. Whatever geometry verified between two robots
@@ -60,11 +56,11 @@ def fuse_rigidly(
     """
     order, entries = list(T_local_base), list(closures)
     matches = [_match(entry, T_local_base, order) for entry in entries if _is_valid(entry)]
-    links = _links(matches, strategy)
+    links = _links(matches)
     maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
     used: dict[ClosureEntry, Reason] = {}
     for robots, members in links.items():
-        if _join(robots, _relation(members, strategy), maps, frames):
+        if _join(robots, _relation(members), maps, frames):
             used |= {match.entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for match in members}
     T_map_base: dict[str, FloatArray] = {
         robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
@@ -85,29 +81,26 @@ def _match(entry: ClosureEntry, T_local_base: Mapping[str, FloatArray], order: S
     return _Match(entry, (j.robot, i.robot), xy_j, xy_i)
 
 
-def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
-    """The matches that align the maps of each pair of robots; pairs in the order in which they had two."""
+def _links(matches: Sequence[_Match]) -> _Links:
+    """The two matches that align the maps of each pair of robots; pairs with the most similar ones come first."""
     known: dict[tuple[str, str], list[_Match]] = {}
-    two: dict[tuple[str, str], Sequence[_Match]] = {}
-    if strategy is FusionStrategy.TWO_POINT:
-        matches = sorted(matches, key=lambda match: -match.entry.closure.similarity)
-    for match in matches:
-        if match.robots in two and strategy is not FusionStrategy.N_POINT:
+    two: dict[tuple[str, str], tuple[_Match, _Match]] = {}
+    for match in sorted(matches, key=lambda match: -match.entry.closure.similarity):
+        if match.robots in two:
             continue
         earlier = known.setdefault(match.robots, [])
         partner = next((other for other in earlier if match.is_valid_with(other)), None)
         if partner is not None:
-            two.setdefault(match.robots, (partner, match))
+            two[match.robots] = partner, match
         earlier.append(match)
-    return {robots: known[robots] for robots in two} if strategy is FusionStrategy.N_POINT else two
+    return two
 
 
-def _relation(matches: Sequence[_Match], strategy: FusionStrategy) -> FloatArray:
-    """T_a_b (3,) of two robots' own maps; NaN if the points contradict each other so much that no rotation is best."""
+def _relation(matches: Sequence[_Match]) -> FloatArray:
+    """T_a_b (3,) of two robots' own maps; NaN if the points do not give its rotation."""
     # A robot may claim to be so far away that its two points are one to a computer.
-    align = n_point_alignment if strategy is FusionStrategy.N_POINT else two_point_alignment
     try:
-        return align([match.xy_a for match in matches], [match.xy_b for match in matches])
+        return two_point_alignment([match.xy_a for match in matches], [match.xy_b for match in matches])
     except ValueError:
         return np.full(3, np.nan)
 

@@ -258,7 +258,7 @@ class SessionStore:
         return self._hellos[robot].vocabularies if robot in self._hellos else {}
 
     def floor(self, robot: str) -> str:
-        """Floor that a user gave to the session, or else the one that it named; empty if there is none."""
+        """Floor that a user gave to the session, or else the one that it named; empty if neither is known."""
         return self._floors.get(robot, self._hellos[robot].floor)
 
     def lasers(self, robot: str) -> tuple[LaserModel, ...]:

@@ -19,6 +19,7 @@ from fcslam.records import (
     TagSighting,
     WordPlace,
 )
+from fcslam.wire.checks import check_name
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 
 _SESSION = re.compile(r"(.+)\+(\d+)", re.ASCII)
@@ -41,11 +42,12 @@ def robot_and_epoch(session: str) -> tuple[str, int]:
 
 
 def check_robot(robot: str) -> None:
-    """Refuse a robot whose name is that of another robot's session.
+    """Refuse a robot whose name cannot be used, or is that of another robot's session.
 
     Raises:
-        PacketError: its name ends in ``+`` and digits.
+        PacketError: it is not a name, or ends in ``+`` and digits.
     """
+    check_name(robot, "robot")
     taken = _SESSION.fullmatch(robot)
     if taken:
         raise PacketError(f"robot: '{robot}' is the name of a session of '{taken[1]}'; name it without '+{taken[2]}'")

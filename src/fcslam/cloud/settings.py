@@ -1,16 +1,25 @@
 """The settings of the cloud; a mission stores them, so that its result can be computed again from its packets."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
 from fcslam.cloud.claims import ClaimLimits
-from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.config import Settings
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.places.matcher import MatchDecision, MatcherConfig
+
+
+class FusionStrategy(StrEnum):
+    """Ways to fuse maps."""
+
+    JOINT = "joint"
+    """All robots in one robust pose graph, every closure decided by all evidence."""
+    TWO_POINT = "two_point"
+    """Rigid maps, each pair aligned by its two most similar matched points: the paper's eqs. (5)-(6)."""
 
 
 class FleetConfig(Settings):
@@ -21,7 +30,7 @@ class FleetConfig(Settings):
     )
     fusion: FusionStrategy = Field(
         default=FusionStrategy.JOINT,
-        description="how maps are fused: joint (one robust graph), or rigid maps by two_point, first_two or n_point",
+        description="how maps are fused: joint (one robust graph), or two_point (rigid maps, as in the paper)",
     )
     sight_m: float = Field(
         default=6.0, gt=0, description="largest distance, in metres, at which places in the same map are compared"
@@ -67,7 +76,7 @@ class FleetConfig(Settings):
         if self.matcher.decision is MatchDecision.SIMILARITY and self.fusion is FusionStrategy.JOINT:
             raise ValueError(
                 "matcher.decision similarity measures no transform, which the joint graph needs; "
-                "set fusion to two_point, first_two or n_point"
+                "set fusion to two_point"
             )
         return self
 

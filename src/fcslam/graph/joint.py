@@ -336,7 +336,7 @@ def _solve_supported(
     kept = factors.restricted(subgraph, supported[graph.arrays().robust])
     starts = (start, initialize(subgraph)) if joined else (start,)
     solutions = [optimize_gnc(subgraph, poses, factors=kept) for poses in starts]
-    best = min(solutions, key=lambda solution: solution.stats.final_cost)
+    best = min(solutions, key=lambda solution: solution.cost)
     return _expand_weights(best, supported)
 
 

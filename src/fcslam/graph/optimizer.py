@@ -36,17 +36,6 @@ _MAXIMUM_STEPS = 100
 """Largest number of its steps; closures that are still undecided are then decided by their residuals."""
 
 
-@dataclass(frozen=True, slots=True)
-class SolveStats:
-    """Statistics of a solve."""
-
-    iterations: int
-    """Solver iterations of all steps together."""
-    initial_cost: float
-    """Half the sum of the edges' losses at the initial poses."""
-    final_cost: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """Optimized poses and the weight of each edge."""
@@ -55,7 +44,10 @@ class Solution:
     """Shape (N, 3), metres and radians."""
     weights: FloatArray
     """Shape (E,), in [0, 1]; 1 for odometry."""
-    stats: SolveStats
+    iterations: int
+    """Solver iterations of all steps together."""
+    cost: float
+    """Half the sum of the edges' losses at the poses."""
 
 
 def optimize(
@@ -83,7 +75,7 @@ def optimize(
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     if not graph.edges:
-        return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+        return _solution(graph, start, start, np.ones(0), 0, 0.0)
     robust = graph.arrays().robust
     counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
     problem, values = cache.robust(loss, counts, start), cache.values(start)
@@ -92,7 +84,7 @@ def optimize(
     cache.read(result, poses)
     cache.complete(poses)
     weights = counts * loss.weights(graph.chi2(poses)[robust])
-    return _solution(graph, start, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
+    return _solution(graph, start, poses, weights, iterations, problem.error(result))
 
 
 def optimize_gnc(
@@ -124,7 +116,7 @@ def optimize_gnc(
     start, cache = _start(graph, initial), _cache(graph, factors)
     robust = graph.arrays().robust
     if not graph.edges:
-        return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+        return _solution(graph, start, start, np.ones(0), 0, 0.0)
     steps = _Steps(cache, start)
     steps.solve(np.ones(int(robust.sum())), _FIRST_ITERATIONS)
     _graduate(steps)
@@ -161,7 +153,7 @@ def refine_inliers(
     if trusted.shape != (len(graph.edges),):
         raise ValueError(f"weights must be of shape ({len(graph.edges)},), not {trusted.shape}")
     if not graph.edges:
-        return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+        return _solution(graph, start, start, np.ones(0), 0, 0.0)
     robust = graph.arrays().robust
     steps = _Steps(cache, start)
     decided = _alternate(steps, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
@@ -226,8 +218,8 @@ def _alternate(steps: _Steps, weights: FloatArray) -> FloatArray:
 def _with_truncated_cost(graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray) -> Solution:
     poses, robust = steps.poses, graph.arrays().robust
     steps.cache.complete(poses)
-    costs = [_truncated(graph.chi2(x), robust) for x in (start, poses)]
-    return _solution(graph, start, poses, weights, SolveStats(steps.iterations, *costs))
+    cost = _truncated(graph.chi2(poses), robust)
+    return _solution(graph, start, poses, weights, steps.iterations, cost)
 
 
 def _truncated_weights(chi2: FloatArray, mu: float) -> FloatArray:
@@ -266,7 +258,7 @@ def _cache(graph: PoseGraph, factors: FactorCache | None) -> FactorCache:
 
 
 def _solution(
-    graph: PoseGraph, start: FloatArray, poses: FloatArray, closure_weights: FloatArray, stats: SolveStats
+    graph: PoseGraph, start: FloatArray, poses: FloatArray, closure_weights: FloatArray, iterations: int, cost: float
 ) -> Solution:
     """The solution, with each connected component moved so that its first variable is at its initial pose."""
     weights = np.ones(len(graph.edges))
@@ -275,4 +267,4 @@ def _solution(
     first = anchors(components)
     moved = se2.compose(se2.compose(start[first], se2.inverse(poses[first]))[components], poses)
     moved[first] = start[first]
-    return Solution(frozen(moved), frozen(weights), stats)
+    return Solution(frozen(moved), frozen(weights), iterations, cost)

@@ -63,7 +63,7 @@ def solve_single_robot(
         refine_inliers(graph, first.poses, weights, factors=factors),
         optimize_gnc(graph, odometry, factors=factors),
     )
-    return min(solutions, key=lambda solution: solution.stats.final_cost)
+    return min(solutions, key=lambda solution: solution.cost)
 
 
 def _robust_start(graph: PoseGraph, chains: Chains | None) -> FloatArray:

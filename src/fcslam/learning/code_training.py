@@ -94,7 +94,7 @@ def train_codes(
             training diverged.
     """
     if not revisits:
-        raise TrainingError("codes are trained on places that were seen again, and there are none; set trained to all")
+        raise TrainingError("codes are trained on places seen again, but no place was; set trained to all")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
     known = inputs.of(network, revisits.images, settings.seed if plan.compatible else None, device)

@@ -10,7 +10,6 @@ from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
 from fcslam.learning.batches import TrainingBatch
-from fcslam.learning.localization import localization_loss
 from fcslam.learning.network import Description, Maps, sample_codes
 from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import Encoder, LossSettings
@@ -82,8 +81,6 @@ def objective(
         "detector": losses.detector_loss(*shift_grid(points, grid_shift)),
         "agreement": losses.agreement_loss(*views_aligned(points[0].sigmoid(), batch)),
     }
-    if weights.localization > 0.0:
-        parts["localization"] = localization_loss(points[0].sigmoid(), batch.homographies)
     factors = {name: getattr(weights, name) for name in parts}
     if bits is not None:
         logits = sample_codes(maps.code_logits.float(), batch.teacher_points)

@@ -49,11 +49,6 @@ class LossSettings(Settings):
     agreement: float = Field(
         default=1.0, ge=0.0, description="weight of the loss that makes the keypoint maps of both views agree"
     )
-    localization: float = Field(
-        default=0.0,
-        ge=0.0,
-        description="weight of the loss of the distance between keypoints that both views show",
-    )
     keypoints: float = Field(
         default=100.0,
         ge=0.0,

@@ -32,10 +32,10 @@ LARGEST_BIAS: Final = 0.25
 
 
 @torch.inference_mode()
-def detect(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> tuple[FloatArray, Codes]:
+def detect(network: KeypointNetwork, image: Tensor) -> tuple[FloatArray, Codes]:
     """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, and their codes (N, 32)."""
     maps = network(image)
-    points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), LEAST_SCORE, NMS_PX, most)
+    points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), LEAST_SCORE, NMS_PX, MOST_POINTS)
     return points.astype(np.float64), sample_codes(maps.code_logits[0].cpu().numpy(), points)
 
 

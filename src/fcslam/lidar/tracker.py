@@ -324,7 +324,7 @@ def _is_good(match: ScanMatch, error: OdometryError) -> bool:
 def weakest_sigma_m(information: FloatArray) -> float:
     """Standard deviation of the position by a scan's points, in the direction that they fix least, metres.
 
-    ``information`` is over (x, y) and theta, shape (3, 3); infinity if there is none.
+    ``information`` is over (x, y) and theta, shape (3, 3); infinity if the points fix no position.
     """
     (xx, xy), (_, yy) = information[:2, :2].tolist()
     weakest = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)  # the lesser eigenvalue

@@ -12,7 +12,6 @@ from fcslam.geometry.beams import is_field_of_view, misfit, spread
 from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
-from fcslam.wire.checks import check_name
 
 JPEG_QUALITY = 95
 """JPEG quality of images that are given as arrays."""
@@ -27,7 +26,6 @@ def checked_robot(name: str) -> str:
         InputError: a robot cannot be called so.
     """
     try:
-        check_name(name, "robot")
         check_robot(name)
     except PacketError as error:
         raise InputError(f"{error}; give the robot another name") from error

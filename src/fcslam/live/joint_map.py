@@ -17,7 +17,7 @@ from fcslam.live.records import RobotPose
 from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, frozen, without
-from fcslam.robot.localization import Localizer
+from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.track import ScanTrack
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Hello, Packet
@@ -90,7 +90,7 @@ class JointMap:
                 with self._lock:
                     self._drawn.append(_DrawnKeyscan(packet.epoch, keyscan, laser, on_teammates))
 
-    def draw(self, part: int, track: ScanTrack, localizer: Localizer) -> OccupancyMap | None:
+    def draw(self, part: int, track: ScanTrack, localizer: CorrectedOdometry) -> OccupancyMap | None:
         """The joint map, with the keyscans of a part drawn into it that the cloud has not drawn yet.
 
         None: the server has not drawn the map that the robot's poses are in.

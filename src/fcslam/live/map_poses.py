@@ -7,7 +7,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.records import Correction, FloatArray
-from fcslam.robot.localization import Localizer
+from fcslam.robot.corrected_odometry import CorrectedOdometry
 
 
 class MapPoses:
@@ -15,15 +15,15 @@ class MapPoses:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._own: dict[int, Localizer] = {}
-        self._by_server: dict[int, Localizer] = {}
+        self._own: dict[int, CorrectedOdometry] = {}
+        self._by_server: dict[int, CorrectedOdometry] = {}
         self._T_map_own: dict[int, FloatArray] = {}
         """Where the robot's own map lies in the map of the server, by its newest correction."""
         self._lock = threading.Lock()
 
-    def localizer(self, part: int) -> Localizer:
+    def localizer(self, part: int) -> CorrectedOdometry:
         """The localizer of a part: with the server's corrections as soon as there is one, else the robot's own."""
-        return self._by_server.get(part) or self._own.setdefault(part, Localizer(self._clock))
+        return self._by_server.get(part) or self._own.setdefault(part, CorrectedOdometry(self._clock))
 
     def T_map_own(self, part: int) -> FloatArray:
         """Where the robot's own map lies in the map of its poses, shape (3,)."""
@@ -32,7 +32,7 @@ class MapPoses:
     def correct(self, part: int, correction: Correction, is_server_away: bool) -> None:
         """Take a correction of the robot's own map. While the server is away, it counts for the pose."""
         with self._lock:
-            own = self._own.setdefault(part, Localizer(self._clock))
+            own = self._own.setdefault(part, CorrectedOdometry(self._clock))
             own.correct(correction)
             if part in self._T_map_own and own.correction is not None and is_server_away:
                 T_map_odom = se2.compose(self._T_map_own[part], own.correction.T_map_odom)
@@ -41,7 +41,7 @@ class MapPoses:
     def correct_by_server(self, part: int, correction: Correction) -> None:
         """Take a correction of the server."""
         with self._lock:
-            by_server = self._by_server.setdefault(part, Localizer(self._clock))
+            by_server = self._by_server.setdefault(part, CorrectedOdometry(self._clock))
             by_server.correct(correction)
             if by_server.correction is correction:
                 own = self._own.get(part)

@@ -52,7 +52,7 @@ class Frontier(NamedTuple):
     gain_m2: float
     """Unknown area around it."""
     distances_m: tuple[float, ...]
-    """Length of the shortest path from each robot; infinite if there is none."""
+    """Length of the shortest path from each robot; infinite if no path leads there."""
 
 
 def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -> list[Frontier]:

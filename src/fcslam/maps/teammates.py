@@ -90,7 +90,7 @@ def _suspects(
     paths: Sequence[RobotPath],
     radius_m: float,
 ) -> _Suspects | None:
-    """Points of other robots' scans that lie on ``robot``; None if there are none."""
+    """Points of other robots' scans that lie on ``robot``; None if no point does."""
     numbers, beams, points = [], [], []
     begin, end = _whereabouts(paths, stamps)
     at = np.array([scan.T_map_base[:2] for scan in scans]).reshape(-1, 2)

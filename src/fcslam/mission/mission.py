@@ -39,7 +39,7 @@ from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
 from fcslam.storage.state_file import State
-from fcslam.wire.checks import check_floor, check_name
+from fcslam.wire.checks import check_floor
 from fcslam.wire.ledger import Counter, Ledger, Traffic
 from fcslam.wire.messages import Packet, PacketKind
 from fcslam.wire.packets import Label, SizedPacket, decode, measure
@@ -194,7 +194,7 @@ class MissionCloud:
         """Take over the state after all packets of the earlier mission, so that they need not be applied again.
 
         Args:
-            first: the first packet of the new ones; None: there are none.
+            first: the first packet of the new ones; None if no packets were added.
 
         Returns:
             Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
@@ -361,7 +361,6 @@ def check_robots(sources: Sequence[Source]) -> None:
                 f"two recordings are called '{name}'; a robot is named by its file, so name one: NAME=LOG"
             )
         try:
-            check_name(name, "robot")
             check_robot(name)
         except PacketError as error:
             raise SourceError(f"{error}; a robot is named by its file, so rename it, or give NAME=LOG") from error

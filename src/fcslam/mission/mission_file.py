@@ -105,7 +105,7 @@ def read_mission(path: Path) -> SavedMission:
     """Read a mission file; it is not changed.
 
     Raises:
-        SourceError: there is none, it is damaged or of another version, or a packet in it cannot be read.
+        SourceError: the file is missing, damaged or of another version, or a packet in it cannot be read.
     """
     path = mission_path(path)
     try:
@@ -160,7 +160,7 @@ def mission_state_bytes(mission: bytes, state: State) -> bytes:
 
 
 def _state_beside(path: Path) -> State | None:
-    """The state that fits this program and the mission file at ``path``; None if there is none."""
+    """The state that fits this program and the mission file at ``path``; None if no such state is stored."""
     place = path.with_name(STATE)
     if path.name != MISSION or not place.exists():
         return None
@@ -242,7 +242,7 @@ def mission_path(path: Path) -> Path:
     """The mission file that a user names by itself or by its run folder.
 
     Raises:
-        SourceError: there is none.
+        SourceError: there is no mission file at ``path``.
     """
     path = path / MISSION if path.is_dir() else path
     if not path.is_file():

@@ -146,7 +146,7 @@ class MissionStore:
     """
 
     def __init__(self, place: Path | RowStore, *, is_checked: bool = False) -> None:
-        """Open a mission: that of a file, which is created if there is none, or that of a server.
+        """Open a mission: that of a file, which is created if it is missing, or that of a server.
 
         ``is_checked``: ``check_mission`` passed the file just now.
 
@@ -355,7 +355,7 @@ class MissionStore:
             database.update(FINALIZATIONS, {"run": run, "failure": failure}, "number = :number", {"number": number})
 
     def fact(self, name: str) -> str | None:
-        """A stored fact about the mission; None if there is none."""
+        """A stored fact about the mission; None if the mission does not have it."""
         value: str | None = self._database.value("SELECT value FROM facts WHERE name = ?", (name,))
         return value
 

@@ -56,7 +56,7 @@ class ShownRun:
 
     @property
     def run_folder(self) -> Path | None:
-        """The run folder as it is now; None: there is none yet."""
+        """The run folder as it is now; None before the first one is written."""
         return self._place.resolve() if is_run_folder(self._place) else None
 
     @property

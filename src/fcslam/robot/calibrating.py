@@ -370,7 +370,7 @@ def _share(calibration: MotionCalibration) -> Estimate | None:
 
 
 def _stamped(first_s: float, last_s: float) -> str | None:
-    """Which beam is measured at the stamp, in the order of time; None if it is none of these."""
+    """Which beam is measured at the stamp, in the order of time; None if it is another one."""
     earliest_s, latest_s = min(first_s, last_s), max(first_s, last_s)
     times = (("first", earliest_s), ("last", latest_s), ("middle", 0.5 * (earliest_s + latest_s)))
     return next((where for where, time_s in times if abs(time_s) <= STAMP_TOLERANCE_S), None)

@@ -260,7 +260,7 @@ class RobotFrontend:
         return self.ready(wait=True)
 
     def _with_motion(self, scan: LaserScan) -> LaserScan:
-        """The scan with its odometry free of jumps, or with a prediction if there is none."""
+        """The scan with its odometry free of jumps, or with a prediction if the scan has no odometry."""
         if self.prediction is None and self._is_without_odometry(scan):
             self.prediction = MotionPrediction()
             self.begin_session()

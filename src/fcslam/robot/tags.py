@@ -22,7 +22,7 @@ TILT_SIGMA_RAD: Final = 0.05
 MOST_TILT: Final = 0.5
 """A tag whose normal is farther off the horizontal and the vertical than by this sine has no heading in the plane."""
 LARGEST_CHI2: Final = 30.0
-"""A square whose corners fit a tag worse is none."""
+"""A square whose corners fit worse is not a tag."""
 AMBIGUITY_CHI2: Final = 12.0
 """A square seen head-on has two poses that fit about as well. A pose counts if the other one costs this much more."""
 POSITION_SIGMA: Final = (0.01, 0.01)

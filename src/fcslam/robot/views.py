@@ -24,6 +24,8 @@ from fcslam.robot.keyframe_folder import KeyframeFolder
 
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
+EVERY_M, EVERY_RAD = 1.0, 0.5
+"""Travel or turn after which an image becomes a camera place; after the turn, about half of the view is new."""
 FEWEST_KEYPOINTS = 20
 """Least number of keypoints with a position; an image with fewer is not a place."""
 
@@ -31,12 +33,6 @@ FEWEST_KEYPOINTS = 20
 class ViewsConfig(Settings):
     """Which images become places, and which are kept."""
 
-    every_m: float = Field(default=1.0, gt=0.0, description="travel after which an image becomes a camera place [m]")
-    every_rad: float = Field(
-        default=0.5,
-        gt=0.0,
-        description="turn after which an image becomes a camera place; at 0.5 rad about half of the view is new [rad]",
-    )
     ceiling_m: float = Field(
         default=3.0, gt=0.0, description="height of the ceiling above the floor; keypoints above it are dropped [m]"
     )
@@ -161,7 +157,7 @@ class ViewExtractor:
             return True
         seen_from, T_odom_last = self._last
         motion = se2.between(T_odom_last, T_odom_base)
-        moved = np.hypot(motion[0], motion[1]) >= self._config.every_m or abs(motion[2]) >= self._config.every_rad
+        moved = np.hypot(motion[0], motion[1]) >= EVERY_M or abs(motion[2]) >= EVERY_RAD
         return bool(moved) and keyscan > seen_from
 
 

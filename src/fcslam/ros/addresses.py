@@ -36,7 +36,7 @@ def parse_address(text: str) -> RosAddress:
     """The address in ``text``.
 
     Raises:
-        NetworkError: its namespace is none.
+        NetworkError: its namespace is not a valid one.
     """
     match = _ADDRESS.fullmatch(text)
     assert match is not None  # as is_address says

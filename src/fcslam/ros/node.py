@@ -235,7 +235,7 @@ class RobotNode:
             self._outputs.closures(stamp_ns, self._robot.closures())
 
     def _publish_joint_map(self, only_changes: bool) -> bool:
-        """Publish the joint map as it is now, as ``Outputs.map``. False: there is none yet."""
+        """Publish the joint map as it is now, as ``Outputs.map``. False before the robot has one."""
         joint = self._robot.joint_map()
         if joint is None or self._pose is None:
             return False

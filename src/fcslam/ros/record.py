@@ -5,7 +5,6 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from itertools import count, pairwise
 from pathlib import Path
@@ -32,7 +31,6 @@ def record(
     output: Path,
     stop: threading.Event,
     notify: Notify,
-    watch: Callable[[Counter[str]], None] = lambda _: None,
 ) -> Counter[str]:
     """Write all messages of the sensors, and /clock, until ``stop``; returns their number by topic.
 
@@ -67,7 +65,6 @@ def record(
                         continue
                     recording.write(topic, kinds[topic], received_ns, payload)
                     counts[topic] += 1
-                    watch(counts)
                 recording.close()
             except BaseException as error:
                 if recording.rescue(error):

@@ -34,7 +34,7 @@ _TRIGGER_HASH: Final = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5
 _ADMIN, _NODE = "@ros2_lv", 0
 _KINDS: Final = {"MP": True, "MS": False}
 """Whether an endpoint publishes, by its name in a token."""
-_RELIABLE, _BEST_EFFORT, _LATCHED, _VOLATILE = "1", "2", "1", "2"
+_RELIABLE, _BEST_EFFORT, _LATCHED = "1", "2", "1"
 _HEARTBEAT_S = 0.5
 """Period at which a publisher of latched messages says which was its last one."""
 _PARTS = 13

@@ -145,11 +145,6 @@ def _camera(
     return camera, None if camera is None else calibrated[camera]
 
 
-def _is_depth(topic: str, known: Mapping[str, str]) -> bool:
-    """Whether a topic has depth images with their calibration."""
-    return known[topic] == IMAGE and is_depth(topic) and known.get(info_beside(topic)) == CAMERA_INFO
-
-
 def info_beside(camera: str) -> str:
     """The topic of the calibration of a camera."""
     return camera.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"

@@ -167,7 +167,7 @@ def identity(folder: Path) -> tuple[int, int]:
     """Return an identifier that differs if another run folder replaces this one: no file in a run folder changes.
 
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: there is no run folder.
     """
     found = folder.stat()
     return found.st_ino, found.st_mtime_ns

@@ -36,7 +36,7 @@ def read_robots(path: Path, within: Path | None = None) -> dict[str, tuple[int, 
     """Map index and floor by robot, in the order of robots.csv; ``within``: see ``untrusted.open_file``.
 
     Raises:
-        ValueError: a column is missing, a map index or a floor is none, or a robot occurs twice.
+        ValueError: a column is missing, a map index or a floor is not valid, or a robot occurs twice.
     """
     rows = _read_csv(path, _ROBOT_COLUMNS, within)
     return _unique(path.name, ((row["robot"], (int(row["map"]), _floor(row.get(_FLOOR) or ""))) for row in rows))

@@ -84,7 +84,7 @@ def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
 
 
 def _authority(folder: Path, now: datetime.datetime) -> Authority:
-    """The authority of the folder, made if there is none."""
+    """The authority of the folder, made if the folder has no authority."""
     if (folder / "ca.key").exists():
         found = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
         if not isinstance(found, ec.EllipticCurvePrivateKey):

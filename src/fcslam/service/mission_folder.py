@@ -16,8 +16,10 @@ import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from fcslam.runs import Run
+from fcslam.wire.checks import check_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +27,16 @@ class MissionFolder:
     """One mission's files."""
 
     path: Path
+
+    @classmethod
+    def of(cls, root: Path, name: str) -> Self:
+        """Files of a mission below the folder ``root``, there or not.
+
+        Raises:
+            PacketError: ``name`` is not a valid name.
+        """
+        check_name(name, "mission")
+        return cls(root / "missions" / name)
 
     @property
     def name(self) -> str:

@@ -18,7 +18,6 @@ from fcslam.service.supervisor import RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing, write_file
-from fcslam.wire.checks import check_name
 
 FIRST = "mission"
 """Name of a new service's first mission."""
@@ -68,7 +67,7 @@ class OpenMission:
         return self.folder.joint_maps
 
     def result(self, name: str) -> Path | None:
-        """The run folder of a requested result; None if there is none."""
+        """The run folder of a requested result; None if it does not exist."""
         return existing_result(self.folder, name)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
@@ -167,22 +166,13 @@ class Missions:
         """All missions."""
         return sorted(path.parent.name for path in (self.root / "missions").glob("*/mission.sqlite"))
 
-    def folder(self, name: str) -> MissionFolder:
-        """Files of a mission, there or not.
-
-        Raises:
-            PacketError: it is not a name.
-        """
-        check_name(name, "mission")
-        return MissionFolder(self.root / "missions" / name)
-
     def create(self, name: str) -> None:
         """Create a mission and open it.
 
         Raises:
             ServiceError: there is one of this name.
         """
-        if self.folder(name).store.exists():
+        if MissionFolder.of(self.root, name).store.exists():
             raise ServiceError(f"mission '{name}' exists; open it or choose another name")
         self._switch(name)
 
@@ -190,28 +180,28 @@ class Missions:
         """Open a mission: robots' packets go to it from now on. The mission that was open is closed.
 
         Raises:
-            ServiceError: there is none of this name.
+            ServiceError: no mission has this name.
         """
-        if not self.folder(name).store.exists():
+        if not MissionFolder.of(self.root, name).store.exists():
             raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
         self._switch(name)
 
     def result(self, name: str, number: int) -> Path | None:
-        """The run folder of a result of a mission; None if there is none.
+        """The run folder of a result of a mission; None if it does not exist.
 
         Raises:
             PacketError: it is not a name.
         """
-        return existing_result(self.folder(name), str(number))
+        return existing_result(MissionFolder.of(self.root, name), str(number))
 
     def export(self, name: str, path: Path) -> None:
         """Write a mission as one new file.
 
         Raises:
-            ServiceError: there is none of this name.
+            ServiceError: no mission has this name.
             StoreError: it cannot be written.
         """
-        folder = self.folder(name)
+        folder = MissionFolder.of(self.root, name)
         if name == self.open_mission.folder.name:
             self.open_mission.store.export(path)
             return
@@ -230,7 +220,7 @@ class Missions:
             ServiceError: there is one of this name.
             StoreError: it cannot be written.
         """
-        folder = self.folder(name)
+        folder = MissionFolder.of(self.root, name)
         if folder.store.exists():
             raise ServiceError(f"mission '{name}' exists; choose another name")
         with translate_errors(folder.store):
@@ -255,7 +245,7 @@ class Missions:
         before.close()
 
     def _opened(self, name: str) -> OpenMission:
-        folder = self.folder(name)
+        folder = MissionFolder.of(self.root, name)
         with translate_errors(folder.path):
             folder.path.mkdir(parents=True, exist_ok=True)
         _check_file(folder)

@@ -204,7 +204,7 @@ def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
 
 
 def run_of(mission: ViewedMission) -> Run:
-    """The newest run, without its maps; an empty one if there is none yet.
+    """The newest run, without its maps; an empty one before the first one is written.
 
     Raises:
         EvaluationError: it is broken, or not there any more.

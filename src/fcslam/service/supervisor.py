@@ -31,6 +31,12 @@ Listen = Callable[[str, int], None]
 """Called with a worker's events, on a separate thread."""
 
 
+def tell(event: str, number: int) -> None:
+    """Write an event of this worker to stdout, where its supervisor reads it."""
+    sys.stdout.write(json.dumps({"event": event, "number": number}) + "\n")
+    sys.stdout.flush()
+
+
 class RunningWorker(Protocol):
     """A worker, wherever it runs."""
 
@@ -105,7 +111,7 @@ class Supervisor:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the worker; None while there is none."""
+        """Process id of the worker; None while no worker runs."""
         process = self._process
         return process.pid if process is not None and process.poll() is None else None
 

@@ -32,7 +32,7 @@ class ViewedMission(Protocol):
 
     @property
     def run_folder(self) -> Path | None:
-        """The newest run folder; its files never change, but another one may replace it. None: there is none yet."""
+        """The newest run folder; its files never change, but another one may replace it. None before the first."""
 
     @property
     def store(self) -> MissionStore:

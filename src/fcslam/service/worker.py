@@ -55,7 +55,7 @@ from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, SharedFiles
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
-from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS
+from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS, tell
 from fcslam.service.warmup import warm_up_fleet
 from fcslam.storage.postgres import Postgres
 from fcslam.storage.state_file import code_version, read_state, write_state
@@ -149,7 +149,7 @@ class Worker:
         tell(PROGRESS, self._applied)
 
     def step(self) -> bool:
-        """Do one piece of work; False: there is none."""
+        """Do one piece of work; False if nothing is left to do."""
         return (
             self._take_edits()
             or self._write_snapshot()
@@ -206,7 +206,7 @@ class Worker:
         return self._log.released - len(self._ready)
 
     def _take_packets(self) -> bool:
-        """Apply packets for about ``AT_ONCE_S``; False: there are none."""
+        """Apply packets for about ``AT_ONCE_S``; False if no packet waits."""
         began = self._clock()
         applied, arrivals = self._applied, self._arrivals
         if not self._ready:
@@ -521,8 +521,8 @@ def main(arguments: Sequence[str]) -> int:
     folder, alone = chosen.folder, _alone(chosen.folder)
     with verifying(chosen.workers, must_connect=False) as verify_pairs, _mission(chosen) as (store, share):
         try:
-            worker = Worker(folder, store, time.monotonic, _print, start_copy, verify_pairs, share)
-            _print(READY, 0)
+            worker = Worker(folder, store, time.monotonic, tell, start_copy, verify_pairs, share)
+            tell(READY, 0)
             while True:
                 wait_s = 0.0 if worker.step() else min(worker.wait_s(), chosen.look_s)
                 if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
@@ -590,11 +590,6 @@ def _alone(folder: MissionFolder) -> IO[str]:
     file = folder.worker_lock.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
-
-
-def _print(event: str, number: int) -> None:
-    sys.stdout.write(json.dumps({"event": event, "number": number}) + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

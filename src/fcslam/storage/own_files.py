@@ -32,7 +32,7 @@ def write_own(path: Path, data: bytes) -> bool:
 
 
 def read_own(path: Path) -> bytes | None:
-    """Read the bytes that this user wrote to ``path``; None if there are none, or another user wrote or changed
+    """Read the bytes that this user wrote to ``path``; None if the file is missing, or another user wrote or changed
     them.
     """
     key = _key()

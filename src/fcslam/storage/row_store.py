@@ -28,7 +28,7 @@ class Found(Protocol):
         """The rows that are left."""
 
     def fetchone(self) -> Any:
-        """The next row; None if there is none."""
+        """The next row; None after the last one."""
 
     def fetchall(self) -> list[Any]:
         """All rows that are left."""

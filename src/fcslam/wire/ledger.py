@@ -53,7 +53,7 @@ class Counter:
     """Counts traffic; ``ledger`` shows it."""
 
     def __init__(self, before: Ledger | None = None) -> None:
-        """``before`` is the traffic so far; None: there was none."""
+        """``before`` is the traffic so far; None: no traffic yet."""
         self._accepted: dict[Label, Traffic] = {} if before is None else dict(before.accepted)
         self._refused = Traffic() if before is None else before.refused
 

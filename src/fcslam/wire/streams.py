@@ -269,7 +269,7 @@ def _code_cells(coder: Coder, data: Bytes, cells: NDArray[np.int64]) -> Coder:
 
 @njit(nogil=True)
 def _common_divisor(values: NDArray[np.int64]) -> int:
-    """Greatest common divisor of all differences; 0 if there are none."""
+    """Greatest common divisor of all differences; 0 if all values are the same."""
     divisor = np.int64(0)
     for k in range(1, len(values)):
         a, b = divisor, abs(values[k] - values[k - 1])

@@ -249,5 +249,5 @@ def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path):
     network = KeypointNetwork("light")
     assert changed <= layer_names(network, network.code_layers)
     assert not same(found, update("b", RevisitExamples(images[::-1], [pair])))
-    with pytest.raises(TrainingError, match="there are none"):
+    with pytest.raises(TrainingError, match="no place was"):
         update("c", RevisitExamples(images))

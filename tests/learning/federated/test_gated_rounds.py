@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
+from fcslam.config import changed
 from fcslam.learning.federated.live_settings import FleetLearningSettings, GateSettings
 from tests.learning.federated.fakes import START, Fake, run, settings, version
 
@@ -79,6 +80,6 @@ def test_a_release_survives_a_kill_between_the_checkpoint_and_its_announcement(t
 
 
 def test_one_setting_of_training_leaves_the_others_of_the_recipe():
-    settings = FleetLearningSettings.model_validate({"federated": {"training": {"seed": 2}}})
+    settings = changed(FleetLearningSettings(), {"federated": {"training": {"seed": 2}}}, "learning.yaml")
     assert settings.federated.training.seed == 2
     assert settings.federated.training.learning_rate == FleetLearningSettings().federated.training.learning_rate == 1e-3

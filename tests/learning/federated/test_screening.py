@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.federated_study.poison import apply_update
 from fcslam.learning.federated.screening import agreements, screen, statistics_distances, update_length
 from fcslam.learning.federated.settings import ScreeningSettings
-from fcslam.learning.federated.weights import apply_update, trained_names, update_vector, weights_error
+from fcslam.learning.federated.weights import trained_names, update_vector, weights_error
 
 RNG = np.random.default_rng(4)
 BEFORE = {

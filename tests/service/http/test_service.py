@@ -195,7 +195,7 @@ def test_viewers_see_the_floors(desk, scripted, monkeypatch):
     assert [(found["floor"], found["robots"]) for found in get(desk, "maps").json()] == [("", ["a"]), ("2", ["b"])]
     assert {robot["robot"]: robot["floor"] for robot in get(desk, "robots").json()} == {"a": "", "b": "2"}
     assert get(desk, "closures").json() == []
-    assert get(desk, "vocabulary").json() == {"lidar_v1": 7}
+    assert {"name": "words_lidar_v1", "value": 7, "unit": "1"} in get(desk, "metrics.json").json()
     joined = {
         "robot_i": "a", "stamp_i": 0.0, "robot_j": "b", "stamp_j": 500.0, "T_i_j": [0, 0, 0], "tolerance": [0.1, 0.1],
     }  # fmt: skip

@@ -24,7 +24,7 @@ app.command(epilog=examples(_FLEET, "fcslam evaluate fleet demo/run --csv fleet.
 app.command(epilog=examples(_RELATIONS, "fcslam evaluate relations runs/intel-3 intel.relations.gz --across-robots"))(
     relations
 )
-app.command(epilog=examples("fcslam evaluate quality fleet/run --truth fleet"))(quality)
+app.command(epilog=examples("fcslam evaluate quality fleet/run"))(quality)
 app.command(
     epilog=examples(
         "fcslam evaluate homography hpatches --detector onnx --detector orb",

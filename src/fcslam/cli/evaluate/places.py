@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.evaluate.arguments import SEED, Features, Label, Sets, TrainOn
+from fcslam.cli.evaluate.arguments import SEED
 from fcslam.cli.options import output_option
 from fcslam.cli.output import EVALUATIONS, answers, new_folder, notices, print_line
 
@@ -22,14 +22,33 @@ if TYPE_CHECKING:
 
 
 def places(
-    sets: Sets,
+    sets: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SETS...",
+            help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), "
+            "fleets with cameras that fcslam tools simulate wrote, or recordings of a LiDAR.",
+        ),
+    ],
     *,
     output: Annotated[
         Path | None, output_option("Folder for the table, the curves and the similarity matrices.", EVALUATIONS)
     ] = None,
-    features: Features = "orb",
-    train_on: TrainOn = None,
-    label: Label = None,
+    features: Annotated[
+        str,
+        typer.Option(
+            help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that `fcslam tools "
+            "extract` wrote, with a subfolder for each set."
+        ),
+    ] = "orb",
+    train_on: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of other images, to train the static vocabulary on. Can be repeated."),
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="Use only this label of sets with labels. Can be repeated.", show_default="all"),
+    ] = None,
     verify: Annotated[
         bool, typer.Option("--verify", help="Also verify the geometry of the most similar places.")
     ] = False,

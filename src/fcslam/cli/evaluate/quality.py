@@ -1,33 +1,25 @@
-"""`fcslam evaluate quality`: the certificate of a run, and whether it is right."""
+"""`fcslam evaluate quality`: the certificate of a run."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
+import json
 
 from fcslam.cli.evaluate.arguments import RunFolder
-from fcslam.cli.options import Csv
 from fcslam.cli.output import answers, print_line
 
 
-def quality(
-    run: RunFolder,
-    *,
-    truth: Annotated[
-        Path | None,
-        typer.Option(help="Folder with the true poses; the cells of the certificate are compared with them."),
-    ] = None,
-    csv: Csv = None,
-) -> None:
-    """Print how good the maps of a run are and what to drive again; with --truth, compare with the truth."""
-    from rich.table import Table
+def quality(run: RunFolder) -> None:
+    """Print how good the maps of a run are, by its certificate, and what to drive again."""
+    from fcslam.errors import EvaluationError
+    from fcslam.runs import QUALITY, open_run
 
-    from fcslam.lab.evaluation.fleet.quality import certificates_of, evaluate_quality
-    from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.runs import open_run
-
+    content = open_run(run).quality.get(f"{QUALITY}.json")
+    if content is None:
+        raise EvaluationError(f"{run}: has no {QUALITY}.json; map the recordings again with this version")
+    try:
+        certificates = dict(json.loads(content))
+    except (ValueError, TypeError) as error:
+        raise EvaluationError(f"{run}: {QUALITY}.json is broken ({error})") from error
     console = answers()
-    for k, one in certificates_of(open_run(run), run).items():
+    for k, one in certificates.items():
         limit = one["bar"]
         good = sum(cell["bound_95"] <= limit for cell in one["cells"])
         print_line(
@@ -41,12 +33,3 @@ def quality(
             )
         for drive in one["drives"]:
             print_line(console, f"map {k}: {drive['text']}")
-    if truth is None:
-        return
-    metrics = evaluate_quality(run, truth).metrics()
-    table = Table("against the truth", "value")
-    for metric in metrics:
-        table.add_row(metric.name, f"{metric.value:.4g}")
-    console.print(table)
-    if csv is not None:
-        write_metrics(tuple(metrics), csv)

@@ -40,7 +40,7 @@ def parse_address(text: str) -> tuple[str, int]:
     """Host and port of ``HOST:PORT``; brackets around an IPv6 address are removed.
 
     Raises:
-        TrainingError: it is none.
+        TrainingError: the text is not of this form.
     """
     from fcslam.errors import TrainingError
 

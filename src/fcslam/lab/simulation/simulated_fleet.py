@@ -52,6 +52,9 @@ LANE_PER_ROBOT_M = 2.0
 IMAGE_DELAY_S = 0.03
 """Time from the first scan to the first image; cameras and LiDARs are not triggered together."""
 
+CAMERA_AT_M = (0.1, 0.0, 0.6)
+"""Position of the camera in the robot's base, whose origin is on the floor."""
+JPEG_QUALITY = 90
 _T_BASE_LASER = (0.05, 0.0, 0.0)
 _AHEAD = (-0.5, 0.5, -0.5, 0.5)
 """Quaternion (x, y, z, w) of an optical frame that looks along x of the base."""
@@ -64,16 +67,13 @@ class CameraSettings(Settings):
     height: int = Field(default=240, ge=16, le=2048, description="height of an image [px]")
     field_of_view_rad: float = Field(default=1.35, gt=0.1, lt=2.8, description="horizontal field of view [rad]")
     rate_hz: float = Field(default=5.0, gt=0.0, description="image rate [Hz]")
-    ahead_m: float = Field(default=0.1, description="position of the camera ahead of the robot's base [m]")
-    above_m: float = Field(default=0.6, gt=0.0, lt=2.0, description="height of the camera above the floor [m]")
     noise: float = Field(default=2.0, ge=0.0, description="standard deviation of the pixel noise [grey levels of 255]")
-    jpeg_quality: int = Field(default=90, ge=1, le=100, description="JPEG quality of the images, as in OpenCV")
 
     def model(self) -> CameraModel:
         """Intrinsics and mounting."""
         focal = 0.5 * self.width / math.tan(0.5 * self.field_of_view_rad)
         middle = (0.5 * (self.width - 1), 0.5 * (self.height - 1))
-        mounting = Transform((self.ahead_m, 0.0, self.above_m), _AHEAD)
+        mounting = Transform(CAMERA_AT_M, _AHEAD)
         return CameraModel(self.width, self.height, focal, focal, *middle, mounting)
 
 
@@ -117,7 +117,7 @@ class SimulationSettings(Settings):
     )
     lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
     drift: OdometryNoiseSettings | None = Field(
-        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: there is none"
+        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: robots record no odometry"
     )
     camera: CameraSettings | None = CameraSettings()
 
@@ -215,7 +215,7 @@ class SimulatedRobot:
             for k in range(len(self.image_stamps)):
                 noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
                 picture = camera.take(poses[k]).astype(np.float32)
-                encoded = _jpeg(picture + settings.noise * noise, settings.jpeg_quality)
+                encoded = _jpeg(picture + settings.noise * noise)
                 T_odom_base = None if odometry is None else odometry[k]
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
 
@@ -362,9 +362,9 @@ def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
     return RayCaster(bare_model(plan)) if plan.terrain is None else OutdoorRayCaster(plan)
 
 
-def _jpeg(pixels: FloatArray, quality: int) -> bytes:
+def _jpeg(pixels: FloatArray) -> bytes:
     import cv2
 
     image = np.clip(pixels, 0.0, 255.0).astype(np.uint8)
-    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return bytes(encoded)

@@ -347,7 +347,7 @@ def _metrics(content: RecordDict) -> Metrics:
 
 
 def _judgement(content: RecordDict) -> Judgement:
-    """A robot's report on the pairs that it holds out; ValueError: it is none."""
+    """A robot's report on the pairs that it holds out; ValueError if it cannot be read as one."""
     return check_judgement(record_to_weights(content[ARRAYS_KEY]).get(PAIRS_KEY))
 
 

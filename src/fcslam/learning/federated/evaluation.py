@@ -77,7 +77,7 @@ class VersionComparison:
 
     @property
     def gain(self) -> float | None:
-        """Gain over the best version: median over the evaluators of both versions; None if there are none.
+        """Gain over the best version: median over the evaluators of both versions; None if no evaluator has both.
 
         Robots hold out different images, so their scores differ in level. Only differences at the same robot are
         compared: robots that join or leave do not change the gain. The median ignores a minority of false scores.

@@ -66,7 +66,7 @@ class FleetGrid(RobotGrid):
             self._online(robot)
 
     def next_request(self, robot: str) -> Request | None:
-        """The request that the robot should work on now; None if there is none."""
+        """The request that the robot should work on now; None if no request waits."""
         with self._changed:
             waiting = self._requests.get(self._online(robot) or 0)
             return waiting[0] if waiting else None

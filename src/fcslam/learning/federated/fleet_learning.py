@@ -4,7 +4,6 @@ On stdout the process writes events as the worker of a mission does. It ends wit
 """
 
 import argparse
-import json
 import logging
 import os
 import signal
@@ -25,7 +24,7 @@ from fcslam.learning.federated.launch import open_port, waiting
 from fcslam.learning.federated.live_settings import RELEASE, FleetLearningSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.service.http.authentication import Authenticator
-from fcslam.service.supervisor import READY
+from fcslam.service.supervisor import READY, tell
 from fcslam.storage.files import write_file
 
 NICENESS: Final = 10
@@ -86,11 +85,6 @@ def _announced(data: Path) -> Path:
     return folder / f"{named.read_text(encoding='utf-8')}.onnx" if named.is_file() else BUNDLED_NETWORK
 
 
-def _tell(event: str, number: int) -> None:
-    sys.stdout.write(json.dumps({"event": event, "number": number}) + "\n")
-    sys.stdout.flush()
-
-
 def _end_with_stdin() -> None:
     # Not by sys.stdin, whose lock Python waits for when the process ends.
     while os.read(0, 4096):
@@ -116,7 +110,7 @@ def main(arguments: Sequence[str]) -> int:
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(given.listener))
             listener.listen()
-            run(given.data, given.output, given.settings, listener, _tell)
+            run(given.data, given.output, given.settings, listener, tell)
     except FcslamError as error:
         _log.error("%s", error)
         return 2

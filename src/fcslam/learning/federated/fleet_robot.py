@@ -70,7 +70,7 @@ class RobotLink(HttpClient):
         self.close()
 
     def fetch(self) -> tuple[int, bytes] | None:
-        """A request with its number; None if there is none now.
+        """A request with its number; None if no request waits.
 
         Raises:
             TrainingError: the server does not accept the robot.

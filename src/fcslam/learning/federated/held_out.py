@@ -91,7 +91,7 @@ def check_judgement(array: object) -> Judgement:
     """A robot's report, which comes from outside.
 
     Raises:
-        ValueError: it is none; the text says why.
+        ValueError: it cannot be read as a report; the text says why.
     """
     if not isinstance(array, np.ndarray) or array.dtype != np.float32:
         raise ValueError("a report on pairs that is not an array of float32")

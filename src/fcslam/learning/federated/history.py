@@ -33,7 +33,7 @@ class RoundReport:
     losses: Mapping[str, float] = field(default_factory=dict)
     """Means over robots and steps."""
     metrics: Mapping[str, float] = field(default_factory=dict)
-    """Metrics of the evaluation; empty if there was none."""
+    """Metrics of the evaluation; empty if the round was not evaluated."""
     score: float = math.nan
     """By which versions are compared, in [0, 1]; NaN if there was no evaluation."""
     released: bool = False

@@ -73,7 +73,7 @@ def read_detector_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.
     """The weights in a checkpoint of federated or central training, or in an exported detector's ONNX file.
 
     Raises:
-        TrainingError: the file is none of these, or belongs to another network.
+        TrainingError: the file is neither a checkpoint nor a detector, or belongs to another network.
     """
     if path.suffix == SUFFIX:
         return read_onnx_weights(path, encoder)

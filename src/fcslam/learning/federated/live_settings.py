@@ -6,7 +6,7 @@ from typing import Final
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.learning.federated.settings import FederatedSettings, Normalisation, TrainedLayers
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.settings import TrainingSettings
 from fcslam.records import FloatArray
 
@@ -53,47 +53,27 @@ class RobotLearningSettings(Settings):
     time_s: float = Field(
         default=14_400.0, gt=0.0, description="time after the drive for which a recorded robot stays to learn [s]"
     )
-    most_keyframes: int = Field(default=400, ge=2, description="newest keyframes that are compared with one another")
     held_out: HeldOutSettings = Field(
         default_factory=HeldOutSettings, description="keyframes that the robot never trains on"
     )
 
 
-class LiveTraining(TrainingSettings):
-    """Training settings with the rate of the study."""
-
-    learning_rate: float = Field(default=1e-3, gt=0.0, description="learning rate after the warm-up, its highest value")
-
-
-class LiveRounds(FederatedSettings):
-    """Federated settings whose defaults are the recipe of the study of closures as teachers."""
-
-    rounds: int = Field(default=60, ge=1, description="number of rounds of local training and aggregation")
-    minimum_robots: int = Field(default=2, ge=1, description="fewest updates for which a round counts")
-    deadline_s: float = Field(
-        default=600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
-    )
-    normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
-    trained: TrainedLayers = Field(
-        default="codes",
-        description="layers that robots train: codes, the layers of the descriptors",
-    )
-    compatible: float = Field(
-        default=4.0,
-        ge=0.0,
-        description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
-        "weights give them, so that they stay compatible and less is forgotten; 0 for off",
-    )
-    training: LiveTraining = Field(
-        default_factory=LiveTraining,
-        description="training on each robot; its steps are replaced by rounds times local_steps",
-    )
+LIVE_ROUNDS: Final = FederatedSettings(
+    rounds=60,
+    minimum_robots=2,
+    deadline_s=600.0,
+    normalisation="frozen",
+    trained="codes",
+    compatible=4.0,
+    training=TrainingSettings(learning_rate=1e-3),
+)
+"""The recipe of the study of closures as teachers."""
 
 
 class FleetLearningSettings(Settings):
-    """A service whose fleet learns while it maps."""
+    """A service whose fleet learns while it maps. A file is read over an instance, which holds the recipe."""
 
-    federated: LiveRounds = Field(
-        default_factory=LiveRounds, description="rounds of training; other keys are those of the federated settings"
+    federated: FederatedSettings = Field(
+        default=LIVE_ROUNDS, description="rounds of training; other keys are those of the federated settings"
     )
     gate: GateSettings = Field(default_factory=GateSettings, description="release of versions")

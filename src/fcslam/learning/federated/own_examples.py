@@ -20,6 +20,8 @@ from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
 from fcslam.storage.files import write_file
 
+MOST_KEYFRAMES: Final = 400
+"""Newest keyframes that are compared with one another."""
 SPLIT_FILE: Final = "split.json"
 """Says of each keyframe that was ever used whether it is held out."""
 
@@ -39,7 +41,7 @@ def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
         folder: of the keyframes.
         settings: of the robot.
     """
-    kept = read_keyframes(folder, settings.most_keyframes)
+    kept = read_keyframes(folder, MOST_KEYFRAMES)
     version = kept[-1].detector_version if kept else ""
     shown = [(frame, picture) for frame in kept if (picture := _picture(frame, version)) is not None]
     held_out = _split(folder / SPLIT_FILE, [frame for frame, _ in shown], settings.held_out)

@@ -48,7 +48,7 @@ def screen(
         sent: weights that all robots trained from.
         settings: the thresholds.
         frozen: batch statistics must come back unchanged.
-        earlier_length: ``update_length`` of the round before; 0 if there is none.
+        earlier_length: ``update_length`` of the round before; 0 in the first round.
     """
     refused = {robot: reason for robot, weights in updates.items() if (reason := weights_error(weights, sent))}
     parameters = trained_names(sent, frozen_statistics=True)
@@ -64,7 +64,7 @@ def screen(
 
 
 def update_length(updates: Mapping[str, Weights], sent: Weights) -> float:
-    """Median norm of the accepted updates of a round, without batch statistics; 0 if there is none."""
+    """Median norm of the accepted updates of a round, without batch statistics; 0 if none was accepted."""
     names = trained_names(sent, frozen_statistics=True)
     lengths = [float(np.linalg.norm(each)) for each in _vectors(updates, sent, names, {}).values()]
     return float(np.median(lengths)) if lengths else 0.0

@@ -55,18 +55,6 @@ def update_vector(new: Weights, old: Weights, names: Collection[str]) -> FloatVe
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:
-    """``old`` with ``update`` (N,) of ``update_vector`` added to the named arrays."""
-    arrays = {name: array.copy() for name, array in old.items()}
-    begin = 0
-    for name in names:
-        size = old[name].size
-        step = update[begin : begin + size].reshape(old[name].shape)
-        arrays[name] = (old[name] + step).astype(np.float32)
-        begin += size
-    return arrays
-
-
 def interpolate_weights(old: Weights, new: Weights, share: float) -> dict[str, NDArray[np.float32]]:
     """The weighted mean ``share`` * ``old`` + (1 - ``share``) * ``new``."""
     # Computed as a difference and not as a sum of products, so that equal values stay equal to the last bit.

@@ -16,7 +16,6 @@ from fcslam.cloud.sessions import check_robot
 from fcslam.config import Settings, load
 from fcslam.errors import PacketError, ServiceError
 from fcslam.records import NAME
-from fcslam.wire.checks import check_name
 
 
 class Role(StrEnum):
@@ -96,7 +95,6 @@ def _by_name(certificate: str) -> Identity | None:
     try:
         names = x509.Name.from_rfc4514_string(certificate).get_attributes_for_oid(NameOID.COMMON_NAME)
         name = str(names[0].value) if len(names) == 1 else ""
-        check_name(name, "robot")
         check_robot(name)
     except (PacketError, ValueError):
         return None

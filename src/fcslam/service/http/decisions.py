@@ -23,7 +23,7 @@ from fcslam.service.summaries import edit_summary
 
 LOOK_EVERY_S = 0.1
 LEAST_FREE_BYTES = 8 * 2**20
-"""A disk with less is full: neither a result nor why there is none can be written reliably."""
+"""A disk with less is full: neither a result nor the reason for a failure can be written reliably."""
 
 EditNumber = Annotated[int, Path(ge=1, le=2**31 - 1)]
 

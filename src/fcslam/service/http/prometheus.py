@@ -103,7 +103,7 @@ class _Arrivals:
                 self._noted.append((packets, now_s))
 
     def age_s(self, applied: int, now_s: float) -> float:
-        """Age of the oldest packet after the first ``applied`` ones; 0 if there is none."""
+        """Age of the oldest packet after the first ``applied`` ones; 0 if all are applied."""
         with self._lock:
             while self._noted and self._noted[0][0] <= applied:
                 self._noted.popleft()

@@ -80,7 +80,7 @@ _SHAPES = TypeAdapter(list[MapShape])
 
 
 def fleet_router(state: ViewerState) -> APIRouter:
-    """Robots, closures and vocabularies."""
+    """Robots, closures, edits and learning."""
     router = APIRouter(
         tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503, 507)
     )
@@ -144,13 +144,6 @@ def fleet_router(state: ViewerState) -> APIRouter:
     def get_learning() -> list[LearningRound]:
         """The rounds of the federated training, oldest first; none if the service knows of no training."""
         return [] if state.learning is None else read_rounds(state.learning)
-
-    @router.get("/vocabulary")
-    def get_vocabulary() -> dict[str, float]:
-        """Words by channel and detector version."""
-        prefix = "words_"
-        metrics = run_of(state.mission).metrics
-        return {name.removeprefix(prefix): m.value for name, m in metrics.items() if name.startswith(prefix)}
 
     return router
 
@@ -306,7 +299,7 @@ def _or_404() -> Iterator[None]:
 def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
     """The closure with this channel, robot and stamp of i, robot and stamp of j.
 
-    Refuses (HTTPException 404): there is none.
+    Refuses (HTTPException 404): the run has no such closure.
     """
     for c in run.closures:
         if named == (c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j):
@@ -317,7 +310,7 @@ def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
 def _folder_of(state: ViewerState) -> Path:
     """The run folder as it is now.
 
-    Refuses (HTTPException 404): there is none yet.
+    Refuses (HTTPException 404): no run folder is written yet.
     """
     folder = state.mission.run_folder
     if folder is None:
@@ -332,7 +325,7 @@ def _file(state: ViewerState, name: str, media_type: str) -> FileResponse:
 def _existing(state: ViewerState, name: str) -> Path:
     """A file of the run folder.
 
-    Refuses (HTTPException 404): there is none.
+    Refuses (HTTPException 404): the file is missing or cannot be read.
     """
     folder = _folder_of(state)
     try:

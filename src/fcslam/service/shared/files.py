@@ -66,7 +66,7 @@ class SharedFiles:
 
 
 def fetched(server: Postgres, mission: int, name: str) -> bytes | None:
-    """A shared file; None if there is none.
+    """A shared file; None if the mission has no file ``name``.
 
     Raises:
         StoreError: it cannot be read.
@@ -76,7 +76,7 @@ def fetched(server: Postgres, mission: int, name: str) -> bytes | None:
 
 
 def fetch_folder(server: Postgres, mission: int, name: str, path: Path) -> bool:
-    """Write a shared run folder to ``path``; False if there is none.
+    """Write a shared run folder to ``path``; False if the mission has no folder ``name``.
 
     Raises:
         StoreError: it cannot be read or written.

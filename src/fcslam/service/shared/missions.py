@@ -1,6 +1,5 @@
 """The missions of a store, as each of its instances serves all of them."""
 
-import logging
 import math
 import secrets
 import shutil
@@ -38,8 +37,6 @@ _SEEN: Final = "seen"
 
 _JOINT_LOOK_S: Final = 1.0
 """Between two looks for joint maps that a worker elsewhere shared."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +76,7 @@ class SharedMission(OpenMission):
 
     @property
     def run_folder(self) -> Path | None:
-        """The newest live run folder that a worker shared; None: there is none yet."""
+        """The newest live run folder that a worker shared; None before the first one."""
         known = self._instance.known.get(self.name)
         return None if known is None or not known.live else self._fetched(LIVE, str(known.live))
 
@@ -99,7 +96,7 @@ class SharedMission(OpenMission):
         return copy
 
     def result(self, name: str) -> Path | None:
-        """The run folder of a requested result; None if there is none."""
+        """The run folder of a requested result; None if it does not exist."""
         return self._fetched(f"{RESULT}{name}", f"result-{name}")
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
@@ -142,7 +139,7 @@ class SharedMissions:
         admission: Admission,
         hooks: Hooks,
     ) -> None:
-        """Take the instance's name, and create the first mission if there is none.
+        """Take the instance's name, and create the first mission if the server has no mission.
 
         Args:
             root: folder of this instance's own files, which can be made again from the store.
@@ -191,22 +188,13 @@ class SharedMissions:
         """The mission that the present request names, or the open one.
 
         Raises:
-            UnknownMissionError: there is none of this name.
+            UnknownMissionError: no mission has this name.
         """
         named = NAMED.get()
         if named is None:
             named = next((name for name, known in self._instance.known.items() if known.is_open), FIRST)
         mission = self._opened.get(named)
         return self._open_here(named) if mission is None else mission
-
-    def folder(self, name: str) -> MissionFolder:
-        """Local files of a mission, there or not.
-
-        Raises:
-            PacketError: it is not a name.
-        """
-        check_name(name, "mission")
-        return MissionFolder(self.root / "missions" / name)
 
     def create(self, name: str) -> None:
         """Create a mission and open it.
@@ -215,7 +203,7 @@ class SharedMissions:
             ServiceError: there is one of this name.
         """
         check_words(name, self._config.fleet)
-        self.folder(name)
+        check_name(name, "mission")
         number = self._registry.create(name)
         MissionStore(MissionTables(self._server, number)).configure(self._config)
         self.open(name)
@@ -224,20 +212,20 @@ class SharedMissions:
         """Let robots that name no mission send to this one.
 
         Raises:
-            ServiceError: there is none of this name.
+            ServiceError: no mission has this name.
         """
         self._registry.open(self._known(name).number)
         self._instance.look()
 
     def result(self, name: str, number: int) -> Path | None:
-        """The run folder of a result of a mission; None if there is none."""
+        """The run folder of a result of a mission; None if it does not exist."""
         return self._open_here(name).result(str(number))
 
     def export(self, name: str, path: Path) -> None:
         """Write a mission as one new file.
 
         Raises:
-            ServiceError: there is none of this name.
+            ServiceError: no mission has this name.
             StoreError: it cannot be written.
         """
         MissionTables(self._server, self._known(name).number).export(path)
@@ -249,7 +237,7 @@ class SharedMissions:
             ServiceError: there is one of this name.
             StoreError: it cannot be written.
         """
-        self.folder(name)
+        check_name(name, "mission")
         MissionTables(self._server, self._registry.create(name)).import_mission(path)
         self._instance.look()
 
@@ -275,7 +263,7 @@ class SharedMissions:
         return known
 
     def _open_here(self, name: str) -> SharedMission:
-        known, folder = self._known(name), self.folder(name)
+        known, folder = self._known(name), MissionFolder.of(self.root, name)
         with self._opening:
             if name not in self._opened:
                 with translate_errors(folder.path):

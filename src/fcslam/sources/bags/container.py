@@ -302,7 +302,7 @@ class _Part:
         """The path; files of MCAP are looked through once before, as they could fill the memory.
 
         Raises:
-            SourceError: one would fill the memory, or is none of ROS 2.
+            SourceError: one would fill the memory, or is not a bag of ROS 2.
         """
         for path in self.path.glob("*.mcap") if self.path.is_dir() else [self.path]:
             with open_file(path) as file:

@@ -302,5 +302,5 @@ def _namespaces(topic: Topic) -> list[str]:
 
 
 def _innermost(topic: Topic, spaces: set[str]) -> str:
-    """The innermost of the namespaces ``spaces`` around a topic; empty if there is none."""
+    """The innermost of the namespaces ``spaces`` around a topic; empty if the topic is in none of them."""
     return next((space for space in _namespaces(topic) if space in spaces), "")

@@ -130,8 +130,8 @@ def find_candidates(
 def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[BagOptions, tuple[str, ...]]:
     """Choose the same topics for all bags of a fleet, where ``options`` name none.
 
-    The rules are those of ``choose_topics``, applied to the topics that all bags have. If there is none of a kind, each
-    bag keeps its own choice.
+    The rules are those of ``choose_topics``, applied to the topics that all bags have. If they share no topic of a
+    kind, each bag keeps its own choice.
 
     Returns:
         The options with the topics, and notes about the choice.

@@ -127,7 +127,7 @@ class TransformTree:
         """The transform in which the robot with ``frame`` moves: its parent and child.
 
         On the way up from ``frame``, it is the first whose parent has "odom" in its name. Without one, it is the first
-        that moves and is neither a joint of the robot nor its pose in a map. The parent is empty if there is none; the
+        that moves and is neither a joint of the robot nor its pose in a map. The parent is empty if none fits; the
         child is then the last frame to which ``frame`` is fixed.
 
         Args:

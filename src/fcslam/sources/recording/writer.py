@@ -10,9 +10,8 @@ from typing import Self
 from zlib import crc32
 
 import numpy as np
-from pydantic import ValidationError
 
-from fcslam.errors import OutputError
+from fcslam.errors import ConfigError, OutputError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import (
     CameraImage,
@@ -66,8 +65,8 @@ class RecordingWriter:
         """
         try:
             meta = Meta(lasers=tuple(lasers), camera=camera)
-        except ValidationError as error:
-            raise OutputError(f"{folder}: cannot hold these sensors ({error.errors()[0]['msg']})") from error
+        except ConfigError as error:
+            raise OutputError(f"{folder}: cannot hold these sensors ({error})") from error
         with _translate_errors(folder):
             folder.mkdir(exist_ok=True)
             if any(folder.iterdir()):

@@ -1,7 +1,7 @@
 """The measures of ``homography`` by name, for each pair and as means over pairs."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,6 @@ from fcslam.records import FloatArray
 
 CORRECT_CORNERS_PX = (1, 2, 3, 5)
 """Thresholds of the corner error of a correct homography."""
-
-Measures = Mapping[str, float]
-"""Measures of one pair, or means over pairs; an unknown measure is missing or NaN."""
 
 
 def pair_measures(pair: PairResult) -> dict[str, float]:

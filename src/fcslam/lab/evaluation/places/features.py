@@ -50,7 +50,7 @@ def choose_features(choice: str) -> FeatureChoice:
     """Choose features by a detector's name, an .onnx file, or a folder of extracted features.
 
     Raises:
-        FeatureError: ``choice`` is none of these, or the network cannot be used.
+        FeatureError: ``choice`` is no detector, .onnx file or folder, or the network cannot be used.
     """
     path = Path(choice)
     if choice == DetectorKind.ORB:

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.errors import OutputError
 from fcslam.lab.evaluation.places.scoring import DescribedSet, Scorer
 from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.lab.evaluation.places.verification import PairVerifier
-from fcslam.metrics.bootstrap import Interval, mean_interval, measure_interval
+from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.metrics.retrieval import (
     PairTruth,
     PrecisionRecall,
@@ -27,6 +28,8 @@ from fcslam.metrics.retrieval import (
 from fcslam.records import FloatArray
 
 RANKS: Final = (1, 5, 10)
+DRAWS: Final = 300
+"""Bootstrap samples of a measure that is no mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +121,26 @@ def measure(
     multi = multi_match_curve(similarity, truth).average_precision
     measures["average_precision_multi"] = Interval(multi, np.nan, np.nan)
     return measures, retrieved
+
+
+def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
+    """Percentile bootstrap of any measure of ``count`` samples.
+
+    Args:
+        measure: computes the measure of the samples whose indices (N,) it is given; draws with NaN are ignored.
+        count: number of samples.
+        rng: random generator.
+
+    Returns:
+        The measure of all samples and its interval.
+    """
+    whole = measure(np.arange(count))
+    drawn = np.array([measure(rng.integers(count, size=count)) for _ in range(DRAWS if count else 0)])
+    known = drawn[np.isfinite(drawn)]
+    if not len(known):
+        return Interval(whole, np.nan, np.nan)
+    low, high = np.quantile(known, (0.025, 0.975))
+    return Interval(whole, float(low), float(high))
 
 
 def write_results(folder: Path, results: Sequence[SetResult]) -> None:

@@ -7,7 +7,7 @@ a wall would be one place.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,10 @@ from fcslam.lab.evaluation.fleet.ground_truth import GAP_S
 from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import CameraModel, FloatArray, LaserModel, Ranges
+from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.runs import read_tum
 from fcslam.sources.recording.frames import RangesFile, merged_frames
 from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, SCANS_FILE, image_path, read_meta
-
-EVERY_M: Final = 1.0
-EVERY_RAD: Final = 0.5
-"""Distance or turn between two places of a robot, as in the robot's settings."""
 
 
 @dataclass(frozen=True, slots=True)

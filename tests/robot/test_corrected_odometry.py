@@ -9,8 +9,8 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.records import Correction, Keyscan
+from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.localization import Localizer
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
@@ -30,7 +30,7 @@ def test_odom_is_where_the_cloud_thinks_it_is(driven):
     """The newest pose is the cloud's own, to the last digit that matters."""
     packets, track = driven
     cloud = Cloud(FleetConfig(), 0)
-    newest = Localizer(lambda: 0.0)
+    newest = CorrectedOdometry(lambda: 0.0)
     for packet in packets:
         for body in (decode(data).body for data in cloud.receive(encode(packet))):
             if isinstance(body, Correction):
@@ -61,7 +61,7 @@ def test_a_track_composes_motions_and_offsets(driven):
 def test_a_correction_replaces_the_last_and_moves_every_pose(driven):
     poses = driven[1].T_odom_base()
     now = 0.0
-    corrected = Localizer(lambda: now)
+    corrected = CorrectedOdometry(lambda: now)
     assert corrected.T_map_base(poses) is None
     assert corrected.map_index is corrected.age_s is None
     corrected.correct(CORRECTION)

@@ -28,7 +28,7 @@ _NOWHERE_PX: Final = 1e6
 
 
 def localization_loss(scores: Tensor, homographies: Tensor) -> Tensor:
-    """Mean Huber loss of the distances [px] between keypoints that both views of a pair show; 0 if there are none.
+    """Mean Huber loss of the distances [px] between keypoints that both views of a pair show; 0 if they share none.
 
     Keypoints are the same if they are mutual nearest neighbours within ``SAME_POINT_PX`` in the second view.
 

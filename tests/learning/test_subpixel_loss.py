@@ -5,9 +5,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
+from benchmarks.subpixel_loss import HUBER_PX, MOST_PEAKS, localization_loss, peaks  # noqa: E402
 from fcslam.features.dense import find_peaks  # noqa: E402
 from fcslam.features.detector import OnnxConfig  # noqa: E402
-from fcslam.learning.localization import HUBER_PX, MOST_PEAKS, localization_loss, peaks  # noqa: E402
 
 HEIGHT, WIDTH = 96, 120
 WIDTH_OF_A_POINT_PX = 1.5

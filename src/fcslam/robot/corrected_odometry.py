@@ -7,7 +7,7 @@ from fcslam.geometry import se2
 from fcslam.records import Correction, FloatArray, frozen
 
 
-class Localizer:
+class CorrectedOdometry:
     """``T_map_base = T_map_odom T_odom_base``. A correction moves ``odom`` in ``map``, never the robot in ``odom``: a
     controller that uses ``odom`` sees no jump."""
 
