@@ -9,6 +9,8 @@ table measures, and on --images, such as renders. Pairs are drawn on the device 
   localization loss of `subpixel_loss.py`, in float32. Views change as in `fcslam tools train` in `near`. In the
   others, the scales of a pair differ by up to 4; in `wide` views turn by 26 degrees (standard deviation), in `turns`
   half of them by any angle. Labels are those of the bundled network and of Harris's measure
+- longer, mixed: `near`, trained on. A quarter of the pairs of `mixed` change as in `wide`. The learning rate rises
+  again and falls as a cosine in the second half. `mean` has the mean of the weights of both ("model soup")
 - ours, hardest, all: the paper's network from `vgg`. The last two have eqs. (1)-(3) alone for their codes, without a
   margin, with the hardest negative of a pair or the mean over all; `ours` has the losses of `fcslam tools train`. As
   many steps each
@@ -22,6 +24,7 @@ They choose a network; `homography.py` then measures this one on its 25 pairs.
 """
 
 import csv
+import math
 import multiprocessing
 import os
 import tempfile
@@ -82,38 +85,48 @@ class Arm:
     """What a network is trained on."""
 
     settings: TrainingSettings
-    change: Change
+    changes: tuple[Change, ...]
+    """A batch has as many pairs of each."""
     localization: float = 0.0
     """Weight of the localization loss."""
     start: Path = BUNDLED_NETWORK
     steps: int | None = None
     """None: as many as the time allows."""
+    after: str | None = None
+    """The arm whose network is trained on."""
 
 
-def light(change: Change) -> Arm:
-    return Arm(TrainingSettings(pairs=64, side_px=256, points=448, learning_rate=1e-3), change, localization=2.0)
+def light(*changes: Change, after: str | None = None) -> Arm:
+    settings = TrainingSettings(pairs=64, side_px=256, points=448, learning_rate=1e-3)
+    return Arm(settings, changes, localization=2.0, after=after)
 
 
 def vgg(**loss: Any) -> Arm:
     settings = TrainingSettings(
         encoder="vgg", pairs=32, side_px=192, learning_rate=5e-4, loss=LossSettings(**loss), steps=EQUATIONS_STEPS
     )
-    return Arm(settings, AS_IN_TRAINING, start=Path("vgg"), steps=EQUATIONS_STEPS)
+    return Arm(settings, (AS_IN_TRAINING,), start=Path("vgg"), steps=EQUATIONS_STEPS)
 
 
 AS_IN_TRAINING = Change(turn_rad=0.2, any_turn_share=0.1, scale_spread=0.7, tilt=0.12)
 """Those of `learning/warps.py`."""
+WIDE = Change(turn_rad=0.45, any_turn_share=0.1, scale_spread=1.4, tilt=0.16)
 EQUATIONS: dict[str, Any] = {
     "margin": 0.0, "rounding": 1e-6, "contrastive": 0.0, "distillation": 0.0, "balance": 0.0, "agreement": 0.0,
 }  # fmt: skip
 ARMS = {
     "near": light(AS_IN_TRAINING),
-    "wide": light(Change(turn_rad=0.45, any_turn_share=0.1, scale_spread=1.4, tilt=0.16)),
+    "wide": light(WIDE),
     "turns": light(Change(turn_rad=0.45, any_turn_share=0.5, scale_spread=1.4, tilt=0.16)),
+    "longer": light(AS_IN_TRAINING, after="near"),
+    "mixed": light(*3 * [AS_IN_TRAINING], WIDE, after="near"),
     "ours": vgg(),
     "hardest": vgg(**EQUATIONS),
     "all": vgg(**EQUATIONS, negatives="all"),
 }
+MEAN_OF = ("longer", "mixed")
+WARM_SHARE, FALL_SHARE, LAST_RATE = 0.02, 0.5, 2e-6
+"""Schedule of an arm that continues another one."""
 
 
 @dataclass
@@ -142,7 +155,9 @@ def main() -> None:
     missing = [arm for arm in chosen.arms if not watched(chosen.networks, arm).exists()]
     if missing:
         vision = common.recordings(*SOURCES, kind="vision")
-        train(missing, [vision / name for name in SOURCES] + chosen.images, chosen)
+        for arms in ([arm for arm in missing if (ARMS[arm].after is None) is first] for first in (True, False)):
+            if arms:
+                train(arms, [vision / name for name in SOURCES] + chosen.images, chosen)
     if not chosen.train_only:
         measure(chosen)
 
@@ -200,11 +215,12 @@ def train_arm(
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
     (folder / name).mkdir(exist_ok=True)
-    network = bundled(arm.start, settings, folder / name, train_on).to(device, memory_format=torch.channels_last)
+    start = arm.start if arm.after is None else folder / f"{arm.after}.onnx"
+    network = bundled(start, settings, folder / name, train_on).to(device, memory_format=torch.channels_last)
     average = KeypointNetwork(settings.encoder).to(device).eval()
     average.load_state_dict(network.state_dict())
     optimizer = create_optimizer(network)
-    draw = partial(draw_on_device, side=settings.side_px, points=settings.points, change=arm.change)
+    draw = partial(draw_on_device, side=settings.side_px, points=settings.points, changes=arm.changes)
     photographs = Photographs.of(train_on, device)
     generator = torch.Generator(device).manual_seed(SEED)
     seen = draw(Photographs.of(held_out, device), WATCHED_PAIRS, generator=torch.Generator(device).manual_seed(SEED))
@@ -212,9 +228,8 @@ def train_arm(
     parts = {"detector": torch.zeros(())}
     watch.look(name, 0, average, parts)
     while progress < 1.0:
-        shown = settings.model_copy(update={"steps": 10_000})  # the schedules depend on the share that is done alone
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(shown, int(progress * shown.steps))
+            group["lr"] = rate(arm, progress)
         batch = draw(photographs, settings.pairs, generator=generator)
         maps = network.train()(batch.images.contiguous(memory_format=torch.channels_last))
         shift = grid_shift(settings.encoder, SEED, step)
@@ -237,7 +252,28 @@ def train_arm(
             print(f"{name} {step} {progress:.3f}", *(f"{key} {value.item():.4f}" for key, value in parts.items()),
                   *(f"{value:.3f}" for value in watch.rows[-1][2:]), flush=True)  # fmt: skip
     if arm.steps is None:
+        torch.save(average.state_dict(), folder / f"{name}.pt")
         keep(average, folder / f"{name}.onnx")
+
+
+def rate(arm: Arm, progress: float) -> float:
+    """Learning rate after a share of the training."""
+    shown = arm.settings.model_copy(update={"steps": 10_000})  # the schedules depend on the share that is done alone
+    if arm.after is None:
+        return learning_rate(shown, int(progress * shown.steps))
+    warm = min(progress / WARM_SHARE + 1e-3, 1.0)
+    fallen = 0.5 - 0.5 * math.cos(math.pi * max(progress - 1.0 + FALL_SHARE, 0.0) / FALL_SHARE)
+    return warm * (shown.learning_rate + fallen * (LAST_RATE - shown.learning_rate))
+
+
+def keep_mean(folder: Path) -> Path:
+    """The network with the mean of the weights of other ones."""
+    path = folder / "mean.onnx"
+    states = [torch.load(folder / f"{name}.pt", map_location="cpu") for name in MEAN_OF]
+    mean = KeypointNetwork("light")
+    mean.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
+    keep(mean, path)
+    return path
 
 
 def follow(average: KeypointNetwork, network: KeypointNetwork, step: int) -> None:
@@ -293,6 +329,8 @@ def measure(chosen: Any) -> None:
     weights = {"bundled": BUNDLED_NETWORK} | {
         arm: chosen.networks / f"{arm}.onnx" for arm in chosen.arms if ARMS[arm].steps is None
     }
+    if set(MEAN_OF) <= set(chosen.arms):
+        weights["mean"] = keep_mean(chosen.networks)
     columns = {"": "s", "NMS": "d"} | dict.fromkeys(MEASURES, ".3f")
     with tempfile.TemporaryDirectory() as made:
         for title, scenes in (

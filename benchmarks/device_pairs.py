@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -64,9 +64,28 @@ class Photographs:
 
 
 def draw_on_device(
+    photographs: Photographs,
+    pairs: int,
+    side: int,
+    points: int,
+    changes: Sequence[Change],
+    generator: torch.Generator,
+) -> TrainingBatch:
+    """A batch of pairs of square views, as `draw_pair` draws them, but for compression; as many of each change."""
+    count = pairs // len(changes)
+    batches = [_draw(photographs, count, side, points, change, generator) for change in changes]
+
+    def joined(name: str) -> Tensor:
+        parts = [getattr(batch, name) for batch in batches]
+        sides = len(parts[0]) // count  # 2 where there is a row for each view
+        return torch.cat([part for view in zip(*(part.chunk(sides) for part in parts), strict=True) for part in view])
+
+    return TrainingBatch(**{each.name: joined(each.name) for each in fields(TrainingBatch)})
+
+
+def _draw(
     photographs: Photographs, pairs: int, side: int, points: int, change: Change, generator: torch.Generator
 ) -> TrainingBatch:
-    """A batch of pairs of square views, as `draw_pair` draws them, but for compression."""
     device = photographs.images.device
     rows = torch.randint(len(photographs.images), (pairs,), generator=generator, device=device)
     window = _windows(photographs.sizes[rows], side, generator)
