@@ -18,10 +18,14 @@ _LONGEST_NUMBER: Final = 100
 """Characters of a number in YAML. Python converts long integers slowly, and back to text not at all."""
 
 
-class Settings(BaseModel):
-    """Base class of all settings: frozen, no unknown keys, finite numbers only."""
+class StrictModel(BaseModel):
+    """A frozen model of known keys and finite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Settings(StrictModel):
+    """Base class of all settings: frozen, no unknown keys, finite numbers only."""
 
     def __init__(self, **values: Any) -> None:
         """Check ``values``; keys that are not given have their defaults.

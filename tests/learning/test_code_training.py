@@ -136,5 +136,5 @@ def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):
 
 
 def test_a_robot_that_saw_nothing_again_is_told_so(light):
-    with pytest.raises(TrainingError, match="none; set trained to all"):
+    with pytest.raises(TrainingError, match="no place was; set trained to all"):
         train_codes(light, RevisitExamples(OWN.images), CodeInputs(), SMALL, LocalTrainingPlan(0, 1), CPU)

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 from urllib.parse import quote, unquote
 
-from fcslam.config import Settings
+from fcslam.config import StrictModel
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import export_map
 from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
@@ -120,11 +120,11 @@ def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
     return {path: base64.b64encode(gzip.compress(content, mtime=0)).decode() for path, content in contents.items()}
 
 
-def _json(content: Settings | Iterable[Settings]) -> str:
+def _json(content: StrictModel | Iterable[StrictModel]) -> str:
     """As the service writes it."""
     whole = (
         content.model_dump(mode="json")
-        if isinstance(content, Settings)
+        if isinstance(content, StrictModel)
         else [one.model_dump(mode="json") for one in content]
     )
     return json.dumps(whole, ensure_ascii=False, allow_nan=False, separators=(",", ":"))

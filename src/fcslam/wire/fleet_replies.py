@@ -5,10 +5,10 @@ Names of lengths in JSON have no units.
 
 from pydantic import ConfigDict, Field
 
-from fcslam.config import Settings
+from fcslam.config import StrictModel
 
 
-class _Reply(Settings):
+class _Reply(StrictModel):
     """A cloud of a later version may say more."""
 
     model_config = ConfigDict(extra="ignore")

@@ -10,7 +10,7 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.edits import read_edit
-from fcslam.config import Settings
+from fcslam.config import StrictModel
 from fcslam.errors import EditError
 from fcslam.records import Change, Undo
 from fcslam.service.detectors import LONGEST_FILE_BYTES
@@ -28,7 +28,7 @@ LEAST_FREE_BYTES = 8 * 2**20
 EditNumber = Annotated[int, Path(ge=1, le=2**31 - 1)]
 
 
-class NewEdit(Settings):
+class NewEdit(StrictModel):
     """An edit: what changes about the mission from now on."""
 
     kind: Literal["veto", "removal", "cut", "pin", "closure", "placement", "region", "floor"]

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.sessions import robot_and_epoch
-from fcslam.config import Settings
+from fcslam.config import StrictModel
 from fcslam.lidar.occupancy import FARTHEST_M
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.records import NAME
@@ -42,7 +42,7 @@ def _number(value: object) -> object:
     return value
 
 
-class OwnPose(Settings):
+class OwnPose(StrictModel):
     """Where a robot says it is."""
 
     map: Annotated[int, Field(ge=0), BeforeValidator(_number)] | None = Field(

@@ -12,7 +12,7 @@ from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.config import Settings
+from fcslam.config import StrictModel
 from fcslam.errors import StoreError
 from fcslam.mission.mission_store import check_mission
 from fcslam.records import NAME
@@ -34,7 +34,7 @@ RunNumber = Annotated[int, PathParameter(ge=1, le=2**31 - 1, description="that `
 MissionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
-class NewMission(Settings):
+class NewMission(StrictModel):
     """A mission to create."""
 
     name: MissionName

@@ -5,32 +5,32 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from fcslam.config import Settings
+from fcslam.config import StrictModel
 from fcslam.records import Channel, ClosureStatus, ReasonCode
 
 Pose = Annotated[list[float], Field(min_length=3, max_length=3, description="x and y in metres, theta in radians")]
 
 
-class Problem(Settings):
+class Problem(StrictModel):
     """Why a request is refused."""
 
     error: str = Field(description="what, where, what to do: one line")
 
 
-class PacketProblem(Settings):
+class PacketProblem(StrictModel):
     """Why a batch is refused, and from which of its packets on."""
 
     error: str = Field(description="what, where, what to do: one line")
     index: int | None = Field(None, description="of the refused packet; those before it are stored")
 
 
-class Health(Settings):
+class Health(StrictModel):
     """The service is well."""
 
     status: Literal["ok"] = "ok"
 
 
-class Readiness(Settings):
+class Readiness(StrictModel):
     """The worker follows what robots send."""
 
     status: Literal["ready"] = "ready"
@@ -43,7 +43,7 @@ class Unready(Problem):
     backlog: int = Field(description="packets that arrived and have no effect yet")
 
 
-class PacketRefusal(Settings):
+class PacketRefusal(StrictModel):
     """A refused packet; its number is used up."""
 
     epoch: int
@@ -51,7 +51,7 @@ class PacketRefusal(Settings):
     reason: str
 
 
-class RobotState(Settings):
+class RobotState(StrictModel):
     """Where a robot continues after a restart."""
 
     robot: str
@@ -62,7 +62,7 @@ class RobotState(Settings):
     refused: list[PacketRefusal]
 
 
-class FleetSummary(Settings):
+class FleetSummary(StrictModel):
     """Counts."""
 
     mission: str
@@ -82,7 +82,7 @@ class FleetSummary(Settings):
     metrics: dict[str, float | None] = Field(description="by name; `metrics.json` has their units")
 
 
-class SessionSummary(Settings):
+class SessionSummary(StrictModel):
     """One start of a robot with odometry at zero."""
 
     robot: str
@@ -107,7 +107,7 @@ class SessionSummary(Settings):
     last_heard_s: float | None = Field(description="seconds since the robot's last batch")
 
 
-class RobotSummary(Settings):
+class RobotSummary(StrictModel):
     """One robot's sessions, and packets of it that were refused."""
 
     robot: str
@@ -115,7 +115,7 @@ class RobotSummary(Settings):
     refused: list[PacketRefusal]
 
 
-class ClosureSummary(Settings):
+class ClosureSummary(StrictModel):
     """As in closures.csv."""
 
     robot_i: str
@@ -144,7 +144,7 @@ class MapLayer(StrEnum):
     QUALITY = "quality"
 
 
-class MapSummary(Settings):
+class MapSummary(StrictModel):
     """Which robots share a map."""
 
     map: int = Field(description="number of the map, from 0")
@@ -158,7 +158,7 @@ class MapSummary(Settings):
     georeferenced: bool = Field(description="whether its place on the earth is known")
 
 
-class LearningRound(Settings):
+class LearningRound(StrictModel):
     """A round of the federated training of the detector."""
 
     round: int = Field(description="number of the round, from 1")
@@ -171,13 +171,13 @@ class LearningRound(Settings):
     measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
 
 
-class WallDirection(Settings):
+class WallDirection(StrictModel):
     """How a map's walls run."""
 
     direction_rad: float = Field(description="of most walls, radians from the x axis, in [-pi/4, pi/4)")
 
 
-class MapShape(Settings):
+class MapShape(StrictModel):
     """A shape that is drawn over a map, and its label."""
 
     kind: Literal["plan", "missing", "new", "moved", "appeared", "disappeared", "tag", "good", "bad"] = Field(
@@ -191,7 +191,7 @@ class MapShape(Settings):
     y: float = Field(default=0.0, description="of the label, metres of the map")
 
 
-class MapSeparation(Settings):
+class MapSeparation(StrictModel):
     """Two maps that no closure joins."""
 
     maps: tuple[int, int] = Field(description="numbers of both maps")
@@ -201,7 +201,7 @@ class MapSeparation(Settings):
     explanation: str = Field(description="the binding reason, with its numbers")
 
 
-class DetectorVersion(Settings):
+class DetectorVersion(StrictModel):
     """A detector that robots may download."""
 
     channel: Channel
@@ -214,14 +214,14 @@ class DetectorSummary(DetectorVersion):
     announced: bool
 
 
-class MissionList(Settings):
+class MissionList(StrictModel):
     """All missions, and which one is open."""
 
     open: str
     missions: list[str]
 
 
-class Finalized(Settings):
+class Finalized(StrictModel):
     """A result."""
 
     number: int
@@ -229,7 +229,7 @@ class Finalized(Settings):
     archive: str = Field(description="path of the run folder as a ZIP archive, to download from the service")
 
 
-class EditSummary(Settings):
+class EditSummary(StrictModel):
     """An edit: what somebody changed about the mission by hand."""
 
     number: int = Field(description="number of the edit, from 1")

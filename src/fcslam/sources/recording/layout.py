@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError, model_validator
 
-from fcslam.config import Settings, parse_yaml
+from fcslam.config import StrictModel, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams, CameraModel, LaserModel, Sweep
@@ -101,7 +101,7 @@ def image_path(folder: Path, index: int, suffix: str) -> Path:
     return folder / IMAGES / f"{index:08d}.{suffix}"
 
 
-class Meta(Settings):
+class Meta(StrictModel):
     """The sensors of the robot."""
 
     version: Literal[3] = 3
