@@ -48,7 +48,7 @@ def needs(*modules):
 def two(tmp_path_factory):
     """The run folder of map_logs.py, and what it printed."""
     folder = tmp_path_factory.mktemp("examples")
-    return folder / "two", started("map_logs.py", "two", cwd=folder)
+    return folder / "two", start("map_logs.py", "two", cwd=folder)
 
 
 @pytest.mark.parametrize("program", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)

@@ -25,7 +25,7 @@ WIDE = LaserModel(180, -math.pi, math.radians(2.0), 12.0, (0.2, 0.05, 0.0))
 
 @lru_cache
 def drive(laser):
-    poses = worlds.ring_drive(rounds=1.0)
+    poses = worlds.ring_drive(rounds=0.6)
     rng = np.random.default_rng(3)
     return worlds.recording(poses, worlds.drifting(poses, rng), worlds.ring(), laser)
 

@@ -54,7 +54,7 @@ def test_a_dense_scanner_that_gives_its_maximum_where_nothing_is_maps_as_any_oth
     """It has 7,200 beams, and sees 5.6 m, which is less in single precision."""
     dense = fcslam.LaserModel(7200, -math.pi, math.tau / 7200, 5.6)
     rng = np.random.default_rng(0)
-    truth = worlds.drive([(-2.0, -1.0), (1.5, -1.5), (1.5, 2.0), (-2.0, 1.0), (-2.0, -1.0)])
+    truth = worlds.drive([(-2.0, -1.0), (1.5, -1.5), (1.5, 2.0), (-2.0, 1.0), (-2.0, -1.0)], step_m=0.2)
     odometry = worlds.drifting(truth, rng)
     measured = worlds.ranges(truth, worlds.room(), dense, 0.01, rng)
     assert (measured == np.float32(5.6)).any()
