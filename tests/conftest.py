@@ -121,8 +121,8 @@ def postgres(postgres_server):
 
 @pytest.fixture(scope="session")
 def drawn() -> SimulatedFleet:
-    """Three robots, 12 m each, that meet."""
-    return small_fleet.draw(3, 12.0)
+    """Three robots, 8 m each, that meet."""
+    return small_fleet.draw(3, 8.0)
 
 
 @pytest.fixture(scope="session")

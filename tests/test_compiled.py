@@ -19,6 +19,7 @@ assert is_cold()
 assert tell_uncached(notices(False))
 """
 
+
 def run(script, *arguments, **environment):
     return subprocess.run(
         [sys.executable, "-c", script, *map(str, arguments)],

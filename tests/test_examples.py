@@ -115,6 +115,7 @@ def test_a_network_of_ones_own_is_a_detector(tmp_path):
 
 @pytest.mark.slow
 @needs("torch", "onnx", "flwr")
+@pytest.mark.usefixtures("brief_validation")
 def test_a_strategy_of_ones_own_aggregates(tmp_path):
     for robot in range(3):
         (tmp_path / f"robot{robot}").mkdir()

@@ -24,7 +24,7 @@ CAMERA = fcslam.CameraModel(64, 48, 60.0, 60.0, 31.5, 23.5, fcslam.Transform((0.
 
 @pytest.fixture(scope="module")
 def scans():
-    return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+    return list(small_fleet.draw(1, path_length_m=8.0).robots[0].scans())
 
 
 @pytest.fixture

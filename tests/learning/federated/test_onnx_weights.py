@@ -114,10 +114,8 @@ def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_
             tmp_path / "detector.onnx", tmp_path, FederatedSettings(), ExecutionOptions(), lambda *_: None, public
         )
 
-    begun = first([pictures[0]])
-    assert any(
-        (begun[name] != read_detector_weights(tmp_path / "detector.onnx", "light")[name]).any() for name in begun
-    )
+    begun, read = first([pictures[0]]), read_detector_weights(tmp_path / "detector.onnx", "light")
+    assert any((begun[name] != read[name]).any() for name in begun)
     again = first([pictures[1]])
     assert all(np.array_equal(begun[name], again[name]) for name in begun)
     (kept,) = tmp_path.glob("start-*.npz")
