@@ -52,7 +52,7 @@ def fed(packets):
 @pytest.fixture(scope="module")
 def honest():
     """Packets of two robots in a building in which a copy bends their paths and no closure shows it."""
-    robots = small_fleet.draw(2, 20.0, seed=5).robots
+    robots = small_fleet.draw(2, 30.0, seed=5).robots
     return in_order(decode(encode(packet)) for robot in robots for packet in small_fleet.sent_by(robot))
 
 
