@@ -20,7 +20,7 @@ from tests.sources.clouds import spinning as spinning_cloud
 
 pytestmark = pytest.mark.slow
 
-START, SCANS = 1_700_000_000.0, 60
+START, SCANS = 1_700_000_000.0, 90
 TICKS = np.arange(0.0, 20.0, 0.01)
 POSES = spinning.pose_at(TICKS) - (0.0, 0.5, 0.0)
 NAN, INF = math.nan, math.inf
@@ -285,7 +285,7 @@ def never_set():
     """A topic of odometry that never moves, beside the tf of the same robot."""
     yield from in_tf()
     yield from (each._replace(fields={**each.fields, "at": (0.0, 0.0, 0.0), "rotation": quaternion(0.0),
-                                      "child": "base_footprint"}) for each in readings(6.0))  # fmt: skip
+                                      "child": "base_footprint"}) for each in readings(9.0))  # fmt: skip
 
 
 def unstamped():
@@ -298,7 +298,7 @@ def unstamped():
 def late(seconds):
     """Odometry by a clock of its own."""
     mounting, *_ = recording(LASER)
-    return [mounting, *readings(6.0, late_s=seconds), *scans_of(LASER)]
+    return [mounting, *readings(9.0, late_s=seconds), *scans_of(LASER)]
 
 
 def namespaced():
@@ -314,7 +314,7 @@ def slashed():
 
 def scaled():
     mounting, *_ = recording(LASER)
-    return [mounting, *readings(6.0, scale=1 / 1.2), *scans_of(LASER)]
+    return [mounting, *readings(9.0, scale=1 / 1.2), *scans_of(LASER)]
 
 
 def with_ranges(change):
@@ -391,7 +391,7 @@ ROBOTS = {
         "or another unit",
     ),
     "NaN in the odometry": (lambda: with_odometry(lambda k, x, y, a: (NAN if k % 7 == 0 else x, y, a)), ""),
-    "gaps in the odometry": (lambda: with_odometry(lambda k, *its: None if 45 < k < 60 else its), ""),
+    "gaps in the odometry": (lambda: with_odometry(lambda k, *its: None if 75 < k < 90 else its), ""),
     "bursts of odometry": (bursts, ""),
     "posts of the robot": (lambda: with_ranges(posts), ""),
     "legs of the operator": (lambda: with_ranges(operator), ""),
