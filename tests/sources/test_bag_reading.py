@@ -114,7 +114,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
         tracemalloc.stop()
         return peak
 
-    short, long = (save(tmp_path / f"{scans}.db3", drive(scans)) for scans in (300, 900))
+    short, long = (save(tmp_path / f"{scans}.db3", drive(scans)) for scans in (600, 1500))
     peak(short)
     assert peak(long) < 1.2 * peak(short) + 20_000
 
