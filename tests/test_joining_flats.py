@@ -65,11 +65,17 @@ def test_known_starts_do_not_join_another_flat():
     assert maps_of(run_mission([one, other], with_starts(dict.fromkeys("ab", (0.0, 0.0, 0.0))))) == {0, 1}
 
 
-@pytest.mark.parametrize("starts", [{}, dict.fromkeys("ab", (0.0, 0.0, 0.0))], ids=["unknown", "wrong"])
-def test_robots_at_different_doors_of_a_corridor_stay_apart(starts):
-    """They never met; every door fits every other, also that of a wrong start, and the last line names this."""
+@pytest.fixture(scope="module")
+def far_apart():
+    """Two robots in one corridor that never met."""
     ways = {"a": [(4.0, 0.0), (12.0, 0.1), (5.0, 0.0)], "b": [(26.0, 0.0), (34.0, 0.1), (27.0, 0.0)]}
-    run = run_mission([Drive(name, way, doors()) for name, way in ways.items()], with_starts(starts))
+    return [Drive(name, way, doors()) for name, way in ways.items()]
+
+
+@pytest.mark.parametrize("starts", [{}, dict.fromkeys("ab", (0.0, 0.0, 0.0))], ids=["unknown", "wrong"])
+def test_robots_at_different_doors_of_a_corridor_stay_apart(far_apart, starts):
+    """Every door fits every other, also that of a wrong start, and the last line names this."""
+    run = run_mission(far_apart, with_starts(starts))
     assert maps_of(run) == {0, 1}
     (apart,) = separations(run)
     assert apart.reason is not None

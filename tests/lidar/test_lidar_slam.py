@@ -162,16 +162,22 @@ def visit(x):
     return [(x, 0.0), (x, 2.6), (x - 1.0, 3.2), (x + 0.2, 3.8), (x, 2.4), (x, 0.0)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("drift", [0.03, 1.0])
-def test_rooms_that_look_alike_stay_apart(drift):
-    """With the default drift, and with so much allowed for that every twin lies inside the search."""
+@pytest.fixture(scope="module")
+def guest():
+    """A drive through four rooms, and its scans."""
     spacing = 8.0
     stops = [stop for k in range(4) for stop in visit(k * spacing)]
     truth = drive([(-4.5, 0), *stops, (3 * spacing + 4.5, 0), (-4.5, 0)])
     odometry = drifting(truth, np.random.default_rng(3), **DRIFT)
-    config = LidarConfig(closing=ClosingConfig(drift=drift))
-    mapped = Mapped(recording(truth, odometry, hotel(spacing, rooms=4)), config)
+    return truth, recording(truth, odometry, hotel(spacing, rooms=4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drift", [0.03, 1.0])
+def test_rooms_that_look_alike_stay_apart(guest, drift):
+    """With the default drift, and with so much allowed for that every twin lies inside the search."""
+    truth, scans = guest
+    mapped = Mapped(scans, LidarConfig(closing=ClosingConfig(drift=drift)))
     assert mapped.false_closures(truth) == []
     assert len(mapped.closures) > 0
     assert pose_errors(mapped.poses, truth)[0].max() < 0.15
