@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.show import Live, live_page
+from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Scanner
 
 if TYPE_CHECKING:
@@ -90,8 +91,6 @@ def _prepare(output: Path) -> None:
     Raises:
         OutputError: the folder holds other files, or it cannot be written.
     """
-    from fcslam.errors import OutputError
-
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():
@@ -112,7 +111,7 @@ def _prepare(output: Path) -> None:
 
 
 def _evaluate(output: Path, console: "Console") -> None:
-    from fcslam.cli.evaluate.fleet import show_fleet
+    from fcslam.cli.evaluate.fleet_tables import show_fleet
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
@@ -122,7 +121,7 @@ def _evaluate(output: Path, console: "Console") -> None:
         display.start("evaluating")
         report = evaluate_fleet(output / RUN, output / RECORDINGS)
         write_metrics(fleet_metrics(report), output / TABLE)
-    show_fleet(report, answers(), explained=False)
+    show_fleet(report, explained=False)
     typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.examples import examples
+from fcslam.cli.recordings import pose as read_pose
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from fcslam.mission.mission_file import SavedMission
@@ -48,19 +50,18 @@ def list_edits(mission: Mission) -> None:
     """Print all edits of a mission: number, time, author, content, and what undid them."""
     from datetime import UTC, datetime
 
-    from fcslam.cli.output import answers, print_line
     from fcslam.cloud.edits import edit_json, kind_of, undone
     from fcslam.mission.mission_file import read_mission
 
-    edits, console = read_mission(mission).edits, answers()
+    edits = read_mission(mission).edits
     gone = undone(edits)
     for edit in edits:
         when = datetime.fromtimestamp(edit.time_s, UTC)
         end = f"  undone by {gone[edit.number]}" if edit.number in gone else ""
         content = f"{kind_of(edit.content)} {edit_json(edit.content)}"
-        print_line(console, f"{edit.number}  {when:%Y-%m-%d %H:%M:%S} UTC  {edit.author}  {content}{end}")
+        typer.echo(f"{edit.number}  {when:%Y-%m-%d %H:%M:%S} UTC  {edit.author}  {content}{end}")
     if not edits:
-        print_line(console, "no edits")
+        typer.echo("no edits")
 
 
 @app.command(epilog=examples("fcslam edit undo runs/building 2"))
@@ -87,7 +88,6 @@ def veto(
     ],
 ) -> None:
     """Exclude a closure, or all closures between two sessions."""
-    from fcslam.errors import InputError
     from fcslam.records import Veto
 
     match ends:
@@ -121,8 +121,6 @@ def close(
     ] = "0.2,0.1",
 ) -> None:
     """Add a closure: the pose of session J at one time, as seen from session I at another time. It joins maps."""
-    from fcslam.cli.recordings import pose as read_pose
-    from fcslam.errors import InputError
     from fcslam.records import ManualClosure
 
     deviations = tolerance.split(",")
@@ -243,8 +241,6 @@ def place(
     import numpy as np
 
     from fcslam.anchoring.walls import wall_direction
-    from fcslam.cli.recordings import pose as read_pose
-    from fcslam.errors import InputError
     from fcslam.mission.map_edits import moved_map
     from fcslam.records import Placement
 
@@ -303,7 +299,6 @@ def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: in
 
 def _opened(folder: Path) -> "tuple[Run, SavedMission]":
     """A run and its mission."""
-    from fcslam.errors import InputError
     from fcslam.mission.mission_file import read_mission
     from fcslam.runs import open_run
 
@@ -333,8 +328,6 @@ def _bounded(stretch: tuple[float, float]) -> tuple[float, float]:
 
 
 def _point(option: str, text: str) -> tuple[float, float]:
-    from fcslam.errors import InputError
-
     numbers = text.split(",")
     if len(numbers) != 2:
         raise InputError(f"{option} {text!r} is not a point; give metres, as in 1.5,-2")
@@ -342,8 +335,6 @@ def _point(option: str, text: str) -> tuple[float, float]:
 
 
 def _number(text: str) -> float:
-    from fcslam.errors import InputError
-
     try:
         number = float(text)
     except ValueError:

@@ -7,6 +7,7 @@ import typer
 
 from fcslam.cli.options import output_option
 from fcslam.cli.output import FEATURES, answers, new_folder, notices, print_line
+from fcslam.errors import FeatureError
 from fcslam.features.detector_kinds import DetectorKind
 
 LONGEST_SIDE_PX = 2048
@@ -33,7 +34,6 @@ def extract(
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import changed
-    from fcslam.errors import FeatureError
     from fcslam.features.classical import OrbConfig
     from fcslam.features.detector import OnnxConfig
     from fcslam.features.extraction import extract_all, find_files

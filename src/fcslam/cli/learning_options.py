@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.errors import InputError
+
 if TYPE_CHECKING:
     from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.robot.frontend import RobotConfig
@@ -39,7 +41,6 @@ def learning_plan(
     """
     from fcslam.cli.training_options import require_training_libraries
     from fcslam.config import load
-    from fcslam.errors import InputError
     from fcslam.features.detector_kinds import DetectorKind
     from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.learning.federated.live_settings import RobotLearningSettings

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from fcslam.errors import ServiceError
+
 if TYPE_CHECKING:
     import socket
 
@@ -17,8 +19,6 @@ def listen(host: str, port: int) -> "socket.socket":
         ServiceError: the port is in use, or the address is not of this machine.
     """
     import socket
-
-    from fcslam.errors import ServiceError
 
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -52,8 +52,6 @@ def find_files(folder: Path | None) -> ServiceFiles:
     Raises:
         ServiceError: no file is there.
     """
-    from fcslam.errors import ServiceError
-
     if folder is None:
         return ServiceFiles()
     names = "tokens.yaml", "cloud.pem", "cloud.key"
@@ -71,7 +69,6 @@ def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None
     """
     import ssl
 
-    from fcslam.errors import ServiceError
     from fcslam.wire.keys import no_passphrase
 
     if (certificate is None) != (key is None):

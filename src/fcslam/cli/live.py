@@ -11,11 +11,11 @@ from fcslam.cli.output import RUNS, answers, new_folder, print_line
 from fcslam.cli.recordings import bag_options, print_faults
 from fcslam.cli.ros_options import node_parameters, stopping
 from fcslam.cli.warm_up import compiled
+from fcslam.errors import CloudError, FcslamError, StateError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.errors import FcslamError
     from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
@@ -143,10 +143,8 @@ def drive_live(
         raise failure
 
 
-def _finish(robot: "Robot", notify: Callable[[str], None]) -> "FcslamError | None":
+def _finish(robot: "Robot", notify: Callable[[str], None]) -> FcslamError | None:
     """End the recording; returns why the server or the state folder cannot be used. The run is written all the same."""
-    from fcslam.errors import CloudError, StateError
-
     try:
         if not robot.finish(SERVER_PATIENCE_S):
             notify("the server does not have everything; the rest is sent at the next start with the same --state")
@@ -165,7 +163,6 @@ def _learning(
     if plan is None or isinstance(robot, LocalizedRobot):
         yield lambda _pose: None
         return
-    from fcslam.errors import CloudError, StateError
     from fcslam.learning.federated.learning_process import LearningProcess
     from fcslam.live.standstill import Standstill
 

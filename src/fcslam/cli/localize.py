@@ -16,6 +16,7 @@ from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, pr
 from fcslam.cli.ros_options import RosParameters, UseSimTime
 from fcslam.cli.server_options import Credentials, ServerUrl, access
 from fcslam.cli.warm_up import compiled
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -80,7 +81,6 @@ def localize(
     """
     from fcslam.api import localize as localize_recording
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.errors import InputError
     from fcslam.runs import prepare_output
     from fcslam.storage.files import keep_private
 

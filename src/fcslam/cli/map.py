@@ -28,6 +28,7 @@ from fcslam.cli.recordings import (
 )
 from fcslam.cli.show import Live, live_page
 from fcslam.cli.warm_up import compiled, cores
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -116,7 +117,6 @@ def map_recordings(
         from fcslam.api import split_recordings
         from fcslam.cluster.verifying import verifying
         from fcslam.cluster.workers import Workers
-        from fcslam.errors import InputError
         from fcslam.mission.mission import Beginning, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
@@ -146,8 +146,6 @@ def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, st
     Raises:
         InputError: a robot or all of them are given two floors.
     """
-    from fcslam.errors import InputError
-
     common = [option for option in options if "=" not in option]
     named = [(name, floor) for name, _, floor in (option.partition("=") for option in options if "=" in option)]
     twice = next((name for name, count in Counter(name for name, _ in named).items() if count > 1), None)

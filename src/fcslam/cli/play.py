@@ -19,6 +19,7 @@ from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
 from fcslam.cli.warm_up import compiled
+from fcslam.errors import InputError, PacketError, SourceError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,7 +63,6 @@ def play(
     quiet: Quiet = False,
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
-    from fcslam.errors import InputError
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
     from fcslam.robot.backend_runner import copied_worker
@@ -161,8 +161,6 @@ def _learn(
 
 def _speed(text: str) -> float | None:
     """Playback speed as a multiple of real time; None: as fast as possible."""
-    from fcslam.errors import InputError
-
     if text == "max":
         return None
     try:
@@ -176,7 +174,6 @@ def _speed(text: str) -> float | None:
 
 def _check_name(name: str) -> None:
     from fcslam.cloud.sessions import check_robot
-    from fcslam.errors import PacketError, SourceError
 
     try:
         check_robot(name)

@@ -18,6 +18,7 @@ from fcslam.cli.options import Force, Quiet
 from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.ros_options import stopping
+from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,8 +67,6 @@ def record(
         _record(source, output, duration, options, force, console)
     else:
         if duration is not None:
-            from fcslam.errors import InputError
-
             raise InputError(f"--duration is the time to record a live robot; {source} is a recording")
         _convert(source, output, options, force, console)
 
@@ -75,7 +74,6 @@ def record(
 def _record(
     address: str, output: Path, duration: float | None, options: "BagOptions | None", force: bool, console: "Console"
 ) -> None:
-    from fcslam.errors import OutputError
     from fcslam.ros.addresses import open_network
     from fcslam.ros.node import await_sensors
     from fcslam.ros.parameters import NodeParameters
@@ -129,7 +127,6 @@ def _scans(source: "Source") -> "Iterator[LaserScan]":
 
 def _prepare(output: Path, force: bool) -> None:
     """Check before the work that ``output`` can be written, and create its parents."""
-    from fcslam.errors import OutputError
     from fcslam.sources import BAG_SUFFIXES
 
     if not (_CARMEN.search(output.name) or output.suffix in (*BAG_SUFFIXES, _RECORDING)):
@@ -149,7 +146,6 @@ def _prepare(output: Path, force: bool) -> None:
 
 def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") -> None:
     """Write into a temporary folder beside ``output`` and move the complete recording to its place."""
-    from fcslam.errors import OutputError
     from fcslam.sources import write_bag, write_carmen, write_recording
 
     try:

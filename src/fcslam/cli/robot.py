@@ -14,6 +14,7 @@ from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
 from fcslam.cli.ros_options import RosParameters, UseSimTime
 from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
+from fcslam.errors import InputError
 
 
 def robot(
@@ -44,7 +45,6 @@ def robot(
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
     from fcslam.cli.live import drive_live, is_live, live_source
-    from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.robot.backend_runner import copied_worker

@@ -11,6 +11,7 @@ from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
+from fcslam.errors import FcslamError, ServiceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -134,7 +135,6 @@ def _check_open(host: str, credentials: Path | None) -> None:
     Raises:
         ServiceError: others reach it, or credentials are given in vain.
     """
-    from fcslam.errors import ServiceError
     from fcslam.wire.http_transport import is_loopback
 
     if not is_loopback(host):
@@ -190,7 +190,6 @@ def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
     import logging
     import signal
 
-    from fcslam.errors import FcslamError
     from fcslam.service.http.authentication import read_tokens
 
     log = logging.getLogger("fcslam.service")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from fcslam.cli.learning_options import LEARNING_FILE
+from fcslam.errors import FcslamError, ServiceError
 from fcslam.learning.federated.live_settings import RELEASE
 from fcslam.learning.federated.settings import DETECTOR
 
@@ -39,7 +40,6 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
     """
     from fcslam.cli.training_options import require_training_libraries
     from fcslam.config import load
-    from fcslam.errors import ServiceError
     from fcslam.learning.federated.live_settings import FleetLearningSettings
 
     if not learn:
@@ -67,7 +67,6 @@ def learning_process(plan: FleetLearningPlan, state: "ServiceState") -> Iterator
     import tempfile
     import time
 
-    from fcslam.errors import FcslamError
     from fcslam.service.supervisor import Supervisor
 
     log = logging.getLogger("fcslam.service")

@@ -14,6 +14,7 @@ import typer
 from fcslam.cli.listening import listen
 from fcslam.cli.options import Force
 from fcslam.cli.output import notices
+from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from socket import socket
@@ -50,7 +51,6 @@ def show(
     force: Force = False,
 ) -> None:
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
-    from fcslam.errors import OutputError
     from fcslam.page.shown_run import ShownRun
 
     if html is not None and html.exists() and not (force and html.is_file()):
@@ -105,8 +105,6 @@ def _mapped(mission: Path, console: "Console") -> Iterator[Path]:
 
 
 def _check_size(run: Path) -> None:
-    from fcslam.errors import InputError
-
     size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
     if size > LARGEST_BYTES:
         raise InputError(
@@ -136,7 +134,6 @@ def _announce(what: str, listening: "socket", open_browser: bool | None) -> None
 
 
 def _write_report(shown: "ShownRun", html: Path, run: Path) -> None:
-    from fcslam.errors import OutputError
     from fcslam.page.report import report_html
     from fcslam.storage.files import write_file
 

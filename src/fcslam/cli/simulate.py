@@ -12,6 +12,7 @@ import typer
 from fcslam.cli.mission_options import chosen_settings
 from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
+from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
 if TYPE_CHECKING:
@@ -103,7 +104,6 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
     import numpy as np
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.errors import OutputError
     from fcslam.lab.simulation.ground_truth import write_ground_truth
     from fcslam.lab.simulation.recording import record_robot
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.errors import TrainingError
+
 if TYPE_CHECKING:
     from fcslam.learning.trainer import ExecutionOptions
 
@@ -29,8 +31,6 @@ QUICK_VALIDATION_PAIRS = 2
 
 def require_training_libraries(*others: str, extra: str = "train") -> None:
     """Raise TrainingError if a library that training needs, or one of ``others``, is missing."""
-    from fcslam.errors import TrainingError
-
     missing = [name for name in ("torch", "onnx", "onnxruntime", *others) if find_spec(name) is None]
     if missing:
         raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
@@ -40,7 +40,6 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
     """How to train here: on a GPU if CUDA shows one, the threads, and how often to validate and log."""
     import torch
 
-    from fcslam.errors import TrainingError
     from fcslam.learning.trainer import ExecutionOptions
 
     device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.output import answers, print_line
+from fcslam.errors import SourceError
 
 MOST_WORDS = 4096
 SEED = 0
@@ -23,7 +24,6 @@ def vocabulary(
     """Train the words that robots send in place of descriptors (robot.sends: words)."""
     import numpy as np
 
-    from fcslam.errors import SourceError
     from fcslam.mission.mission_file import read_mission
     from fcslam.places.words import short, train_words, write_vocabularies
     from fcslam.records import Channel, Place
