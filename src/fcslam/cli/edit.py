@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.examples import examples
+from fcslam.cli.options import examples
 from fcslam.cli.recordings import pose as read_pose
 from fcslam.errors import InputError
 

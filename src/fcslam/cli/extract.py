@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.options import output_option
-from fcslam.cli.output import FEATURES, answers, new_folder, notices, print_line
+from fcslam.cli.output import FEATURES, new_folder, notices, print_line
 from fcslam.errors import FeatureError
 from fcslam.features.detector_kinds import DetectorKind
 
@@ -61,4 +61,4 @@ def extract(
         raise FeatureError(f"{images}: no usable image there, {len(files)} files skipped; give JPEG, PNG, PPM or TIFF")
     without = f", {empty} of them without a keypoint" if empty else ""
     skipped = f", {len(files) - done} files skipped" if done < len(files) else ""
-    print_line(answers(), f"{finder.version}: features of {done} images{without}{skipped}: {output}")
+    typer.echo(f"{finder.version}: features of {done} images{without}{skipped}: {output}")

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.recordings import (
-    Sensors,
-    bag_options,
-)
+from fcslam.cli.output import notices
+from fcslam.cli.recordings import Sensors, bag_options
 from fcslam.errors import printable
 
 if TYPE_CHECKING:
@@ -44,15 +41,14 @@ def info(
 
     options = bag_options(sensors)
     found = _with_contradictions(inspect(recording, options), options)
-    console = answers()
     if as_json:
-        print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
+        typer.echo(json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
     else:
         for line in _lines(found):
-            print_line(console, printable(line))
+            typer.echo(printable(line))
         for each in found.robots or [found]:
             for line in _calibration(each.path, options) if calibrate and each.problem is None else ():
-                print_line(console, printable(line))
+                typer.echo(printable(line))
     if any(each.problem is not None for each in (found, *found.robots)):
         raise typer.Exit(1)
 

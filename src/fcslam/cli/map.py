@@ -12,20 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.mission_options import ConfigFiles, mission_config, with_starts
-from fcslam.cli.options import (
-    Force,
-    Quiet,
-    WorkersOption,
-    output_option,
-)
-from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
-from fcslam.cli.recordings import (
-    Sensors,
-    bag_options,
-    open_recordings,
-    print_faults,
-    print_notes,
-)
+from fcslam.cli.options import Force, Quiet, WorkersOption, output_option
+from fcslam.cli.output import RUNS, answers, new_folder, notices
+from fcslam.cli.recordings import Sensors, bag_options, open_recordings, print_faults, print_notes
 from fcslam.cli.show import Live, live_page
 from fcslam.cli.warm_up import compiled, cores
 from fcslam.errors import InputError
@@ -187,7 +176,7 @@ def map_sources(
     if page is not None:
         page.finish(output)
     print_faults(console, faults)
-    _report(answers(), run, time.perf_counter() - began, output, settings, beginning.onto)
+    _report(run, time.perf_counter() - began, output, settings, beginning.onto)
     return run
 
 
@@ -228,7 +217,6 @@ def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
 
 
 def _report(
-    console: "Console",
     run: "Run",
     elapsed_s: float,
     output: Path,
@@ -251,10 +239,9 @@ def _report(
             f"{trajectory.path_length_m:.1f}",
             str(len(trajectory.stamps)),
         )
-    console.print(table)
+    answers().print(table)
     speed = "".join(f" ({text})" for text in _speed(values["recorded_time"], elapsed_s))
-    print_line(
-        console,
+    typer.echo(
         f"{values['scans']:.0f} scans in {elapsed_s:.1f} s{speed}, "
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
@@ -267,37 +254,37 @@ def _report(
             why = f"{robot} was lost; this session begins at {begin_s:.3f} s"
             if begin_s < ends.get(robot, begin_s):
                 why = f"the clock stepped back; this session begins at {begin_s:.3f} s"
-            print_line(console, f"{session.robot}: {why}")
+            typer.echo(f"{session.robot}: {why}")
         ends[robot] = session.stamps[-1]
-    _print_jumps(console, run, settings)
+    _print_jumps(run, settings)
     maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:
-        print_line(console, f"{maps} maps" if joined else f"{maps} maps: one for each robot")
+        typer.echo(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
     if joined:
-        _print_separations(console, run)
+        _print_separations(run)
     for line in anchoring_lines(run.map_files):
-        print_line(console, line)
+        typer.echo(line)
     for name in sorted(name for name in run.map_files if name.endswith(".png")):
-        print_line(console, f"map: {output / name}")
+        typer.echo(f"map: {output / name}")
 
 
-def _print_jumps(console: "Console", run: "Run", settings: "MissionConfig") -> None:
+def _print_jumps(run: "Run", settings: "MissionConfig") -> None:
     """Warn of every trajectory with steps that no robot can make."""
     from fcslam.metrics.jumps import find_jumps
 
     for trajectory in run.trajectories.values():
         jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
         if jumps is not None:
-            print_line(console, f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
+            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
 
 
-def _print_separations(console: "Console", run: "Run") -> None:
+def _print_separations(run: "Run") -> None:
     """Say for every two maps what keeps them apart; maps without similar places share one line."""
     from fcslam.runs import separations
 
     apart = separations(run)
     unlike = [separation for separation in apart if separation.reason is None]
     for separation in apart if len(unlike) == 1 else (one for one in apart if one not in unlike):
-        print_line(console, str(separation))
+        typer.echo(str(separation))
     if len(unlike) > 1:
-        print_line(console, f"{len(unlike)} pairs of maps: no two of their places look alike")
+        typer.echo(f"{len(unlike)} pairs of maps: no two of their places look alike")

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live, named_address
+from fcslam.cli.live import is_live, named_address, stopping
 from fcslam.cli.options import Force, Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
-from fcslam.cli.ros_options import stopping
 from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ def _record(
                 timer.start()
             counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
         timer.cancel()
-    print_line(answers(), f"{_listed(counts)}: {output}")
+    typer.echo(f"{_listed(counts)}: {output}")
 
 
 def _listed(counts: Counter[str]) -> str:
@@ -116,7 +115,7 @@ def _convert(log: str, output: Path, options: "BagOptions | None", force: bool, 
         print_line(console, f"{output}: a CARMEN log has no place for the times of beams, they are lost")
     _write(output, survey, _with_progress(source, survey.scan_count, console))
     print_faults(console, {source.name: source.faults})
-    print_line(answers(), f"{survey.scan_count} scans: {output}")
+    typer.echo(f"{survey.scan_count} scans: {output}")
 
 
 def _scans(source: "Source") -> "Iterator[LaserScan]":

@@ -8,12 +8,11 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.learning_options import Learn, learning_plan
+from fcslam.cli.live import RosParameters, UseSimTime
 from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access, output_option
 from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
-from fcslam.cli.ros_options import RosParameters, UseSimTime
-from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
 from fcslam.errors import InputError
 
 

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.examples import examples
-from fcslam.cli.options import Csv, output_option
+from fcslam.cli.options import Csv, examples, output_option
 from fcslam.cli.output import EVALUATIONS, new_folder, notices
 from fcslam.errors import EvaluationError
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
