@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import RosParameters, UseSimTime, is_live
+from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Credentials, Force, Quiet, ServerUrl, access, output_option
 from fcslam.cli.output import RUNS, new_folder, notices, print_line
@@ -91,7 +91,6 @@ def localize(
         keep_private()
         _fetch(map_path, cloud, console)
     if live:
-        from fcslam.cli.live import drive_live, live_source
         from fcslam.live.localized_robot import LocalizedRobot
         from fcslam.live.records import Wiring
         from fcslam.robot.backend_runner import copied_worker
