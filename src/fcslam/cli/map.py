@@ -105,7 +105,6 @@ def map_recordings(
         from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import split_recordings
         from fcslam.cluster.verifying import verifying
-        from fcslam.cluster.workers import Workers
         from fcslam.mission.mission import Beginning, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
@@ -123,8 +122,7 @@ def map_recordings(
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
-    chosen = Workers(workers)
-    with verifying(chosen) as verify, live_page(output) if live else nullcontext() as page:
+    with verifying(workers) as verify, live_page(output) if live else nullcontext() as page:
         beginning = Beginning(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
         map_sources(sources, settings, beginning, output, notices(quiet), force, page)
 

@@ -65,8 +65,7 @@ def serve(
     import logging
 
     from fcslam.cli import serving
-    from fcslam.cluster.verifying import verifying
-    from fcslam.cluster.workers import Workers
+    from fcslam.cluster.verifying import check_workers, is_cluster, verifying
     from fcslam.page.routes import page_router, report_router
     from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.app import create_app
@@ -79,10 +78,9 @@ def serve(
     check_tls(certificate, key, client_ca)
     if tokens is None and client_ca is None and not insecure:
         serving.check_open(host, credentials)
-    chosen = Workers(workers)
-    chosen.check()
-    if chosen.is_cluster:
-        with verifying(chosen):  # refused here, not by the worker of each mission
+    check_workers(workers)
+    if is_cluster(workers):
+        with verifying(workers):  # refused here, not by the worker of each mission
             pass
     learning = serving.learning_settings(data, store) if learn else None
     keep_private()
@@ -92,9 +90,9 @@ def serve(
         known = read_tokens(tokens) if tokens is not None else None if client_ca is None else ()
         authenticator, given = Authenticator(known), mission_config(config).cloud
         if store is None:
-            state = serving.own_state(data, authenticator, given, chosen)
+            state = serving.own_state(data, authenticator, given, workers)
         else:
-            state = serving.shared_state(store, listening.getsockname()[1], data, authenticator, given, chosen)
+            state = serving.shared_state(store, listening.getsockname()[1], data, authenticator, given, workers)
         serving.reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()

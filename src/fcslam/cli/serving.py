@@ -19,7 +19,6 @@ from fastapi import FastAPI
 from fcslam.cli.learning_options import LEARNING_FILE
 from fcslam.cli.training_options import require_training_libraries
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cluster.workers import Workers
 from fcslam.config import load
 from fcslam.errors import FcslamError, ServiceError
 from fcslam.learning.federated.live_settings import RELEASE, FleetLearningSettings
@@ -66,7 +65,7 @@ def check_open(host: str, credentials: Path | None) -> None:
         )
 
 
-def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, workers: Workers) -> ServiceState:
+def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, workers: str) -> ServiceState:
     """The state of a service whose missions are files in the folder ``data``.
 
     Raises:
@@ -74,7 +73,7 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
         StoreError: the mission cannot be opened.
     """
     events = EventStream()
-    command = (*WORKER, *workers.options())
+    command = (*WORKER, "--workers", workers)
 
     def launch(folder: MissionFolder) -> RunningWorker:
         return Supervisor(folder.path, time.monotonic, events.publish, command)
@@ -85,7 +84,7 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
 
 
 def shared_state(
-    store: str, port: int, data: Path, authenticator: Authenticator, config: CloudConfig, workers: Workers
+    store: str, port: int, data: Path, authenticator: Authenticator, config: CloudConfig, workers: str
 ) -> ServiceState:
     """The state of an instance of the store; who closes its missions closes all that it holds.
 
@@ -109,7 +108,7 @@ def shared_state(
         def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
             folder = MissionFolder(data / "missions" / mission.name)
             folder.path.mkdir(parents=True, exist_ok=True)
-            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), *workers.options())
+            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), "--workers", workers)
             # Events of all instances, this one included, come from the store.
             return Supervisor(folder.path, time.monotonic, lambda *_: None, options, spares.start)
 

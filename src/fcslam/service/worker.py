@@ -42,7 +42,6 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cluster.verifying import verifying
-from fcslam.cluster.workers import Workers
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
@@ -561,7 +560,7 @@ def _mission(chosen: "_Chosen") -> Iterator[tuple[MissionStore, Share]]:
 
 class _Chosen(NamedTuple):
     folder: MissionFolder
-    workers: Workers
+    workers: str
     store: str | None
     lease: Lease | None
 
@@ -576,10 +575,10 @@ def _chosen(arguments: Sequence[str]) -> _Chosen:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--store")
     parser.add_argument("--lease", type=int, nargs=2, metavar=("MISSION", "FENCE"))
-    parser.add_argument("--workers", default=Workers().where)
+    parser.add_argument("--workers", default="1")
     given = parser.parse_args(arguments)
-    workers = Workers(given.workers)
-    return _Chosen(MissionFolder(given.folder), workers, given.store, Lease(*given.lease) if given.lease else None)
+    lease = Lease(*given.lease) if given.lease else None
+    return _Chosen(MissionFolder(given.folder), given.workers, given.store, lease)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:
