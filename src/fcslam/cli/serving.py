@@ -76,7 +76,7 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
     command = (*WORKER, "--workers", workers)
 
     def launch(folder: MissionFolder) -> RunningWorker:
-        return Supervisor(folder.path, time.monotonic, events.publish, command)
+        return Supervisor(folder.path, events.publish, command)
 
     missions = Missions(data, config, time.monotonic, time.time, launch)
     audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
@@ -110,7 +110,7 @@ def shared_state(
             folder.path.mkdir(parents=True, exist_ok=True)
             options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), "--workers", workers)
             # Events of all instances, this one included, come from the store.
-            return Supervisor(folder.path, time.monotonic, lambda *_: None, options, spares.start)
+            return Supervisor(folder.path, lambda *_: None, options, spares.start)
 
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)
@@ -218,7 +218,7 @@ def learning_process(settings: FleetLearningSettings, state: ServiceState, outpu
         listener = Path(folder) / "learning"
         command = [sys.executable, "-m", "fcslam.learning.federated.fleet_learning", "--listener", str(listener)]
         command += ["--settings", settings.model_dump_json(), "--output", str(output)]
-        learner = Supervisor(state.missions.root, time.monotonic, announce, command)
+        learner = Supervisor(state.missions.root, announce, command)
         typer.echo(f"robots learn here; rounds are in {output}")
         try:
             yield listener
