@@ -34,7 +34,7 @@ from fcslam.service.missions import Missions
 from fcslam.service.shared.audit_table import AuditTable
 from fcslam.service.shared.instance import Hooks
 from fcslam.service.shared.mission_tables import Lease
-from fcslam.service.shared.missions import Admission, SharedMissions
+from fcslam.service.shared.missions import SharedMissions
 from fcslam.service.shared.registry import KnownMission
 from fcslam.service.shared.schema import prepare
 from fcslam.service.shared.spares import Spares
@@ -95,7 +95,8 @@ def shared_state(
         StoreError: the store cannot be used, or is of a newer version.
     """
     name = f"{socket.gethostname()[:LONGEST_HOST]}-{port}"
-    admission = Admission(_limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS), _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS))
+    missions_here = _limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS)
+    robots_here = _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS)
     if not is_server(store):
         raise ServiceError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(store)
@@ -115,7 +116,7 @@ def shared_state(
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)
         hooks = Hooks(launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM))
-        missions = SharedMissions(data, config, server, name, admission, hooks)
+        missions = SharedMissions(data, config, server, name, missions_here, robots_here, hooks)
         log = AuditLog(audit, time.time)
         missions.closing = opened.pop_all().close
         return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log)

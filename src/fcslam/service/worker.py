@@ -371,9 +371,7 @@ class Worker:
             result = self._result()
             self._run(result, self._store.traffic()).save(self._folder.run(name), force=True)
             self._concluded = (self._applied, self._newest_edit), result
-        except (
-            Exception
-        ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
+        except Exception as error:  # asked for again, it would fail at the next worker too, and nothing else go on
             _log.exception("result %s failed", name)
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:

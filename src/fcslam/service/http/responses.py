@@ -17,10 +17,9 @@ class Problem(StrictModel):
     error: str = Field(description="what, where, what to do: one line")
 
 
-class PacketProblem(StrictModel):
+class PacketProblem(Problem):
     """Why a batch is refused, and from which of its packets on."""
 
-    error: str = Field(description="what, where, what to do: one line")
     index: int | None = Field(None, description="of the refused packet; those before it are stored")
 
 
