@@ -28,9 +28,6 @@ STAGE_RUNS, STAGE_MS = "runs of ", "ms of "
 """Before the name of a stage: the events by which a worker reports how often it ran, and how many milliseconds it took
 in all. The supervisor keeps the numbers."""
 
-Listen = Callable[[str, int], None]
-"""Called with a worker's events, on a separate thread."""
-
 
 def tell(event: str, number: int) -> None:
     """Write an event of this worker to stdout, where its supervisor reads it."""
@@ -74,9 +71,6 @@ WORKER = (sys.executable, "-m", "fcslam.service.worker")
 SPARE = "--spare"
 """The only argument of a worker that gets its other arguments later, as a line of JSON on stdin."""
 
-StartWorker = Callable[[Sequence[str]], subprocess.Popen[bytes]]
-"""Starts the process of a worker."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -92,11 +86,13 @@ class Supervisor:
     def __init__(
         self,
         folder: Path,
-        listen: Listen,
+        listen: Callable[[str, int], None],
         command: Sequence[str] = WORKER,
-        start: StartWorker = start_worker,
+        start: Callable[[Sequence[str]], subprocess.Popen[bytes]] = start_worker,
     ) -> None:
-        """``start`` makes a process of ``command``, to which the folder, of a mission for instance, is added."""
+        """``listen`` is called with the worker's events, on a separate thread. ``start`` makes a process of
+        ``command``, to which the folder, of a mission for instance, is added.
+        """
         self._command, self._start = (*command, str(folder)), start
         self._listen = listen
         self._stopping = threading.Event()
