@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.live import is_live
 from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access
 from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
+from fcslam.cli.training_options import Learn, learning_plan
 from fcslam.cli.warm_up import compiled
 from fcslam.errors import InputError, PacketError, SourceError
 

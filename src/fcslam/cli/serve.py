@@ -12,8 +12,6 @@ from fcslam.cli.options import Quiet, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 
-_CREDENTIALS = "Credentials"
-
 
 def serve(
     *,
@@ -26,7 +24,7 @@ def serve(
         typer.Option(
             "--insecure",
             help="Accept requests from other machines without authentication.",
-            rich_help_panel=_CREDENTIALS,
+            rich_help_panel="Credentials",
         ),
     ] = False,
     client_ca: Annotated[
@@ -34,7 +32,7 @@ def serve(
         typer.Option(
             help="Certificate of the authority that signs robots' certificates (PEM). Robots with such a certificate "
             "need no token.",
-            rich_help_panel=_CREDENTIALS,
+            rich_help_panel="Credentials",
         ),
     ] = None,
     config: ConfigFiles = None,

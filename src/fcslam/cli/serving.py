@@ -16,8 +16,7 @@ import typer
 import uvicorn
 from fastapi import FastAPI
 
-from fcslam.cli.learning_options import LEARNING_FILE
-from fcslam.cli.training_options import require_training_libraries
+from fcslam.cli.training_options import LEARNING_FILE, require_training_libraries
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import load
 from fcslam.errors import FcslamError, ServiceError
