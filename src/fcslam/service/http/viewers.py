@@ -19,7 +19,6 @@ from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, ClosureRow, Run
 from fcslam.runs.map_files import map_stem
-from fcslam.service.closure_submaps import overlay_png
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,
@@ -38,8 +37,8 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
+from fcslam.service.keyscans import live_scan, overlay_png
 from fcslam.service.learning_rounds import read_rounds
-from fcslam.service.live_poses import live_scan
 from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
