@@ -33,7 +33,7 @@ OWN = {
     "compiled.py": "the cache of this user",
     "ros/record.py": "the recording that this process writes",
     "wire/keys.py": "the robot's own token",
-    "cli/serve_learning.py": "written by the training that this service started",
+    "cli/serving.py": "written by the training that this service started",
     "features/network_check.py": "the memory of this process",
     "features/onnx_runtime.py": "no file",
     "learning": "the folder of this user's training",

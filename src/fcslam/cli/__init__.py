@@ -35,7 +35,7 @@ from fcslam.cli import map as mapping
 from fcslam.cli import play as playback
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
-from fcslam.cli.examples import examples
+from fcslam.cli.options import examples
 from fcslam.cli.recordings import SENSOR_KEYS
 from fcslam.errors import FcslamError, InputError, printable
 

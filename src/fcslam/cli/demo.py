@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.show import Live, live_page
+from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Scanner
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
 
 RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
-STAGES = 4
 ABOUT = "about"
 """The file that marks a folder as the output of a demo, which the next demo may replace."""
 
@@ -58,16 +58,19 @@ def demo(
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed)
     console = notices(quiet)
-    stages = _Stages(console)
-    stages.begin(f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
+
+    def begin(stage: int, text: str) -> None:
+        print_line(console, f"{stage} of 4 {text}")
+
+    begin(1, f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, console)
     sources = [open_source(place) for place in recordings]
-    stages.begin("map each robot, recognise places, fuse the maps")
+    begin(2, "map each robot, recognise places, fuse the maps")
     with live_page(output / RUN) if live else nullcontext() as page:
         map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
-        stages.begin("evaluate: compare with the truth")
+        begin(3, "evaluate: compare with the truth")
         _evaluate(output, console)
-        stages.begin("draw")
+        begin(4, "draw")
         _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
         for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
@@ -90,8 +93,6 @@ def _prepare(output: Path) -> None:
     Raises:
         OutputError: the folder holds other files, or it cannot be written.
     """
-    from fcslam.errors import OutputError
-
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():
@@ -112,7 +113,7 @@ def _prepare(output: Path) -> None:
 
 
 def _evaluate(output: Path, console: "Console") -> None:
-    from fcslam.cli.evaluate.fleet import show_fleet
+    from fcslam.cli.evaluate.fleet_tables import show_fleet
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
@@ -122,7 +123,7 @@ def _evaluate(output: Path, console: "Console") -> None:
         display.start("evaluating")
         report = evaluate_fleet(output / RUN, output / RECORDINGS)
         write_metrics(fleet_metrics(report), output / TABLE)
-    show_fleet(report, answers(), explained=False)
+    show_fleet(report, explained=False)
     typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
 
 
@@ -138,14 +139,3 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
         solid = [piece for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
         outlines = [Outline(piece.outline, piece.kind is not PieceKind.WALL) for piece in solid]
         write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)
-
-
-class _Stages:
-    """Announces the stages of the demo."""
-
-    def __init__(self, console: "Console") -> None:
-        self._console, self._begun = console, 0
-
-    def begin(self, text: str) -> None:
-        self._begun += 1
-        print_line(self._console, f"{self._begun} of {STAGES} {text}")

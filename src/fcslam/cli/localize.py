@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live
+from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
 from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Force, Quiet, output_option
-from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
+from fcslam.cli.options import Credentials, Force, Quiet, ServerUrl, access, output_option
+from fcslam.cli.output import RUNS, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
-from fcslam.cli.ros_options import RosParameters, UseSimTime
-from fcslam.cli.server_options import Credentials, ServerUrl, access
 from fcslam.cli.warm_up import compiled
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -80,7 +79,6 @@ def localize(
     """
     from fcslam.api import localize as localize_recording
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.errors import InputError
     from fcslam.runs import prepare_output
     from fcslam.storage.files import keep_private
 
@@ -93,7 +91,6 @@ def localize(
         keep_private()
         _fetch(map_path, cloud, console)
     if live:
-        from fcslam.cli.live import drive_live, live_source
         from fcslam.live.localized_robot import LocalizedRobot
         from fcslam.live.records import Wiring
         from fcslam.robot.backend_runner import copied_worker
@@ -149,18 +146,16 @@ def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationPro
 
 
 def _report(run: "Run", robot: str, output: Path) -> None:
-    console, values = answers(), {name: metric.value for name, metric in run.metrics.items()}
+    values = {name: metric.value for name, metric in run.metrics.items()}
     share, scans = values["localized_share"], int(values["scans"])
     if not values["fixes"]:
-        print_line(
-            console,
+        typer.echo(
             f"{robot}: not localized in {scans} scans; is this the right map, and did the robot drive far enough?",
         )
     else:
         times = "" if values["losses"] == 0 else f", lost {values['losses']:.0f} x"
-        print_line(
-            console,
+        typer.echo(
             f"{robot}: localized after {values['first_fix_after']:.1f} m, at {share:.0%} of {scans} scans{times}",
         )
-    print_line(console, f"poses: {output / 'localization' / f'{robot}.csv'}")
-    print_line(console, f"map: {output / 'map.png'}")
+    typer.echo(f"poses: {output / 'localization' / f'{robot}.csv'}")
+    typer.echo(f"map: {output / 'map.png'}")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fcslam.errors import ConfigError
 from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
@@ -45,7 +46,6 @@ def chosen_settings(
         ConfigError: a file cannot be read, or a key or a value is invalid.
     """
     from fcslam.config import changed, load, parse_yaml
-    from fcslam.errors import ConfigError
 
     for one in chosen or ():
         single = _single_key(one)
@@ -90,7 +90,6 @@ def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "Missi
     """
     from fcslam.cli.recordings import pose
     from fcslam.config import changed
-    from fcslam.errors import ConfigError
 
     named = [start.partition("=")[::2] for start in starts or ()]
     if len(dict(named)) < len(named):

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.live import is_live
 from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
-from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
+from fcslam.cli.training_options import Learn, learning_plan
 from fcslam.cli.warm_up import compiled
+from fcslam.errors import InputError, PacketError, SourceError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,7 +62,6 @@ def play(
     quiet: Quiet = False,
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
-    from fcslam.errors import InputError
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
     from fcslam.robot.backend_runner import copied_worker
@@ -161,8 +160,6 @@ def _learn(
 
 def _speed(text: str) -> float | None:
     """Playback speed as a multiple of real time; None: as fast as possible."""
-    from fcslam.errors import InputError
-
     if text == "max":
         return None
     try:
@@ -176,7 +173,6 @@ def _speed(text: str) -> float | None:
 
 def _check_name(name: str) -> None:
     from fcslam.cloud.sessions import check_robot
-    from fcslam.errors import PacketError, SourceError
 
     try:
         check_robot(name)
@@ -271,20 +267,18 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
     from fcslam.runs import write_tum
 
     now = robot.status()
-    console = answers()
-    print_line(
-        console,
+    typer.echo(
         f"{now.scans} scans, {now.keyscans} keyscans; {server} has confirmed all packets "
         f"({now.sent_bytes / 1e3:.0f} kB sent)",
     )
     if now.left_out:
-        print_line(console, f"{now.left_out} places were left out: the outbox was full or the budget was spent")
+        typer.echo(f"{now.left_out} places were left out: the outbox was full or the budget was spent")
     if now.refused:
-        print_line(console, f"{now.refused} packets were refused: {state / 'refused'}")
+        typer.echo(f"{now.refused} packets were refused: {state / 'refused'}")
     if now.times_lost:
         lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
-        print_line(console, f"{lost}; {_localization(now, now.times_lost)}")
+        typer.echo(f"{lost}; {_localization(now, now.times_lost)}")
     if now.map_index is not None:
         trajectory = robot.trajectory()
         write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)
-        print_line(console, f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
+        typer.echo(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")

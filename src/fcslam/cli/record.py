@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live, named_address
+from fcslam.cli.live import is_live, named_address, stopping
 from fcslam.cli.options import Force, Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
-from fcslam.cli.ros_options import stopping
+from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,8 +66,6 @@ def record(
         _record(source, output, duration, options, force, console)
     else:
         if duration is not None:
-            from fcslam.errors import InputError
-
             raise InputError(f"--duration is the time to record a live robot; {source} is a recording")
         _convert(source, output, options, force, console)
 
@@ -75,7 +73,6 @@ def record(
 def _record(
     address: str, output: Path, duration: float | None, options: "BagOptions | None", force: bool, console: "Console"
 ) -> None:
-    from fcslam.errors import OutputError
     from fcslam.ros.addresses import open_network
     from fcslam.ros.node import await_sensors
     from fcslam.ros.parameters import NodeParameters
@@ -98,7 +95,7 @@ def _record(
                 timer.start()
             counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
         timer.cancel()
-    print_line(answers(), f"{_listed(counts)}: {output}")
+    typer.echo(f"{_listed(counts)}: {output}")
 
 
 def _listed(counts: Counter[str]) -> str:
@@ -118,7 +115,7 @@ def _convert(log: str, output: Path, options: "BagOptions | None", force: bool, 
         print_line(console, f"{output}: a CARMEN log has no place for the times of beams, they are lost")
     _write(output, survey, _with_progress(source, survey.scan_count, console))
     print_faults(console, {source.name: source.faults})
-    print_line(answers(), f"{survey.scan_count} scans: {output}")
+    typer.echo(f"{survey.scan_count} scans: {output}")
 
 
 def _scans(source: "Source") -> "Iterator[LaserScan]":
@@ -129,7 +126,6 @@ def _scans(source: "Source") -> "Iterator[LaserScan]":
 
 def _prepare(output: Path, force: bool) -> None:
     """Check before the work that ``output`` can be written, and create its parents."""
-    from fcslam.errors import OutputError
     from fcslam.sources import BAG_SUFFIXES
 
     if not (_CARMEN.search(output.name) or output.suffix in (*BAG_SUFFIXES, _RECORDING)):
@@ -149,7 +145,6 @@ def _prepare(output: Path, force: bool) -> None:
 
 def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") -> None:
     """Write into a temporary folder beside ``output`` and move the complete recording to its place."""
-    from fcslam.errors import OutputError
     from fcslam.sources import write_bag, write_carmen, write_recording
 
     try:

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.learning_options import Learn, learning_plan
+from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
 from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access, output_option
 from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
-from fcslam.cli.ros_options import RosParameters, UseSimTime
-from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
+from fcslam.cli.training_options import Learn, learning_plan
+from fcslam.errors import InputError
 
 
 def robot(
@@ -43,8 +43,6 @@ def robot(
     quiet: Quiet = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
-    from fcslam.cli.live import drive_live, is_live, live_source
-    from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.robot.backend_runner import copied_worker
@@ -53,9 +51,8 @@ def robot(
     keep_private()
     if not is_live(address):
         raise InputError(
-            f"{address}: is not the address of a live robot, such as ros2:/robot1; `fcslam play` plays a "
-            "recording to a "
-            "service"
+            f"{address}: is not the address of a live robot, such as ros2:/robot1; `fcslam play` plays a recording to "
+            "a service"
         )
     live = live_source(address, sensors, ros_parameters, use_sim_time)
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)

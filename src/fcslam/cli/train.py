@@ -8,7 +8,7 @@ import typer
 
 from fcslam.cli.mission_options import SettingsFiles, chosen_settings
 from fcslam.cli.options import output_option
-from fcslam.cli.output import TRAINING, new_folder, notices, print_line
+from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,
     TRAINING_OUTPUT,
@@ -95,12 +95,7 @@ def _start_network(
 
 def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":
     """Show each stage, and print its last figures and every alarm once."""
-    printed: set[str] = set()
-
-    def print_once(text: str) -> None:
-        if text not in printed:
-            printed.add(text)
-            print_line(console, text)
+    print_once = once_printer(console)
 
     def watch(stage: str, status: "TrainingProgress") -> None:
         figures = "  ".join(f"{name} {status.metrics[name]:.3f}" for name in FIGURES if name in status.metrics)

@@ -24,9 +24,6 @@ FIRST = "mission"
 IMPORT, EXPORT = ".import", ".export"
 """Prefixes of temporary folders of imported and exported missions."""
 
-Launch = Callable[[MissionFolder], RunningWorker]
-"""Starts the worker of a mission."""
-
 
 class UnknownMissionError(ServiceError):
     """There is no mission of a name."""
@@ -127,8 +124,7 @@ def _check_file(folder: MissionFolder) -> None:
     if folder.worker_lock.exists() and not (folder.store.exists() and folder.store.stat().st_size):
         raise StoreError(
             f"{folder.store}: the mission's file is missing or empty; put its backup in its place, or move "
-            f"{folder.path} "
-            "away to begin a new mission"
+            f"{folder.path} away to begin a new mission"
         )
 
 
@@ -141,9 +137,9 @@ class Missions:
         config: CloudConfig,
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
-        launch: Launch,
+        launch: Callable[[MissionFolder], RunningWorker],
     ) -> None:
-        """Open the mission that was open last, or create the first one.
+        """Open the mission that was open last, or create the first one; ``launch`` starts the worker of a mission.
 
         Raises:
             ServiceError: the folder cannot be used, or another service uses it.

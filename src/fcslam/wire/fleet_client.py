@@ -1,12 +1,16 @@
 """HTTP client of a robot that follows its fleet: the joint map in tiles, and where all robots are."""
 
 import json
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from pydantic import TypeAdapter
 
 from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
 from fcslam.wire.http_transport import HttpClient
+
+if TYPE_CHECKING:
+    import httpx
 
 _FRONTIERS, _QUALITY = TypeAdapter(tuple[MapFrontiers, ...]), TypeAdapter(tuple[QualityReply, ...])
 
@@ -17,32 +21,32 @@ class FleetClient(HttpClient):
     received_bytes = 0
     """Bytes of the replies' bodies so far."""
 
+    def _ask(self, *request: Any, **options: Any) -> "httpx.Response":
+        response = super()._ask(*request, **options)
+        if response.status_code == 200:
+            self.received_bytes += len(response.content)
+        return response
+
     def exchange(self, robot: str, map_index: int | None, pose: tuple[float, ...] | None) -> FleetReply:
         """Say where the robot is in its map, if it knows, and read where all robots are."""
         content = json.dumps({"map": map_index, "pose": pose} if pose and map_index is not None else {})
         response = self._ask(
             "POST", f"robots/{robot}/fleet", content.encode(), {"Content-Type": "application/json"}, "application/json"
         )
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
         with self._reading():
             return FleetReply.model_validate_json(response.content)
 
     def frontiers(self, robot: str) -> tuple[MapFrontiers, ...]:
         """The frontiers of the map that a robot is in; none if it is in no map."""
         response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}", accept="application/json")
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
         with self._reading():
             return _FRONTIERS.validate_json(response.content)
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
-        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", accept="application/json")
+        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", accept="application/json", passes=(404,))
         if response.status_code == 404:  # a cloud of an older version
             return ()
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
         with self._reading():
             return _QUALITY.validate_json(response.content)
 
@@ -52,9 +56,8 @@ class FleetClient(HttpClient):
         None: nothing changed since the ETag ``known``, or the robot is in no map yet.
         """
         headers = {"If-None-Match": known} if known else {}
-        response = self._ask("GET", f"robots/{robot}/map?limit={limit_bytes}", headers=headers, accept="*/*")
-        if response.status_code in (304, 404):
+        path, nothing = f"robots/{robot}/map?limit={limit_bytes}", (304, 404)
+        response = self._ask("GET", path, headers=headers, accept="*/*", passes=nothing)
+        if response.status_code in nothing:
             return None
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
         return response.content, response.headers.get("ETag", "")

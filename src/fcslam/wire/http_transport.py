@@ -2,7 +2,7 @@
 
 import ipaddress
 import ssl
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -176,9 +176,21 @@ class HttpClient:
         content: bytes | None = None,
         headers: Mapping[str, str] | None = None,
         accept: str = MEDIA_TYPE,
+        passes: Collection[int] = (),
     ) -> "httpx.Response":
+        """The response, if its status is 200 or one of ``passes``; raises as ``BatchTransport.state``."""
         with self._explained():
-            return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
+            asked = {"Accept": accept, **(headers or {})}
+            response = self._client.request(method, path, content=content, headers=asked)
+        code = response.status_code
+        if code == 200 or code in passes:
+            return response
+        after = response.headers.get("Retry-After", "")
+        wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
+        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
+        if code in _LATER or is_other_agent:
+            raise UnavailableError(self._reason(response), wait_s)
+        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -207,18 +219,6 @@ class HttpClient:
             return "; if that stays, the cloud may use TLS: then its address begins with https://"
         # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
         return "; if that stays, it does not trust this robot's certificate" if self._has_own else ""
-
-    def _require(self, response: "httpx.Response", status: int) -> None:
-        """Raise an error for any other status."""
-        code = response.status_code
-        if code == status:
-            return
-        after = response.headers.get("Retry-After", "")
-        wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
-        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
-        if code in _LATER or is_other_agent:
-            raise UnavailableError(self._reason(response), wait_s)
-        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
 
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase
@@ -251,7 +251,6 @@ class HttpTransport(HttpClient):
     def state(self) -> CloudState:
         """As in BatchTransport."""
         response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
-        self._require(response, 200)
         with self._reading():
             state = response.json()
             expected = {int(epoch): int(sequence) for epoch, sequence in state["next"].items()}
@@ -265,13 +264,13 @@ class HttpTransport(HttpClient):
             f"robots/{self._robot}/packets",
             content=write_batch(packets),
             headers={CORRECTION_HEADER: str(correction)},
+            passes=(400,),
         )
         if response.status_code == 400:
             index = _detail(response).get("index")
             if isinstance(index, int) and 0 <= index < len(packets):
                 return HttpResponse(refusal=Refusal(index, self._reason(response)))
             raise UnavailableError(self._reason(response))  # the batch was corrupted on its way
-        self._require(response, 200)
         try:
             return HttpResponse(
                 tuple(read_batch(response.content)),
@@ -283,9 +282,7 @@ class HttpTransport(HttpClient):
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """As in BatchTransport."""
-        response = self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*")
-        self._require(response, 200)
-        return response.content
+        return self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*").content
 
 
 class InstancesTransport:

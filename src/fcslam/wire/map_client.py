@@ -22,7 +22,6 @@ class MapClient(HttpClient):
     def maps(self) -> list[ServedMap]:
         """The maps of the cloud now."""
         response = self._ask("GET", "maps", accept="application/json")
-        self._require(response, 200)
         with self._reading():
             return [
                 ServedMap(
@@ -36,13 +35,8 @@ class MapClient(HttpClient):
 
     def image(self, number: int) -> bytes:
         """The PGM file of a map."""
-        return self._file(f"maps/{number}.pgm")
+        return self._ask("GET", f"maps/{number}.pgm", accept="*/*").content
 
     def description(self, number: int) -> bytes:
         """The YAML file of a map."""
-        return self._file(f"maps/{number}.yaml")
-
-    def _file(self, path: str) -> bytes:
-        response = self._ask("GET", path, accept="*/*")
-        self._require(response, 200)
-        return response.content
+        return self._ask("GET", f"maps/{number}.yaml", accept="*/*").content

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.cli.federate.rounds import round_line
+from fcslam.cli.federate import round_line
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.evaluation import PublicImages, VersionComparison, valid_metrics

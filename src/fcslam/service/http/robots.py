@@ -16,6 +16,7 @@ from fcslam.service.http.responses import (
     PacketRefusal,
     RobotState,
     content,
+    file_of,
     refusals,
 )
 from fcslam.service.http.state import ServiceState
@@ -119,8 +120,7 @@ def detector_router(state: ServiceState) -> APIRouter:
         "/detectors/{channel}/{version}",
         tags=["robots"],
         dependencies=state.require(*Role),
-        response_class=Response,
-        responses={**refusals(404), 200: content(NETWORK)},
+        **file_of(NETWORK),
     )
     def get_detector(channel: Channel, version: Name) -> FileResponse:
         """The network of a detector version."""

@@ -26,19 +26,14 @@ NAME_S: Final = LEASE_S + 2.0
 
 _log = logging.getLogger(__name__)
 
-Launch = Callable[[KnownMission, Lease], RunningWorker]
-"""Starts the worker of a mission."""
-
-Listen = Callable[[str, str, int], None]
-"""Receives the name of a mission, an event and its number."""
-
 
 class Hooks(NamedTuple):
     """What an instance calls."""
 
-    launch: Launch
-    listen: Listen
-    """Receives what happened to missions, whoever has their worker."""
+    launch: Callable[[KnownMission, Lease], RunningWorker]
+    """Starts the worker of a mission."""
+    listen: Callable[[str, str, int], None]
+    """Receives the name of a mission, an event and its number, whoever has the mission's worker."""
     on_taken: Callable[[], None]
     """Called when another process has taken the name, after this one was gone for a while."""
     follow: Callable[[], None] = lambda: None

@@ -11,8 +11,8 @@ from fcslam.storage.postgres import Postgres
 
 VERSION: Final = 1
 """Version of the tables."""
-PREPARING: Final = 0x0FC51A
-"""The lock of whoever makes the tables."""
+LOCK: Final = 0x0FC51A  # of fcslam's, in case other programs lock as well
+"""The lock of whoever makes the tables, and first number of the locks of those who write to a mission."""
 SHARED: Final = """
 CREATE TABLE missions (
     number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -81,7 +81,7 @@ def prepare(server: Postgres) -> None:
     Raises:
         StoreError: they are of another version, the role may not make them, or the server cannot be used.
     """
-    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({PREPARING})") as connection:
+    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({LOCK})") as connection:
         found = connection.execute("SELECT to_regclass('fcslam.version') IS NOT NULL").fetchone()
         if not (found and found[0]):
             connection.execute("CREATE SCHEMA IF NOT EXISTS fcslam")
