@@ -12,7 +12,7 @@ from math import inf
 
 from fcslam.errors import NetworkError
 from fcslam.records import Beams, GnssFix, SensorRecord
-from fcslam.ros.topics import SensorTopics, info_beside
+from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
 from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import (
@@ -50,6 +50,7 @@ from fcslam.sources.bags.rig import (
     tilt_note,
 )
 from fcslam.sources.bags.sectors import SectorJoiner, are_sectors
+from fcslam.sources.bags.topics import info_beside
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransformError, TransformTree
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
@@ -94,7 +95,7 @@ class LiveSensors:
         """Whether the robot is mapped without odometry."""
         self.restarts = 0
         """Number of times that the clock stepped back."""
-        self.newest_stamp: float | None = None
+        self._newest_stamp: float | None = None
         """Stamp of the newest scan that was read."""
         self._topics, self._options, self._notify = topics, options, notify
         self._prefix = namespace.strip("/")
@@ -122,11 +123,6 @@ class LiveSensors:
         self._merging_since: float | None = None
         self._beams: list[Beams] = []
         """Usual beams of each laser, once they are known."""
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether the mounting of every laser is known."""
-        return self._rig is not None
 
     def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
         """Read the next message; yields the records that are complete.
@@ -337,7 +333,11 @@ class LiveSensors:
             )
             if camera is None and not is_late:
                 return None
-        self._tell_rig(mountings, note)
+        if note:
+            self._notify(f"the camera of {self._topics.camera} {note}")
+        for topic, mounted in zip(self._topics.scans, mountings, strict=True):
+            if tilt := tilt_note(mounted):
+                self._notify(f"the laser of {topic} is {tilt}")
         self._beams = usual
         for scans in self._first:
             scans.clear()
@@ -382,13 +382,6 @@ class LiveSensors:
                     "topic by --sensors odom-topic"
                 )
         return enough and (self._has_odometry or self.is_without_odometry)
-
-    def _tell_rig(self, mountings: list[Mounting], camera_note: str) -> None:
-        if camera_note:
-            self._notify(f"the camera of {self._topics.camera} {camera_note}")
-        for topic, mounted in zip(self._topics.scans, mountings, strict=True):
-            if tilt_note(mounted):
-                self._notify(f"the laser of {topic} is {tilt_note(mounted)}")
 
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
         if self._options.laser_poses:
@@ -469,10 +462,10 @@ class LiveSensors:
         """Start again if the clock stepped back and stays there, as when a bag is played again."""
         if not isinstance(item, ScanMessage):
             return
-        newest = self.newest_stamp
+        newest = self._newest_stamp
         if newest is None or item.stamp >= newest - MAX_STEP_BACK_S:
             self._misplaced = 0
-            self.newest_stamp = item.stamp if newest is None else max(newest, item.stamp)
+            self._newest_stamp = item.stamp if newest is None else max(newest, item.stamp)
             return
         self._misplaced += 1
         if self._misplaced >= STEPS_BACK_FOR_RESTART:
@@ -481,7 +474,7 @@ class LiveSensors:
                 "the robot goes on from there"
             )
             self.restarts += 1
-            self._misplaced, self.newest_stamp = 0, item.stamp
+            self._misplaced, self._newest_stamp = 0, item.stamp
             self._begin()
 
     def _recorded(self, number: int, entry: Entry) -> Iterator[SensorRecord]:
