@@ -34,14 +34,15 @@ from fcslam.sources.bags.messages import (
     transforms_of,
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry, without_odometry
+from fcslam.sources.bags.pairing import Entry, EntryGate, Message, pair_with_odometry, without_odometry
+from fcslam.sources.bags.rig import usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
-from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad
+from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad, joined_turns
 from fcslam.sources.bags.topics import Candidates, Topics, calibration_beside, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
+from fcslam.sources.gate import SCANS_THAT_VOTE
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, leaning
 from fcslam.sources.pose import Pose
@@ -130,11 +131,6 @@ class BagStream:
         self.first_errors: dict[str, str] = {}
         """The fault of the first invalid message of each topic, by its name."""
 
-    @property
-    def reading_notes(self) -> tuple[str, ...]:
-        """How the bag was read, if it is not whole; complete after a pass over all messages."""
-        return self.bag.notes
-
     @cached_property
     def robot(self) -> BagRobot:
         """The robot whose topics are read.
@@ -208,11 +204,7 @@ class BagStream:
                 "driver publish whole turns, or record its laser scans"
             )
         is_in_sectors = are_sectors(scans)
-        if is_in_sectors:
-            joiner = SectorJoiner()
-            scans = [turn for sector in scans for turn in joiner.add(sector)] or list(joiner.flush())
-        usual = usual_beams([scan.beams for scan in scans])
-        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual), frame, is_in_sectors)
+        return RecordedLaser(topic, usual_scan(joined_turns(scans) if is_in_sectors else scans), frame, is_in_sectors)
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -229,18 +221,10 @@ class BagStream:
 
     def entries(self, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         """Odometry, consistent scans with odometry, and images if asked, each with its message's number."""
-        gates = [ScanGate(laser.first.beams, audit) for laser in self.lasers]
-        items = merge_scans(self._joined(self._items(audit, with_images)), len(gates))
-        for number, entry in (without_odometry if self.odometry is None else pair_with_odometry)(items):
-            if not isinstance(entry, PosedScan):
-                if isinstance(entry, OdometryReading) and entry.is_after_jump:
-                    audit.add(Fault.ODOMETRY_JUMP, number)
-                yield number, entry
-            elif gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
-                if entry.fault is not None:
-                    audit.add(entry.fault, number)
-                if entry.fault is not Fault.NO_ODOMETRY:
-                    yield number, entry
+        gate = EntryGate((laser.first.beams for laser in self.lasers), audit)
+        items = merge_scans(self._joined(self._items(audit, with_images)), len(self.lasers))
+        entries = (without_odometry if self.odometry is None else pair_with_odometry)(items)
+        yield from ((number, entry) for number, entry in entries if gate.admits(number, entry))
 
     def _joined(self, items: Iterator[tuple[int, Message]]) -> Iterator[tuple[int, Message]]:
         """The items with the sectors of a turn joined to one scan."""
