@@ -183,8 +183,11 @@ class RosBag:
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
         body_notes = self._leave_out_body(bodies, mountings)
         camera, camera_notes = self._camera(tree, base_frame)
+        of_several = which if len(which) > 1 else [""]
         tilts = (
-            self._tilt_note(laser.name, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
+            f"{self.stream.path}: the laser{its} is {tilt}"
+            for its, mounted in zip(of_several, mountings, strict=True)
+            if (tilt := tilt_note(mounted))
         )
         unlimited = (
             f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
@@ -206,7 +209,7 @@ class RosBag:
             *self.stream.robot.notes,
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
-            *filter(None, tilts),
+            *tilts,
             *camera_notes,
         )
         rig = rig_of([laser.first for laser in self.stream.lasers], farthest_m, mountings, camera)
@@ -324,11 +327,6 @@ class RosBag:
             return None, ()
         camera, note = mounted_camera(self.stream.calibration, tree, base_frame)
         return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
-
-    def _tilt_note(self, name: str, mounted: Mounting) -> str:
-        tilt = tilt_note(mounted)
-        which = f" of {name}" * (len(self.stream.lasers) > 1)
-        return f"{self.stream.path}: the laser{which} is {tilt}" * bool(tilt)
 
 
 def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]:
