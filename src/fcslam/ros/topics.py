@@ -20,7 +20,8 @@ from fcslam.sources.bags.codec import (
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.robots import is_truth
-from fcslam.sources.bags.topics import is_depth
+from fcslam.sources.bags.topics import info_beside, is_depth
+from fcslam.sources.bags.transforms import last_part
 
 TF, TF_STATIC = "tf", "tf_static"
 
@@ -79,18 +80,19 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
                 f"the driver; {chosen.known()}"
             )
         rank = [*SCANS, IMAGE].index
-        scans = [min(candidates, key=lambda topic: (rank(known[topic]), _basename(topic) != "scan", topic))]
+        scans = [min(candidates, key=lambda topic: (rank(known[topic]), last_part(topic) != "scan", topic))]
         notes += _note("laser scans", "--sensors scan-topic", scans[0], candidates)
     odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
     if options.odom_topic == NO_ODOMETRY:
         notes.append("reads no odometry, as --sensors odom-topic=none says")
     elif odometry is None:
         candidates = [topic for topic in inside if known[topic] == ODOMETRY and not is_truth(topic)]
-        odometry = min(candidates, key=lambda topic: (_basename(topic) != "odom", topic), default=None)
+        odometry = min(candidates, key=lambda topic: (last_part(topic) != "odom", topic), default=None)
         notes += _note("odometry", "--sensors odom-topic", odometry, candidates)
     else:
         chosen.named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
-    transforms = _transforms(known, namespace)
+    own_or_common = {f"{namespace}/{name}": f"/{name}" for name in (TF, TF_STATIC)}  # they may appear later
+    transforms = tuple(own if own in known else common for own, common in own_or_common.items())
     if odometry is not None and known[odometry] != ODOMETRY:
         transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
     camera, info = _camera(chosen, known, inside, options.camera_topic)
@@ -121,15 +123,6 @@ class _Choice:
         return named_topics(self.endpoints)
 
 
-def _transforms(known: Mapping[str, str], namespace: str) -> tuple[str, ...]:
-    """Topics of tf; they may appear later."""
-    found = []
-    for name in (TF, TF_STATIC):
-        own = f"{namespace}/{name}"
-        found.append(own if own in known else f"/{name}")
-    return tuple(found)
-
-
 def _camera(
     chosen: _Choice, known: Mapping[str, str], inside: Sequence[str], wanted: str | None
 ) -> tuple[str | None, str | None]:
@@ -145,15 +138,6 @@ def _camera(
     return camera, None if camera is None else calibrated[camera]
 
 
-def info_beside(camera: str) -> str:
-    """The topic of the calibration of a camera."""
-    return camera.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-
-
 def _note(what: str, option: str, chosen: str | None, candidates: Sequence[str]) -> list[str]:
     others = ", ".join(topic for topic in candidates if topic != chosen)
     return [f"reads {what} from {chosen}, not from {others} ({option} chooses)"] if others else []
-
-
-def _basename(topic: str) -> str:
-    return topic.rsplit("/", 1)[-1]

@@ -43,7 +43,7 @@ class Format:
 
 def _text_format(dialect: Dialect) -> Format:
     return Format(
-        dialect.name, lambda _, head: dialect.recognises(head), lambda path, name, _: TextLog(path, name, dialect)
+        dialect.name, lambda _, head: bool(dialect.recognises(head)), lambda path, name, _: TextLog(path, name, dialect)
     )
 
 

@@ -83,7 +83,7 @@ def choose_topics(
         bare = [topic.name for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
         remedy = "record them"
         if bare:
-            remedy = f"the depth images of {bare[0]} need their {_info_name(bare[0])}"
+            remedy = f"the depth images of {bare[0]} need their {info_beside(bare[0])}"
         if packed:
             remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
         raise SourceError(
@@ -254,13 +254,13 @@ def _calibration_of(camera: Topic, robot: BagRobot) -> Topic | None:
 
 def calibration_beside(camera: Topic, robot: BagRobot) -> Topic | None:
     """The calibration topic beside the images."""
-    name = slashed(_info_name(camera.name))
+    name = slashed(info_beside(camera.name))
     infos = (topic for topic in _heard(robot) if topic.type == CAMERA_INFO)
     return next((info for info in infos if slashed(info.name) == name), None)
 
 
-def _info_name(images: str) -> str:
-    """The name of the calibration topic beside the images of a topic."""
+def info_beside(images: str) -> str:
+    """The topic of the calibration of the camera with these images."""
     return images.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
 
 

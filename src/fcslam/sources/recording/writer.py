@@ -81,16 +81,6 @@ class RecordingWriter:
             raise
         return writer
 
-    @property
-    def lasers(self) -> tuple[LaserModel, ...]:
-        """The lasers of all scans."""
-        return self._meta.lasers
-
-    @property
-    def camera(self) -> CameraModel | None:
-        """The camera of all images."""
-        return self._meta.camera
-
     def write(self, item: RecordedItem) -> None:
         """Append one record.
 
