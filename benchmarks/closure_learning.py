@@ -61,6 +61,7 @@ from fcslam.lab.evaluation.places.simulated_views import lidar_overlap
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
+from fcslam.learning.code_batches import MOST_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient
@@ -76,7 +77,6 @@ from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
-from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.revisits import Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions

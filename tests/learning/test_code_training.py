@@ -9,12 +9,12 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
 from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork, sample_codes  # noqa: E402
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
 
 CPU = torch.device("cpu")

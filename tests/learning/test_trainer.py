@@ -11,8 +11,8 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
+from fcslam.learning.artifacts import read_curves  # noqa: E402
 from fcslam.learning.checkpoint import Checkpoint, write_checkpoint  # noqa: E402
-from fcslam.learning.curve import read_curves  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse_keypoints  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402

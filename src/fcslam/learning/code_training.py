@@ -15,6 +15,7 @@ from torch import Tensor
 
 from fcslam.errors import TrainingError
 from fcslam.features.detector import GreyImage
+from fcslam.learning.code_batches import RevisitExamples, draw_rehearsal, draw_revisits, draw_views
 from fcslam.learning.local_training import (
     LocalTrainingPlan,
     LocalTrainingResult,
@@ -24,8 +25,6 @@ from fcslam.learning.local_training import (
 )
 from fcslam.learning.network import Description, KeypointNetwork
 from fcslam.learning.objective import rehearsal_loss, revisit_objective
-from fcslam.learning.rehearsal import draw_rehearsal, draw_views
-from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import reduced_precision
 

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from fcslam.learning.federated.gate import decide
+from fcslam.learning.federated.evaluation import decide
 from fcslam.learning.federated.held_out import COLUMNS, MOST_PAIRS, check_judgement
 from fcslam.learning.federated.live_settings import GateSettings
 

@@ -102,7 +102,7 @@ def _closures(report: "FleetReport", within: "ClosureScope") -> "Table":
     """Table of the channels that closed something, and of both together if both did."""
     from rich.table import Table
 
-    from fcslam.lab.evaluation.fleet.closure_stages import BOTH
+    from fcslam.lab.evaluation.fleet.closures import BOTH
 
     table = Table(_KINDS[within], "channel", "all", "wrong", "precision", "recall", "like heading", "at 100 %")
     scores = {(status, channel): score for (kind, status, channel), score in report.closures.items() if kind is within}
@@ -147,8 +147,7 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
 
 
 def _explanations(report: "FleetReport") -> "Iterator[str]":
-    from fcslam.lab.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
-    from fcslam.lab.evaluation.fleet.closures import ClosureScope
+    from fcslam.lab.evaluation.fleet.closures import LIKE_HEADING_DEG, ClosureScope
     from fcslam.metrics.closures import REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
     from fcslam.metrics.grid import TOLERANCE_M
     from fcslam.metrics.revisits import EVERY_M, RADIUS_M
@@ -174,7 +173,7 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
 
 
 def _revisits(report: "FleetReport", within: "ClosureScope") -> str:
-    from fcslam.lab.evaluation.fleet.closure_stages import BOTH
+    from fcslam.lab.evaluation.fleet.closures import BOTH
     from fcslam.records import ClosureStatus
 
     score = report.closures[within, ClosureStatus.ACCEPTED, BOTH]

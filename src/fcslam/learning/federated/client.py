@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fcslam.learning.code_batches import RevisitExamples
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.federated.client_state import legacy_weights, load_robot_state, save_robot_state
 from fcslam.learning.federated.evaluation import SCORE_METRICS
@@ -20,7 +21,6 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, shared_weights, with_private
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
-from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
 from fcslam.learning.trainer import TrainingProgress, validation_pairs

@@ -15,7 +15,6 @@ import numpy as np
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, CoordinatorState, read_state, run_id, write_state
-from fcslam.learning.federated.codec import GlobalModel, record_to_weights
 from fcslam.learning.federated.evaluation import (
     EvaluateFn,
     Evaluator,
@@ -23,10 +22,10 @@ from fcslam.learning.federated.evaluation import (
     PublicImages,
     VersionComparison,
     combined_score,
+    decide,
     valid_metrics,
 )
 from fcslam.learning.federated.flower import Message, MessageType, NodeSelection, RecordDict, RobotGrid
-from fcslam.learning.federated.gate import decide
 from fcslam.learning.federated.held_out import Judgement, check_judgement
 from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
 from fcslam.learning.federated.live_settings import GateSettings
@@ -34,6 +33,8 @@ from fcslam.learning.federated.messages import (
     ARRAYS_KEY,
     CONFIG_KEY,
     PAIRS_KEY,
+    GlobalModel,
+    record_to_weights,
     reply_metrics,
     reply_sender,
     request_config,

@@ -8,9 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import printable
-from fcslam.learning.federated.codec import GlobalModel, record_bytes, record_to_weights
 from fcslam.learning.federated.flower import Message
-from fcslam.learning.federated.messages import ARRAYS_KEY, reply_metrics, reply_sender
+from fcslam.learning.federated.messages import (
+    ARRAYS_KEY,
+    GlobalModel,
+    record_bytes,
+    record_to_weights,
+    reply_metrics,
+    reply_sender,
+)
 
 MAX_REASON_LENGTH: Final = 300
 """Longer texts from a robot are cut, so that one robot cannot flood the table of rounds."""

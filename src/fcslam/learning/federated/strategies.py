@@ -7,9 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.codec import record_to_weights, weights_to_record
 from fcslam.learning.federated.flower import FedAvg, FedMedian, Message, MetricRecord, RecordDict
-from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, EXAMPLES_KEY, METRICS_KEY
+from fcslam.learning.federated.messages import (
+    ARRAYS_KEY,
+    CONFIG_KEY,
+    EXAMPLES_KEY,
+    METRICS_KEY,
+    record_to_weights,
+    weights_to_record,
+)
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, trained_names, weights_error
 

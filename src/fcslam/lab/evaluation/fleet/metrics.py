@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 
-from fcslam.lab.evaluation.fleet.closure_stages import FleetClosureScore
+from fcslam.lab.evaluation.fleet.closures import FleetClosureScore
 from fcslam.lab.evaluation.fleet.relations import relation_metrics
 from fcslam.lab.evaluation.fleet.report import FleetReport, RobotScore
 from fcslam.metrics.closures import Recall

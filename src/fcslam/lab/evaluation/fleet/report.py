@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.lab.evaluation.fleet.closure_stages import FleetClosures, score_closures
+from fcslam.lab.evaluation.fleet.closures import FleetClosures, score_closures
 from fcslam.lab.evaluation.fleet.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
 from fcslam.lab.evaluation.fleet.match_views import MatchViews, judge_views
 from fcslam.metrics.closures import WRONG_DEG, WRONG_M, Mask
