@@ -82,7 +82,7 @@ from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
 from fcslam.metrics.bootstrap import Interval, mean_interval
-from fcslam.metrics.framing import HomographyGroundTruth
+from fcslam.metrics.homography import HomographyGroundTruth
 from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig

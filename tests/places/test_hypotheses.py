@@ -4,7 +4,7 @@ import pytest
 from fcslam.features.birdseye import BIRDSEYE, describe
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.geometry import se2
-from fcslam.places.hypotheses import rigid_hypotheses
+from fcslam.places.motions import rigid_hypotheses
 from tests.rooms import asymmetric_room
 
 

@@ -130,8 +130,7 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.fleet.charts import fleet_charts
     from fcslam.lab.simulation.floorplan import PieceKind
-    from fcslam.maps.charts import Outline
-    from fcslam.maps.fleet_figure import write_figure
+    from fcslam.maps.fleet_figure import Outline, write_figure
 
     with ProgressDisplay(console) as display:
         display.start("drawing")

@@ -36,8 +36,8 @@ def extract(
     from fcslam.errors import FeatureError
     from fcslam.features.classical import OrbConfig
     from fcslam.features.detector import OnnxConfig
-    from fcslam.features.extraction import extract_all, find_files
     from fcslam.features.factory import make_detector
+    from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX

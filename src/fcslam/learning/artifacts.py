@@ -19,7 +19,6 @@ SHOWN_METRICS = {
     "bit_bias": "distance of a bit's mean from a half",
     "code_spread_bits": "bits between codes of different points",
 }
-
 LOSSES: Final = ("detector", "contrastive", "triplet", "distillation")
 SHARES: Final = ("repeatability", "mma_3px", "shift_repeatability")
 BITS: Final = ("code_spread_bits",)

@@ -17,7 +17,7 @@ from fcslam.features.detector import GreyImage
 from fcslam.learning.batches import TensorRecord
 from fcslam.learning.labels import Points
 from fcslam.learning.warps import random_change, relight, warp_image
-from fcslam.metrics.framing import Size
+from fcslam.metrics.homography import Size
 from fcslam.records import FloatArray
 
 REVISIT_IMAGES: Final = 4

@@ -17,8 +17,7 @@ from fcslam.learning.warps import (
     warp_image,
     well_inside,
 )
-from fcslam.metrics.framing import Size
-from fcslam.metrics.homography import Mask, inverse, warp
+from fcslam.metrics.homography import Mask, Size, inverse, warp
 from fcslam.records import FloatArray
 
 BORDER_PX: Final = 4

@@ -18,9 +18,8 @@ from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig
-from fcslam.places.index import PlaceIndex
+from fcslam.places.index import PlaceIndex, QueryResult
 from fcslam.places.motions import Motion, propose_motions
-from fcslam.places.query_result import QueryResult
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, ReasonCode, Tag, frozen

@@ -6,9 +6,8 @@ import numpy as np
 
 from fcslam.features.birdseye import BIRDSEYE, BirdseyeFeatures, describe
 from fcslam.features.codes import mutual_matches
-from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.index import PlaceIndex
-from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS
+from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS, rigid_hypotheses
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
 

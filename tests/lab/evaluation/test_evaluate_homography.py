@@ -15,8 +15,7 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
 from fcslam.lab.evaluation.detectors.measures import column, difference, mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.metrics.framing import HomographyGroundTruth, framed_homography
-from fcslam.metrics.homography import warp
+from fcslam.metrics.homography import HomographyGroundTruth, framed_homography, warp
 from tests.features.networks import tiny_network
 
 pytestmark = pytest.mark.slow

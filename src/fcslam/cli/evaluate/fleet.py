@@ -148,9 +148,8 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
 
 def _explanations(report: "FleetReport") -> "Iterator[str]":
     from fcslam.lab.evaluation.fleet.closures import LIKE_HEADING_DEG, ClosureScope
-    from fcslam.metrics.closures import REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
+    from fcslam.metrics.closures import EVERY_M, RADIUS_M, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
     from fcslam.metrics.grid import TOLERANCE_M
-    from fcslam.metrics.revisits import EVERY_M, RADIUS_M
 
     scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
     yield f"Truth: {report.truth}, at {covered} of {scans} scans."

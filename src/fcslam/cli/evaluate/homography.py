@@ -43,7 +43,7 @@ def homography(
     from fcslam.lab.evaluation.detectors.homography import evaluate_homography
     from fcslam.lab.evaluation.detectors.measures import write_pairs
     from fcslam.lab.evaluation.detectors.scenes import find_scenes
-    from fcslam.metrics.framing import HomographyGroundTruth
+    from fcslam.metrics.homography import HomographyGroundTruth
 
     found = find_scenes(scenes)
     kinds = [EvaluatedDetectorKind(one) for one in detector or () if one in list(EvaluatedDetectorKind)]

@@ -24,8 +24,7 @@ from fcslam.features.detector import (
 )
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_features, read_grey
-from fcslam.metrics.framing import Framing, Size
-from fcslam.metrics.homography import inside
+from fcslam.metrics.homography import Framing, Size, inside
 
 _CANDIDATES = 1500
 """Most features of ORB and SIFT, as in SuperPoint's evaluation."""

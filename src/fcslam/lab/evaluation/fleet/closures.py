@@ -14,11 +14,12 @@ from fcslam.metrics.closures import (
     Mask,
     Precision,
     Recall,
+    Revisits,
     Rows,
+    find_revisits,
     precision,
 )
 from fcslam.metrics.relations import PoseTable, motion_errors
-from fcslam.metrics.revisits import Revisits, find_revisits
 from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus, FloatArray
 from fcslam.runs import Run
 
