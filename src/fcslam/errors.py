@@ -22,6 +22,9 @@ FcslamError
 """
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 _SYSTEM_ERROR = re.compile(r"\[Errno -?\d+\] ([^:()]+)(?:: '([^']*)')?")
@@ -41,6 +44,19 @@ class FcslamError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         """With all attributes, whatever the arguments of the class are: errors cross processes."""
         return _restored, (type(self), str(self)), vars(self)
+
+
+@contextmanager
+def writing(path: Path, advice: str = "free disk space and run the same command again") -> Iterator[None]:
+    """Report an error of the operating system in this block as one of writing ``path``; ``advice``: what to do then.
+
+    Raises:
+        OutputError: the block cannot write.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); {advice}") from error
 
 
 def printable(text: str) -> str:

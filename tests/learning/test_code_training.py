@@ -57,7 +57,7 @@ def test_only_the_layers_of_the_codes_change(encoder, start):
     network = train_codes(start, OWN, CodeInputs(), settings, LocalTrainingPlan(0, 3), CPU).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
     assert changed
-    assert changed <= layer_names(network, network.code_layers)
+    assert changed <= layer_names(network, network.body.code_layers)
     assert not any("running" in name for name in changed)
     before = network_from_state(encoder, start)
     image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(1))
@@ -71,7 +71,7 @@ def test_whole_images_give_what_their_inputs_give(encoder, start):
     network = network_from_state(encoder, start)
     image = torch.rand(2, 1, 64, 48, generator=torch.Generator().manual_seed(1))
     with torch.inference_mode():
-        described = network.describe(network.code_inputs(image))
+        described = network.body.describe(network.body.code_inputs(image))
         assert torch.equal(described.code_logits, network(image).code_logits)
 
 

@@ -80,9 +80,8 @@ def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, 
             value.grad = torch.full_like(value, torch.inf)
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
-        return {}
 
-    monkeypatch.setattr("fcslam.learning.local_training.training_step", overflow)
+    monkeypatch.setattr("fcslam.learning.local_training.descend", overflow)
     with pytest.raises(TrainingError, match="diverged in the last step"):
         local_training(start, examples, SMALL, LocalTrainingPlan(0, 1), CPU)
 

@@ -204,7 +204,7 @@ def test_the_same_charts_make_the_same_file(charts, tmp_path):
     for name in ("one.png", "two.png"):
         write_figure(charts, tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    with pytest.raises(OutputError, match="cannot write the figure"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_figure(charts, tmp_path / "missing" / "figure.png")
 
 

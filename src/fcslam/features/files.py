@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import FeatureError, OutputError
+from fcslam.errors import FeatureError, writing
 from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures, decode_grey, in_original, shrink
 from fcslam.records import CODE_BYTES, frozen
 from fcslam.sources.images import MAX_SIDE_PX, image_size
 from fcslam.storage.files import replacing
-from fcslam.untrusted import read_arrays, read_bytes
+from fcslam.untrusted import Arrays, read_arrays, read_bytes
 
 _ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
 
@@ -42,22 +42,21 @@ def read_grey(path: Path) -> GreyImage:
 
 
 def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, int]) -> None:
-    """Write the features of an image of ``image_size`` (width, height), pixels.
+    """Write the features of an image of ``image_size`` (width, height), pixels; makes the folder of the file.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    try:
+    arrays: Arrays = {
+        "keypoints": features.keypoints_px,
+        "scores": features.scores,
+        "descriptors": features.descriptors,
+        "image_size": np.array(image_size, np.int32),
+    }
+    with writing(path, "make room or choose another folder"):
+        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as unfinished, unfinished.open("wb") as file:
-            np.savez(
-                file,
-                keypoints=features.keypoints_px,
-                scores=features.scores,
-                descriptors=features.descriptors,
-                image_size=np.array(image_size, np.int32),
-            )
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another folder") from error
+            np.savez(file, allow_pickle=False, **arrays)
 
 
 def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
@@ -138,10 +137,6 @@ def extract_all(
             yield Extraction(path, 0, str(error))
             continue
         features = extract(image, detector, longest_side_px)
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{target.parent}: cannot be made ({error}); choose another folder") from error
         write_features(target, features, (image.shape[1], image.shape[0]))
         written[target] = path
         yield Extraction(path, len(features.scores))

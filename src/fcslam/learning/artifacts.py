@@ -1,11 +1,12 @@
 """The files of a finished training run: the detector as an ONNX file, its model card, its training curve."""
 
 import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from fcslam.config import dump
-from fcslam.errors import OutputError, TrainingError
+from fcslam.config import Settings, dump
+from fcslam.errors import TrainingError, writing
 from fcslam.learning.export import detector_version, export_onnx
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import TrainingSettings
@@ -38,32 +39,32 @@ def write_training_artifacts(
     detector, picture, card = (folder / name for name in ("detector.onnx", "training.png", "card.md"))
     export_onnx(network, detector)
     curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
-    try:
+    latest = {text: curves[name][1][-1] for name, text in SHOWN_METRICS.items() if name in curves}
+    held_out = f"{len(images.held_out)} others were held out" if images.are_held_out else "none was held out"
+    facts = [
+        f"Trained on {len(images.train)} images; {held_out}, {images.skipped} left out.",
+        f"Teacher: {'none' if teacher is None else f'keypoints and descriptors in {teacher.name}'}.",
+    ]
+    judged = "held-out images" if images.are_held_out else "an image that was trained on"
+    judged_on = f"on pairs of views of {judged}, 320 x 240, warped and lit at random"
+    with writing(folder):
         draw_curves(curves, picture)
-        latest = {name: curves[name][1][-1] for name in SHOWN_METRICS if name in curves}
-        card.write_text(_card(detector_version(network), settings, images, teacher, latest), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be written ({error}); free disk space and run the command again"
-        ) from error
+        card.write_text(model_card(detector_version(network), facts, judged_on, latest, settings), encoding="utf-8")
     return [detector, picture, card]
 
 
-def _card(
-    version: str, settings: TrainingSettings, images: TrainingImages, teacher: Path | None, figures: dict[str, float]
+def model_card(
+    version: str, facts: Sequence[str], judged_on: str, figures: Mapping[str, float], settings: Settings
 ) -> str:
-    taught = "none" if teacher is None else f"keypoints and descriptors in {teacher.name}"
-    held_out = f"{len(images.held_out)} others were held out" if images.are_held_out else "none was held out"
-    judged = "held-out images" if images.are_held_out else "an image that was trained on"
+    """A model card in Markdown: facts about the training, figures by what they measure, and the settings."""
     lines = [
         f"# Detector {version}",
         "",
-        f"Trained on {len(images.train)} images; {held_out}, {images.skipped} left out.",
-        f"Teacher: {taught}.",
+        *facts,
         "",
-        f"| on pairs of views of {judged}, 320 x 240, warped and lit at random | |",
+        f"| {judged_on} | |",
         "|---|---|",
-        *(f"| {SHOWN_METRICS[name]} | {value:.3f} |" for name, value in figures.items()),
+        *(f"| {measure} | {value:.3f} |" for measure, value in figures.items()),
         "",
         "Settings:",
         "",

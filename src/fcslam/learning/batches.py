@@ -1,7 +1,7 @@
 """Batches of view pairs, prepared ahead in threads. A batch depends on the seed and its step alone."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Self
@@ -84,7 +84,7 @@ def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
 
 def batch_stream(
     examples: Sequence[TrainingExample], settings: TrainingSettings, first: int, ahead: int, threads: int
-) -> Iterator[tuple[int, TrainingBatch]]:
+) -> Generator[tuple[int, TrainingBatch], None, None]:
     """Step numbers and batches from step ``first``, in order; ``threads`` threads prepare up to ``ahead`` of them."""
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[Future[TrainingBatch]] = deque()

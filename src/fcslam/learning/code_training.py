@@ -46,7 +46,7 @@ class CodeInputs:
 
         ``seed`` is that of the views; None for none.
         """
-        heads = layer_names(network, (*network.code_layers, *network.point_layers))
+        heads = layer_names(network, (*network.body.code_layers, *network.body.point_layers))
         frozen = {name: value for name, value in network.state_dict().items() if name not in heads}
         is_same = self._frozen.keys() == frozen.keys() and all(
             torch.equal(value, self._frozen[name]) for name, value in frozen.items()
@@ -58,7 +58,7 @@ class CodeInputs:
             for k in range(0, len(shown), _IMAGES_AT_ONCE):
                 grey = np.stack(shown[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
                 with torch.no_grad():
-                    parts.append(network.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
+                    parts.append(network.body.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
             self._inputs = torch.cat(parts)
         return self._inputs
 
@@ -110,13 +110,13 @@ def train_codes(
             total = total + plan.compatible * losses["compatible"]
         return total, losses
 
-    return train_layers(network, network.code_layers, losses_of, settings, plan, on_step, optimizer_state)
+    return train_layers(network, network.body.code_layers, losses_of, settings, plan, on_step, optimizer_state)
 
 
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:
     """Descriptions by both networks of inputs of the trained layers, shape (B, C, H/8, W/8)."""
     given = inputs.float().contiguous(memory_format=torch.channels_last)
     with reduced_precision(given.device):
-        described = network.describe(given)
+        described = network.body.describe(given)
         with torch.no_grad():
-            return described, before.describe(given)
+            return described, before.body.describe(given)

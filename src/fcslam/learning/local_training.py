@@ -1,6 +1,7 @@
 """Local training: a client's part of a federated round. It trains some steps from given weights."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -19,7 +20,7 @@ from fcslam.learning.training_step import (
     get_optimizer_state,
     learning_rate,
     restore_optimizer_state,
-    training_step,
+    step_losses,
 )
 
 RAMP_STEPS: Final = 10
@@ -81,17 +82,15 @@ def local_training(
     legacy_detector = None
     if legacy is not None and plan.compatible > 0.0:
         legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, legacy).to(device))
-    optimizer = continued_optimizer(network, optimizer_state)
-    sums: dict[str, float] = {}
     until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
-    for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
-        done = step - plan.first_step + 1
-        rate = local_rate(settings, step, done, optimizer_state is None)
-        losses = training_step(network, optimizer, batch.to(device), settings, step, rate, legacy=legacy_detector)
-        for name, loss in losses.items():
-            sums[name] = sums.get(name, 0.0) + float(loss)
-        on_step(done)
-    return local_result(network, optimizer, sums, plan)
+    batches = batch_stream(examples, until, plan.first_step, ahead=2, threads=1)
+
+    def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        _, batch = next(batches)
+        return step_losses(network, batch.to(device), settings, step, legacy=legacy_detector)
+
+    with closing(batches):
+        return _descended(network, losses_of, settings, plan, on_step, optimizer_state)
 
 
 def train_layers(
@@ -117,51 +116,37 @@ def train_layers(
     Raises:
         TrainingError: ``optimizer_state`` belongs to another network, or training diverged.
     """
-    freeze_all_but(network, layer_names(network, layers))
-    optimizer = continued_optimizer(network, optimizer_state)
-    sums: dict[str, float] = {}
-    for done in range(1, plan.steps + 1):
-        step = plan.first_step + done - 1
-        for group in optimizer.param_groups:
-            group["lr"] = local_rate(settings, step, done, optimizer_state is None)
-        total, losses = losses_of(step)
-        descend(network, optimizer, total, step)
-        for name, loss in losses.items():
-            sums[name] = sums.get(name, 0.0) + float(loss.detach())
-        on_step(done)
-    return local_result(network, optimizer, sums, plan)
+    trained = layer_names(network, layers)
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(name in trained)
+    freeze_statistics(network)
+    return _descended(network, losses_of, settings, plan, on_step, optimizer_state)
 
 
-def continued_optimizer(
-    network: KeypointNetwork, optimizer_state: Mapping[str, Tensor] | None
-) -> torch.optim.Optimizer:
-    """A new optimizer, or one that continues from the result of an earlier local training.
-
-    Raises:
-        TrainingError: the state belongs to another network.
-    """
+def _descended(
+    network: KeypointNetwork,
+    losses_of: Callable[[int], tuple[Tensor, dict[str, Tensor]]],
+    settings: TrainingSettings,
+    plan: LocalTrainingPlan,
+    on_step: Callable[[int], None],
+    optimizer_state: Mapping[str, Tensor] | None,
+) -> LocalTrainingResult:
+    """The network after the steps of the plan, in evaluation mode."""
     optimizer = create_optimizer(network)
     if optimizer_state is not None:
         try:
             restore_optimizer_state(optimizer, optimizer_state)
         except (KeyError, ValueError) as error:
             raise TrainingError(f"the optimizer cannot continue ({error})") from error
-    return optimizer
-
-
-def local_rate(settings: TrainingSettings, step: int, done: int, is_new: bool) -> float:
-    """Learning rate of a step of the whole run, the ``done``-th here, of an optimizer that may be new."""
-    return learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if is_new else 1.0)
-
-
-def local_result(
-    network: KeypointNetwork, optimizer: torch.optim.Optimizer, sums: Mapping[str, float], plan: LocalTrainingPlan
-) -> LocalTrainingResult:
-    """The result after the last step, from sums of the losses over the steps.
-
-    Raises:
-        TrainingError: training diverged.
-    """
+    sums: dict[str, float] = {}
+    for done in range(1, plan.steps + 1):
+        step = plan.first_step + done - 1
+        ramp = min(done / RAMP_STEPS, 1.0) if optimizer_state is None else 1.0
+        total, losses = losses_of(step)
+        descend(network, optimizer, total, step, ramp * learning_rate(settings, step))
+        for name, loss in losses.items():
+            sums[name] = sums.get(name, 0.0) + float(loss.detach())
+        on_step(done)
     network.eval()
     state = get_optimizer_state(optimizer)
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
@@ -174,13 +159,6 @@ def layer_names(network: KeypointNetwork, layers: Sequence[nn.Module]) -> set[st
     """Names of the parameters and statistics of some layers of a network."""
     values = {id(value) for layer in layers for value in layer.state_dict(keep_vars=True).values()}
     return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
-
-
-def freeze_all_but(network: KeypointNetwork, names: Collection[str]) -> None:
-    """Let only the parameters of these names be trained, without batch statistics."""
-    for name, parameter in network.named_parameters():
-        parameter.requires_grad_(name in names)
-    freeze_statistics(network)
 
 
 def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:

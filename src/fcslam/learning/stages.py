@@ -15,7 +15,7 @@ from typing import Final, overload
 import numpy as np
 import torch
 
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import OutputError, TrainingError, writing
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.export import detector_version
@@ -240,12 +240,8 @@ def _labels(
     else:
         others = corners
     labels = fuse_keypoints(corners, others)
-    try:
+    with writing(place):
         write_labels(place, labels, key)
-    except OSError as error:
-        raise OutputError(
-            f"{place}: cannot be written ({error}); free disk space and run the same command again"
-        ) from error
     return labels
 
 

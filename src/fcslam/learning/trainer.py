@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.errors import OutputError, TrainingError
-from fcslam.learning.batches import TrainingBatch, batch_stream
+from fcslam.errors import TrainingError, writing
+from fcslam.learning.batches import batch_stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits
@@ -23,10 +23,11 @@ from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import (
     create_optimizer,
+    descend,
     get_optimizer_state,
     learning_rate,
     restore_optimizer_state,
-    training_step,
+    step_losses,
 )
 from fcslam.learning.validation import collapse_warnings, validate
 
@@ -131,11 +132,14 @@ class TrainingRun:
         for step, batch in batch_stream(
             examples, self.settings, self.step, 4 * self.options.threads, self.options.threads
         ):
-            parts = self._step(step, batch.to(self.device), bits)
+            self.network.train()
+            total, parts = step_losses(self.network, batch.to(self.device), self.settings, step, bits)
+            descend(self.network, self.optimizer, total, step, learning_rate(self.settings, step))
+            self._average(step)
             self.step = step + 1
             last = self.step == self.settings.steps
             if self.step % self.options.log_every == 0 or last:
-                losses = {name: float(part) for name, part in parts.items()}
+                losses = {name: float(part.detach()) for name, part in parts.items()}
                 metrics |= losses
                 self._log(losses)
             if self.step % self.options.validate_every == 0 or last:
@@ -148,13 +152,6 @@ class TrainingRun:
             on_progress(TrainingProgress(self.step, self.settings.steps, dict(metrics), warnings))
         trained: KeypointNetwork = self.average
         return trained
-
-    def _step(self, step: int, batch: TrainingBatch, bits: TeacherBits | None) -> dict[str, Tensor]:
-        self.network.train()
-        rate = learning_rate(self.settings, step)
-        parts = training_step(self.network, self.optimizer, batch, self.settings, step, rate, bits)
-        self._average(step)
-        return parts
 
     @torch.no_grad()
     def _average(self, step: int) -> None:
@@ -203,16 +200,11 @@ class TrainingRun:
 
     def _log(self, metrics: Mapping[str, float]) -> None:
         path = self.folder / PROGRESS_FILE
-        try:
-            with path.open("a", newline="", encoding="utf-8") as file:
-                rows = csv.writer(file)
-                if not file.tell():
-                    rows.writerow(("stage", "step", "name", "value"))
-                rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
-        except OSError as error:
-            raise OutputError(
-                f"{path}: cannot be written ({error}); free disk space and run the command again"
-            ) from error
+        with writing(path), path.open("a", newline="", encoding="utf-8") as file:
+            rows = csv.writer(file)
+            if not file.tell():
+                rows.writerow(("stage", "step", "name", "value"))
+            rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
 
 
 def trained_network(path: Path) -> KeypointNetwork:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening
 
-from fcslam.errors import OutputError
+from fcslam.errors import writing
 from fcslam.geometry import se2
 from fcslam.maps.drawing import round_length
 from fcslam.maps.palette import CLOSURES, FLOOR, FURNITURE, INK, PAPER, WALL, robot_colors
@@ -165,10 +165,8 @@ def write_figure(charts: FleetCharts, path: Path) -> None:
 
     drawn = io.BytesIO()
     draw_figure(charts).savefig(drawn, format="png")
-    try:
+    with writing(path, "choose another place"):
         Image.open(drawn).convert("RGB").quantize(SHADES, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the figure ({error})") from error
 
 
 def draw_figure(charts: FleetCharts) -> "Figure":

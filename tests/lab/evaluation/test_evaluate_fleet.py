@@ -291,7 +291,7 @@ def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
     for arguments, message in (
         ([str(tmp_path / "nothing")], "not a run folder"),
         ([str(folder), "--truth", str(tmp_path / "nowhere")], "nowhere: no folder with the truth"),
-        ([str(folder), "--csv", str(tmp_path / "missing" / "table.csv")], "cannot write the table"),
+        ([str(folder), "--csv", str(tmp_path / "missing" / "table.csv")], "cannot be written"),
     ):
         assert main(["evaluate", "fleet", *arguments]) == 2
         error = capsys.readouterr().err

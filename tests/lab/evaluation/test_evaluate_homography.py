@@ -230,7 +230,7 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
         (["{scenes}", "--detector", "{empty}/none"], "no such folder"),
         (["{scenes}", "--detector", "{empty}"], "cannot read the features"),
         (["{scenes}", "--detector", "onnx", "--detector", "{empty}/n.onnx"], "cannot read the network weights"),
-        (["{scenes}", "--detector", "orb", "--csv", "{empty}/none/t.csv"], "cannot write the table"),
+        (["{scenes}", "--detector", "orb", "--csv", "{empty}/none/t.csv"], "cannot be written"),
     ],
 )
 def test_mistakes_are_told_in_one_line(scenes, tmp_path, capsys, arguments, message):

@@ -104,5 +104,5 @@ def test_metrics_are_written_as_csv_and_json(folders):
     assert [row["name"] for row in rows] == [row["name"] for row in content]
     assert {row["name"]: row["unit"] for row in rows}["rotation_error_mean"] == "deg"
     assert float(rows[0]["value"]) == pytest.approx(content[0]["value"]) == pytest.approx(0.1, abs=1e-6)
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_metrics(metrics, folder / "missing" / "table.csv")

@@ -247,7 +247,7 @@ def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path):
     changed = {name for name, array in found.items() if not np.array_equal(array, start[name])}
     assert changed
     network = KeypointNetwork("light")
-    assert changed <= layer_names(network, network.code_layers)
+    assert changed <= layer_names(network, network.body.code_layers)
     assert not same(found, update("b", RevisitExamples(images[::-1], [pair])))
     with pytest.raises(TrainingError, match="no place was"):
         update("c", RevisitExamples(images))

@@ -34,9 +34,9 @@ def join(
     """
     require_training_libraries("flwr", extra="federated")
     from fcslam.errors import PacketError, TrainingError
-    from fcslam.learning.federated import launch
     from fcslam.learning.federated.client import RobotClient
-    from fcslam.learning.federated.fleet_robot import RobotLink
+    from fcslam.learning.federated.client_app import build_client_app
+    from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
     from fcslam.wire.checks import check_name
     from fcslam.wire.keys import Credentials, read_credentials
 
@@ -55,6 +55,6 @@ def join(
             print_line(console, line)
 
     found = Credentials() if credentials is None else read_credentials(credentials)
-    link = RobotLink(server, robot, found.token, found.ca)
     client = RobotClient(robot, images, output / "labels", compute_budget().device)
-    launch.join(link, client, print_once)
+    with RobotLink(server, robot, found.token, found.ca) as link:
+        serve_requests(link, build_client_app(client), print_once)

@@ -40,8 +40,8 @@ def serve(
 
     settings = round_settings(config, quick)
     require_training_libraries("flwr", extra="federated")
-    from fcslam.learning.federated import launch
-    from fcslam.learning.federated.job import FederatedJob
+    from fcslam.learning.federated.fleet_server import open_port, waiting
+    from fcslam.learning.federated.job import FederatedJob, run_job
     from fcslam.service.http.authentication import Authenticator, read_tokens
 
     tokens, certificate, key = find_files(credentials)
@@ -64,5 +64,6 @@ def serve(
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     with listen(host, port) as listener, ProgressDisplay(console, f"output: {job.output}") as display:
         progress = show_rounds(display, console, settings)
-        launch.serve(job, options, listener, None if insecure else tls, authenticator, progress, print_once)
+        with open_port(listener, None if insecure else tls, authenticator, print_once) as grid:
+            run_job(job, options, progress, grid, waiting(print_once))
     typer.echo(str(job.output / "detector.onnx"))

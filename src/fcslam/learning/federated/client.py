@@ -23,7 +23,7 @@ from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
-from fcslam.learning.trainer import TrainingProgress, validation_pairs
+from fcslam.learning.trainer import validation_pairs
 from fcslam.learning.validation import validate
 
 
@@ -176,7 +176,7 @@ class RobotClient:
             labeller = keypoint_response(weights_to_network(weights, settings.training.encoder).to(device), device)
             files = find_images([self.folder])
             self.images = read_labelled_images(
-                files, self.cache, settings.training, labeller, None, _ignore_progress, self.most_images
+                files, self.cache, settings.training, labeller, None, lambda _stage, _progress: None, self.most_images
             )
             self.images_settings = settings.training
         return self.images
@@ -185,7 +185,3 @@ class RobotClient:
 def robot_seed(robot: str, seed: int) -> int:
     """The seed of a robot, so that two robots draw different views."""
     return int(np.random.default_rng([seed, zlib.crc32(robot.encode())]).integers(2**31))
-
-
-def _ignore_progress(_stage: str, _progress: TrainingProgress) -> None:
-    pass

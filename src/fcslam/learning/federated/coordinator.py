@@ -16,10 +16,9 @@ import numpy as np
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, CoordinatorState, read_state, run_id, write_state
 from fcslam.learning.federated.evaluation import (
+    PUBLIC_IMAGES,
     EvaluateFn,
-    Evaluator,
     Metrics,
-    PublicImages,
     VersionComparison,
     combined_score,
     decide,
@@ -218,13 +217,12 @@ class Coordinator:
             return self._ask_gate(self._hooks.gate, model, state, replies)
         metrics = self._measure(model, state.rounds_done)
         newcomers = metrics.keys() - state.best_scores.keys()
-        best: Mapping[Evaluator, Metrics] = {}
+        best: Mapping[str, Metrics] = {}
         if newcomers and self._hooks.evaluate_fn is not None:
-            best = {PublicImages(): self._hooks.evaluate_fn(state.best)}
+            best = {PUBLIC_IMAGES: self._hooks.evaluate_fn(state.best)}
         elif newcomers:
             nodes = {robot: node for robot, node in self._present().items() if robot in newcomers}
-            measured, failed = self._measure_on(nodes, self._model(state.best), state.rounds_done)
-            best = {robot: measured[robot] for robot in measured}
+            best, failed = self._ask(nodes, self._model(state.best), state.rounds_done, _metrics)
             replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
         scores = {evaluator: combined_score(found) for evaluator, found in best.items()}
         return VersionComparison(metrics, {**state.best_scores, **scores})
@@ -278,21 +276,15 @@ class Coordinator:
             update_length=length,
         )
 
-    def _measure(self, model: GlobalModel, round_number: int) -> Mapping[Evaluator, Metrics]:
+    def _measure(self, model: GlobalModel, round_number: int) -> Mapping[str, Metrics]:
         """Metrics of the model on public images, or else by all robots that can give them, at least one."""
         if self._hooks.evaluate_fn is not None:
-            return {PublicImages(): self._hooks.evaluate_fn(model.weights)}
-        found, failed = self._measure_on(self._connected(), model, round_number)
+            return {PUBLIC_IMAGES: self._hooks.evaluate_fn(model.weights)}
+        found, failed = self._ask(self._connected(), model, round_number, _metrics)
         while not found:
             self._wait_or_fail(_joined(failed))
-            found, failed = self._measure_on(self._connected(), model, round_number)
-        return {robot: found[robot] for robot in found}
-
-    def _measure_on(
-        self, nodes: Mapping[str, int], model: GlobalModel, round_number: int
-    ) -> tuple[dict[str, Metrics], dict[str, str]]:
-        """Metrics of the model by these robots, and the reasons why some gave none."""
-        return self._ask(nodes, model, round_number, _metrics)
+            found, failed = self._ask(self._connected(), model, round_number, _metrics)
+        return found
 
     def _ask(
         self, nodes: Mapping[str, int], model: GlobalModel, round_number: int, read: Callable[[RecordDict], _Answer]
@@ -320,9 +312,7 @@ class Coordinator:
 
     def _present(self) -> dict[str, int]:
         """Node numbers by robot, in the order of the names."""
-        nodes = self._grid.get_node_ids()
-        names = self._grid.robot_names()  # asked last: whoever came meanwhile has a name
-        return dict(sorted((names[node], node) for node in nodes))
+        return dict(sorted(self._grid.nodes().items()))
 
     def _connected(self) -> dict[str, int]:
         """Node numbers by robot, as soon as enough robots are connected."""

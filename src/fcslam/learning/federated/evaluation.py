@@ -21,6 +21,8 @@ Metrics = Mapping[str, float]
 """Values by name; those in ``SCORE_METRICS`` are shares in [0, 1]."""
 EvaluateFn = Callable[[Weights], Metrics]
 """Evaluation by the coordinator itself, on public images; Flower's ``evaluate_fn``."""
+PUBLIC_IMAGES: Final = ""
+"""Stands for the coordinator among the evaluators of a version, which are named; no robot's name is empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +87,6 @@ def _shown(interval: Interval) -> str:
     return f"{interval.mean:+.3f} [{interval.low:+.3f}; {interval.high:+.3f}]"
 
 
-@dataclass(frozen=True, slots=True)
-class PublicImages:
-    """The evaluator that is not a robot: the coordinator, on public images."""
-
-
-Evaluator = str | PublicImages
-"""The evaluator of a version: a robot, by its name, on images that it held out, or the coordinator."""
-
-
 def combined_score(metrics: Metrics) -> float:
     """The score by which versions are compared: the mean of repeatability and MMA, in [0, 1]."""
     values = [metrics.get(name, np.nan) for name in SCORE_METRICS]
@@ -110,15 +103,15 @@ def valid_metrics(metrics: Metrics) -> dict[str, float]:
 class VersionComparison:
     """A version beside the best one so far."""
 
-    by_evaluator: Mapping[Evaluator, Metrics]
+    by_evaluator: Mapping[str, Metrics]
     """Metrics of the version; empty if it was not evaluated in this round."""
-    best: Mapping[Evaluator, float]
+    best: Mapping[str, float]
     """Scores of the best version, by everyone who ever evaluated it."""
     gate: GateDecision | None = None
     """The decision of the gate on pairs that robots hold out, if there is one; then nothing else was evaluated."""
 
     @property
-    def scores(self) -> dict[Evaluator, float]:
+    def scores(self) -> dict[str, float]:
         """Scores of the version by evaluator."""
         return {evaluator: combined_score(metrics) for evaluator, metrics in self.by_evaluator.items()}
 

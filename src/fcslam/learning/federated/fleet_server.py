@@ -38,6 +38,8 @@ LONG_POLL_S: Final = 10.0
 POLL_S: Final = 0.1
 MAX_OPEN_REQUESTS: Final = 4
 """Requests of one robot at the same time. A robot needs two: one at work, and the sign of life."""
+WAIT_S: Final = 5.0
+"""Time after which a round is tried again that could not be completed."""
 START_S: Final = 30.0
 STOP_S: Final = 5.0
 MAX_NOTICES: Final = 100
@@ -161,6 +163,26 @@ class FleetApp:
             self._notices.add(line)
             self._on_notice(line)
         return PlainTextResponse(reason, status, headers={"connection": "close"})
+
+
+@contextlib.contextmanager
+def open_port(
+    listener: socket.socket, tls: tuple[Path, Path] | None, authenticator: Authenticator, on_notice: OnNotice
+) -> Iterator[FleetGrid]:
+    """Let robots fetch requests while the block runs; arguments as for ``FleetApp`` and ``listening``."""
+    grid = FleetGrid()
+    with listening(FleetApp(grid, authenticator, on_notice), listener, tls):
+        yield grid
+
+
+def waiting(on_notice: OnNotice) -> Callable[[str], None]:
+    """A function that says the reason to wait, and waits."""
+
+    def wait(reason: str) -> None:
+        on_notice(f"waiting: {reason}")
+        time.sleep(WAIT_S)
+
+    return wait
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import EvaluationError, OutputError
+from fcslam.errors import EvaluationError, writing
 from fcslam.metrics.relations import (
     ACROSS_ROBOTS_GAP_S,
     PoseTable,
@@ -88,12 +88,9 @@ def write_metrics(metrics: tuple[Metric, ...], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            if path.suffix == ".json":
-                file.write(metrics_json(metrics))
-            else:
-                rows = [(metric.name, f"{metric.value:.9g}", metric.unit) for metric in metrics]
-                csv.writer(file, lineterminator="\n").writerows([("name", "value", "unit"), *rows])
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the table ({error})") from error
+    with writing(path, "choose another place"), path.open("w", encoding="utf-8", newline="") as file:
+        if path.suffix == ".json":
+            file.write(metrics_json(metrics))
+        else:
+            rows = [(metric.name, f"{metric.value:.9g}", metric.unit) for metric in metrics]
+            csv.writer(file, lineterminator="\n").writerows([("name", "value", "unit"), *rows])

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fcslam.errors import OutputError
+from fcslam.errors import writing
 from fcslam.lab.evaluation.places.report import SetResult
 
 COLOURS: Final = (
@@ -75,8 +75,6 @@ def save(figure: Any, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    try:
+    with writing(path, "choose another place"):
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=120, metadata={"Software": None})
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the figure ({error})") from error

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import OutputError
+from fcslam.errors import writing
 from fcslam.lab.evaluation.places.scoring import DescribedSet, Scorer
 from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.lab.evaluation.places.verification import PairVerifier
@@ -150,13 +150,11 @@ def write_results(folder: Path, results: Sequence[SetResult]) -> None:
     Raises:
         OutputError: the folder cannot be written.
     """
-    try:
+    with writing(folder, "choose another place"):
         folder.mkdir(parents=True, exist_ok=True)
         _write_table(folder / "places.csv", results)
         for result in results:
             _write_set(folder / result.place_set.name, result)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot write the results ({error}); choose another folder") from error
 
 
 def _write_table(path: Path, results: Sequence[SetResult]) -> None:
