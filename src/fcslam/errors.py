@@ -1,25 +1,4 @@
-"""The exception tree.
-
-FcslamError
-├── InputError            an input of the user is wrong; the message says what, where and what to do (exit code 2)
-│   ├── SourceError       a recording cannot be read
-│   ├── ConfigError       a settings file, one of its keys or a veto is wrong
-│   ├── OutputError       the output folder cannot be used
-│   ├── SimulationError   a fleet cannot be simulated
-│   ├── FeatureError      network weights, images or extracted features cannot be used
-│   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
-│   ├── EvaluationError   a reference file or a run folder cannot be evaluated
-│   ├── ServiceError      the service cannot run: tokens, certificates, address, folder or mission are unusable
-│   ├── StoreError        a mission cannot be stored or read: the disk is full, or the file is damaged
-│   ├── EditError         an edit of a mission cannot be undone or read
-│   ├── StateError        a robot's state folder cannot be used
-│   ├── NetworkError      a ROS network cannot be used: its middleware, its topics or its transforms are missing
-│   └── CloudError        the cloud rejects a robot: its token, its name or its packets
-│       └── OversizeError     a request is too large
-├── PacketError           received bytes are not a valid packet
-│   └── PacketConflictError   two different packets have the same number
-└── UnavailableError      the cloud is unreachable or busy; retry later
-"""
+"""The exceptions. An ``InputError`` gives exit code 2 and one line that says what is wrong, where, and what to do."""
 
 import re
 from collections.abc import Iterator

@@ -58,11 +58,7 @@ def placed_regions(
 ) -> tuple[PlacedRegion, ...]:
     """The regions whose sessions are in a map, at the present poses of the keyscans to which they are tied.
 
-    Args:
-        map_indices: number of each session's map.
-        sessions: their keyscans.
-        pose_of: poses in the maps.
-        changes: edits in force.
+    ``map_indices``: number of each session's map; ``pose_of``: poses in the maps; ``changes``: edits in force.
     """
     regions = [change for change in changes if isinstance(change, MapRegion) and change.session in map_indices]
     return tuple(

@@ -250,11 +250,7 @@ def train_on_shapes(
 ) -> KeypointNetwork:
     """Train a detector of the corners of synthetic shapes; its descriptors are not trained yet.
 
-    Args:
-        folder: for the files of this stage, which is continued if it is in there.
-        settings: of the run.
-        options: where and how to compute.
-        on_progress: called after every step.
+    ``folder`` is for the files of this stage, which is continued if it is in there.
 
     Raises:
         TrainingError: ``folder`` belongs to another run.

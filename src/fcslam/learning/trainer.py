@@ -207,22 +207,6 @@ class TrainingRun:
             rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
 
 
-def trained_network(path: Path) -> KeypointNetwork:
-    """The averaged network of a checkpoint, the result of its run, in evaluation mode.
-
-    Raises:
-        TrainingError: the file is not a checkpoint, or belongs to a network that this version does not have.
-    """
-    checkpoint = read_checkpoint(path)
-    try:
-        network = KeypointNetwork(checkpoint.settings["encoder"])
-        network.load_state_dict(checkpoint.part(AVERAGE))
-    except (KeyError, RuntimeError) as error:
-        raise TrainingError(f"{path}: does not fit this network ({error})") from error
-    network.eval()
-    return network
-
-
 def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION_PAIRS) -> list[ViewPair]:
     """At most ``most`` pairs of views of held-out images, spread over all of them; always the same."""
     pairs = []

@@ -119,11 +119,7 @@ def highlighted_png(
 ) -> bytes:
     """Draw the map as a PNG of about 1600 pixels on its long side, with two sets of cells in colours.
 
-    Args:
-        fused: the map.
-        appeared: cells of ``fused``, shape (H, W).
-        disappeared: other cells, shape (H, W).
-        labels: what the legend calls both.
+    The sets are masks (H, W) of the map; ``labels`` are what the legend calls both.
     """
     painted = fused.cells.copy()
     painted[appeared], painted[disappeared] = _APPEARED, _DISAPPEARED

@@ -32,13 +32,12 @@ def relations(
 ) -> None:
     """Measure a run by the relations metric of Kuemmerle et al. 2009: mean, standard deviation and maximum."""
     from fcslam.lab.evaluation.fleet.relations import (
-        RelationsQuestion,
         evaluate_relations,
         relation_metrics,
         write_metrics,
     )
 
-    errors = evaluate_relations(run, reference, RelationsQuestion(across_robots, parts=parts))
+    errors = evaluate_relations(run, reference, across_robots, parts)
     _show_relations(errors, "relations across robots" if across_robots else "relations")
     if csv is not None:
         write_metrics(relation_metrics(errors), csv)

@@ -32,13 +32,7 @@ _LEAST_SPREAD_M = 1.0
 def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
     """Draw goals (G, 2) for each robot: overlapping parts of one walk through rooms and corridors.
 
-    Another robot changes nothing for those before it.
-
-    Args:
-        plan: the building.
-        robots: number of robots.
-        length_m: path length of each robot.
-        rng: random generator.
+    Another robot changes nothing for those before it. ``length_m``: path length of each robot.
 
     Raises:
         SimulationError: the building has no drivable space, or too little of it.

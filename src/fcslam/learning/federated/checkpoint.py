@@ -90,11 +90,7 @@ def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings
 def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin: str) -> CoordinatorState | None:
     """Read a checkpoint of this run.
 
-    Args:
-        path: file of the checkpoint.
-        settings: of this run.
-        initial: weights that this run starts from.
-        origin: detector version of ``initial``.
+    ``initial`` and ``origin``: the weights that the run starts from, and their detector version.
 
     Returns:
         The state, or None if there is no file.

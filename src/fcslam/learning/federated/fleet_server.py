@@ -189,10 +189,7 @@ def waiting(on_notice: OnNotice) -> Callable[[str], None]:
 def listening(app: FleetApp, listener: socket.socket, tls: tuple[Path, Path] | None = None) -> Iterator[None]:
     """Serve the operations in a thread while the block runs.
 
-    Args:
-        app: the operations to serve.
-        listener: bound socket.
-        tls: PEM files of this machine's certificate and its key; None for no encryption.
+    ``tls``: PEM files of this machine's certificate and its key; None for no encryption.
     """
     server = GuardedServer(
         uvicorn.Config(

@@ -66,12 +66,7 @@ def run_job(
 ) -> list[Path]:
     """Run a job, or continue it.
 
-    Args:
-        job: what to do.
-        options: where and how to compute.
-        callbacks: receive the progress.
-        grid: carries the messages to the robots.
-        wait: as in ``CoordinatorHooks``.
+    ``wait``: as in ``CoordinatorHooks``.
 
     Returns:
         The files for the user: the detector, the picture of the rounds, and the model card.

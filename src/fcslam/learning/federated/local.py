@@ -19,12 +19,8 @@ def federate_locally(
 ) -> list[Path]:
     """Run or continue federated training.
 
-    Args:
-        folders: the images of each robot; a robot has the name of its folder.
-        job: what to do.
-        options: where and how to compute.
-        callbacks: receive the progress.
-        most_images: each robot trains on its first ones alone; None for all.
+    ``folders`` hold the images of each robot, which has the name of its folder. It trains on its first ``most_images``
+    alone; None for all.
 
     Returns:
         The files for the user, see ``run_job``.

@@ -35,12 +35,7 @@ class OwnExamples:
 
 
 def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
-    """Read the keyframes of a robot and find what it saw again.
-
-    Args:
-        folder: of the keyframes.
-        settings: of the robot.
-    """
+    """Read the keyframes of a robot and find what it saw again."""
     kept = read_keyframes(folder, MOST_KEYFRAMES)
     version = kept[-1].detector_version if kept else ""
     shown = [(frame, picture) for frame in kept if (picture := _picture(frame, version)) is not None]

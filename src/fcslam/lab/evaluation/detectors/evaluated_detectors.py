@@ -93,10 +93,8 @@ def choose_detectors(
 ) -> tuple[EvaluatedDetector, ...]:
     """Choose extracted features first, then the named detectors; by default all available detectors.
 
-    Args:
-        names: kinds of detectors.
-        weights: ONNX files, each a detector of its own; empty: the bundled network.
-        folders: folders with extracted features.
+    ``weights``: ONNX files, each a detector of its own; empty: the bundled network. ``folders`` hold extracted
+    features.
 
     Raises:
         FeatureError: a network's weights cannot be used.

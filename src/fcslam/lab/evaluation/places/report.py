@@ -71,12 +71,8 @@ def evaluate_set(
 ) -> SetResult:
     """Evaluate every scorer on every question of a set.
 
-    Args:
-        described: the set.
-        scorers: scorers by name.
-        checker: geometric verification; None: none.
-        seed: seed of the bootstrap.
-        watch: called after each scorer.
+    ``checker`` verifies by geometry; None: nothing does. ``seed`` is that of the bootstrap; ``watch`` is called after
+    each scorer.
     """
     similarities: dict[str, FloatArray] = {}
     verified: dict[str, FloatArray] = {}
@@ -126,10 +122,7 @@ def measure(
 def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
     """Percentile bootstrap of any measure of ``count`` samples.
 
-    Args:
-        measure: computes the measure of the samples whose indices (N,) it is given; draws with NaN are ignored.
-        count: number of samples.
-        rng: random generator.
+    ``measure`` is given the indices (N,) of samples; draws with NaN are ignored.
 
     Returns:
         The measure of all samples and its interval.
