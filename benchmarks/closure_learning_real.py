@@ -45,7 +45,7 @@ from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_over
 from fcslam.learning.code_batches import RevisitExamples, RevisitPair
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
-from fcslam.learning.federated.live_settings import LIVE_ROUNDS
+from fcslam.learning.federated.settings import LIVE_ROUNDS
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.revisits import BORDER_PX, FEWEST_SHARED, correspond_predicted

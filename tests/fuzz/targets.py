@@ -262,11 +262,11 @@ def federated(_: Path) -> Iterator[Target]:
         CONFIG_KEY,
         GlobalModel,
         client_reply,
+        read_replies,
         read_request,
         request_config,
         weights_to_record,
     )
-    from fcslam.learning.federated.replies import read_replies
     from fcslam.learning.federated.screening import screen
     from fcslam.learning.federated.settings import FederatedSettings
 

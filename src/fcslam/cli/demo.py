@@ -114,9 +114,8 @@ def _prepare(output: Path) -> None:
 def _evaluate(output: Path, console: "Console") -> None:
     from fcslam.cli.evaluate.fleet import show_fleet
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+    from fcslam.lab.evaluation.fleet.report import evaluate_fleet, fleet_metrics
 
     with ProgressDisplay(console) as display:
         display.start("evaluating")

@@ -34,9 +34,8 @@ def extract(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import changed
     from fcslam.errors import FeatureError
-    from fcslam.features.classical import OrbConfig
+    from fcslam.features.classical import OrbConfig, make_detector
     from fcslam.features.detector import OnnxConfig
-    from fcslam.features.factory import make_detector
     from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)

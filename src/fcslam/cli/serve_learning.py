@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from fcslam.cli.learning_options import LEARNING_FILE
-from fcslam.learning.federated.live_settings import RELEASE
-from fcslam.learning.federated.settings import DETECTOR
+from fcslam.learning.federated.settings import DETECTOR, RELEASE
 
 if TYPE_CHECKING:
-    from fcslam.learning.federated.live_settings import FleetLearningSettings
+    from fcslam.learning.federated.settings import FleetLearningSettings
     from fcslam.service.http.state import ServiceState
 
 
@@ -40,7 +39,7 @@ def learning_plan(learn: bool, data: Path, store: str | None) -> FleetLearningPl
     from fcslam.cli.training_options import require_training_libraries
     from fcslam.config import load
     from fcslam.errors import ServiceError
-    from fcslam.learning.federated.live_settings import FleetLearningSettings
+    from fcslam.learning.federated.settings import FleetLearningSettings
 
     if not learn:
         return None

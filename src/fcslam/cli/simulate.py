@@ -104,8 +104,7 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
 
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import OutputError
-    from fcslam.lab.simulation.ground_truth import write_ground_truth
-    from fcslam.lab.simulation.recording import record_robot
+    from fcslam.lab.simulation.recording import record_robot, write_ground_truth
 
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]

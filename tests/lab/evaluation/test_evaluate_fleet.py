@@ -11,8 +11,7 @@ from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.closures import ClosureScope
 from fcslam.lab.evaluation.fleet.ground_truth import read_grid
-from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
-from fcslam.lab.evaluation.fleet.report import Join, evaluate_fleet
+from fcslam.lab.evaluation.fleet.report import Join, evaluate_fleet, fleet_metrics
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.lab.simulation.decoration import WallPicture, decorate
+from fcslam.lab.simulation.decoration import WallPicture, decorate, light_of
 from fcslam.lab.simulation.engine import mujoco
 from fcslam.lab.simulation.floorplan import draw_floor_plan
-from fcslam.lab.simulation.lighting import light_of
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building, Lighting
 from fcslam.lab.simulation.route import drive

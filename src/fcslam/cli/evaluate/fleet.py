@@ -41,9 +41,8 @@ def fleet(
 ) -> None:
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+    from fcslam.lab.evaluation.fleet.report import evaluate_fleet, fleet_metrics
 
     with ProgressDisplay(notices()) as display:
         display.start("evaluating")

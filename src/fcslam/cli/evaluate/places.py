@@ -55,8 +55,7 @@ def places(
 ) -> None:
     """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.places.figures import curves_figure, save
-    from fcslam.lab.evaluation.places.report import write_results
+    from fcslam.lab.evaluation.places.report import curves_figure, save, write_results
 
     output = output or new_folder(EVALUATIONS)
     with ProgressDisplay(notices()) as display:

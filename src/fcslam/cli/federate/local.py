@@ -40,8 +40,7 @@ def local(
 
     settings = round_settings(config, quick)
     require_training_libraries("flwr", extra="federated")
-    from fcslam.learning.federated.job import FederatedJob
-    from fcslam.learning.federated.local import federate_locally
+    from fcslam.learning.federated.job import FederatedJob, federate_locally
 
     console = notices()
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))

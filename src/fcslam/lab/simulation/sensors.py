@@ -8,8 +8,8 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.geometry.rotations import rotation_matrix
+from fcslam.lab.simulation.decoration import Light
 from fcslam.lab.simulation.engine import GL_LOCK, gl_context, mujoco
-from fcslam.lab.simulation.lighting import Light
 from fcslam.lab.simulation.scene import SEEN, SOLID
 from fcslam.lab.simulation.textures import Image
 from fcslam.records import CameraModel, FloatArray, LaserModel

@@ -27,20 +27,21 @@ from fcslam.learning.federated.evaluation import (
 from fcslam.learning.federated.flower import Message, MessageType, NodeSelection, RecordDict, RobotGrid
 from fcslam.learning.federated.held_out import Judgement, check_judgement
 from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
-from fcslam.learning.federated.live_settings import GateSettings
 from fcslam.learning.federated.messages import (
     ARRAYS_KEY,
     CONFIG_KEY,
     PAIRS_KEY,
     GlobalModel,
+    RoundReplies,
+    printable_line,
+    read_replies,
     record_to_weights,
     reply_metrics,
     reply_sender,
     request_config,
 )
-from fcslam.learning.federated.replies import RoundReplies, printable_line, read_replies
 from fcslam.learning.federated.screening import screen, update_length
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.settings import FederatedSettings, GateSettings
 from fcslam.learning.federated.strategies import Aggregator, StrategyFactory
 from fcslam.learning.federated.weights import Weights, check_private, interpolate_weights, shared_weights
 from fcslam.learning.training_step import learning_rate

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.learning.federated.held_out import COLUMNS, Judgement, same_pairs
-from fcslam.learning.federated.live_settings import GateSettings
+from fcslam.learning.federated.settings import GateSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
@@ -42,7 +42,10 @@ class GateDecision:
 def decide(
     candidate: Mapping[str, Judgement], released: Mapping[str, Judgement], settings: GateSettings, seed: int
 ) -> GateDecision:
-    """Compare a version with the released one.
+    """The release gate of a fleet that learns while it maps: compare a version with the released one.
+
+    It has to be better on pairs that no robot trained on, and to find places as well. Both comparisons are paired:
+    every pair is judged with both versions, and the intervals are those of the differences.
 
     Args:
         candidate: what each robot reports of the version.

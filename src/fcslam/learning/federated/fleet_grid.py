@@ -16,7 +16,7 @@ from fcslam.learning.federated.flower import (
     reply_from_bytes,
     use_own_identity,
 )
-from fcslam.learning.federated.replies import MAX_REPLY_RATIO
+from fcslam.learning.federated.messages import MAX_REPLY_RATIO
 
 ONLINE_S: Final = 60.0
 """A robot that has been silent for longer is gone."""

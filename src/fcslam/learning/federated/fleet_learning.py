@@ -21,7 +21,7 @@ from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.learning.federated.fleet_server import open_port, waiting
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
-from fcslam.learning.federated.live_settings import RELEASE, FleetLearningSettings
+from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.service.http.authentication import Authenticator
 from fcslam.service.supervisor import READY, tell

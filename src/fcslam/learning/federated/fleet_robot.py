@@ -29,7 +29,7 @@ from fcslam.learning.federated.flower import (
     request_from_bytes,
     use_own_identity,
 )
-from fcslam.learning.federated.replies import printable_line
+from fcslam.learning.federated.messages import printable_line
 from fcslam.wire.http_transport import HttpClient
 
 ALIVE_S: Final = 15.0

@@ -26,7 +26,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.replies import printable_line
+from fcslam.learning.federated.messages import printable_line
 from fcslam.service.http.authentication import Authenticator, Identity, Role
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 

@@ -14,7 +14,7 @@ from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.geometry import se2
 from fcslam.learning.code_batches import RevisitExamples, RevisitPair
 from fcslam.learning.federated.held_out import HeldOutPairs
-from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
+from fcslam.learning.federated.settings import HeldOutSettings, RobotLearningSettings
 from fcslam.learning.revisits import Keyframe, revisits_in_map
 from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes

@@ -24,8 +24,8 @@ from fcslam.learning.code_training import CodeInputs
 from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
-from fcslam.learning.federated.live_settings import RobotLearningSettings
 from fcslam.learning.federated.own_examples import own_examples
+from fcslam.learning.federated.settings import RobotLearningSettings
 from fcslam.wire.keys import Credentials, read_credentials
 
 NICENESS: Final = 19
