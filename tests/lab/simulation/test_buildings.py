@@ -16,8 +16,8 @@ from fcslam.lab.simulation.floorplan import (
     with_closed_doors,
 )
 from fcslam.lab.simulation.options import Building, Lighting
-from fcslam.lab.simulation.route import drive, schedule
-from tests.lab.simulation.driving import INDOORS, distances, route
+from fcslam.lab.simulation.route import schedule
+from tests.lab.simulation.driving import INDOORS, distances, drive, route
 
 every_building = pytest.mark.parametrize("building", INDOORS)
 

@@ -124,13 +124,6 @@ def schedule(waypoints: FloatArray, turn_rate_rad_s: float = TURN_RATE_RAD_S) ->
     return Schedule(frozen(times), frozen(np.column_stack((positions, angles))))
 
 
-def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
-    """Sample a drive along waypoints (K, 2) every ``period_s``: times (N,) from zero and poses (N, 3)."""
-    plan = schedule(waypoints)
-    stamps = np.arange(0.0, plan.duration_s, period_s)
-    return stamps, plan.at(stamps)
-
-
 def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator) -> NDArray[np.intp]:
     """Numbers (S,) of grid points to visit: one in each room, and some along each corridor."""
     spots = []

@@ -138,10 +138,23 @@ class Coordinator:
         comparison = self._evaluate(candidate, state, replies)
         decision = self._decide(comparison, state)
 
-        length = update_length(replies.weights, self._shared(sent.weights))
-        following = self._next_state(trained, weights, candidate.weights, comparison, decision, length)
+        number = state.rounds_done + 1
+        if decision.returned:
+            self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
+        following = CoordinatorState(
+            rounds_done=number,
+            weights=trained.best if decision.returned else weights,
+            average=trained.best if decision.returned else candidate.weights,
+            best=candidate.weights if decision.released else trained.best,
+            best_scores=comparison.scores if decision.released else comparison.best,
+            best_round=number if decision.released else trained.best_round,
+            strategy_state=self._aggregator.state,
+            times_asked=trained.times_asked,
+            origin=trained.origin,
+            update_length=update_length(replies.weights, self._shared(sent.weights)),
+        )
         report = RoundReport(
-            round_number=following.rounds_done,
+            round_number=number,
             version=candidate.version,
             robots=tuple(sorted(replies.weights)),
             left_out=replies.left_out,
@@ -250,32 +263,6 @@ class Coordinator:
             return Decision(comparison.gate.released, state.best_round > 0 and is_collapse)
         # Never back to the initial weights: as long as training costs something at first, nothing would be learnt.
         return Decision(released=gain >= 0.0, returned=state.best_round > 0 and gain < -self._settings.collapse)
-
-    def _next_state(
-        self,
-        state: CoordinatorState,
-        weights: Weights,
-        average: Weights,
-        comparison: VersionComparison,
-        decision: Decision,
-        length: float,
-    ) -> CoordinatorState:
-        """The state after the round; ``state`` is the one in which the robots were asked."""
-        number = state.rounds_done + 1
-        if decision.returned:
-            self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
-        return CoordinatorState(
-            rounds_done=number,
-            weights=state.best if decision.returned else weights,
-            average=state.best if decision.returned else average,
-            best=average if decision.released else state.best,
-            best_scores=comparison.scores if decision.released else comparison.best,
-            best_round=number if decision.released else state.best_round,
-            strategy_state=self._aggregator.state,
-            times_asked=state.times_asked,
-            origin=state.origin,
-            update_length=length,
-        )
 
     def _measure(self, model: GlobalModel, round_number: int) -> Mapping[str, Metrics]:
         """Metrics of the model on public images, or else by all robots that can give them, at least one."""
