@@ -239,12 +239,8 @@ class Fleet:
         """The result of all packets in canonical order, without those of removed sessions.
 
         Unless they came in this order, another fleet applies them: all, or those after an earlier result, if all of
-        these come later in the order.
-
-        Args:
-            log: the order in which this fleet applied its packets.
-            arrived: time and number of every packet in ``log``, in any order.
-            read: gives a packet by its number.
+        these come later in the order. ``log`` is the order in which this fleet applied its packets; ``arrived`` has
+        time and number of each, in any order.
         """
         if log.is_canonical and not self._needs_replay:
             return self.conclude()

@@ -39,11 +39,7 @@ def T_placed_map(
 ) -> FloatArray | None:
     """The motion that puts a map where users want it, shape (3,); None if no placement names one of its sessions.
 
-    Args:
-        members: the sessions of the map.
-        sessions: their keyscans.
-        pose_of: poses in the map as it is.
-        changes: edits in force; of several placements the last one counts.
+    ``pose_of`` gives poses in the map as it is; of several placements the last one counts.
     """
     placements = [change for change in changes if isinstance(change, Placement) and change.session in members]
     if not placements:

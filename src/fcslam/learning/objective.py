@@ -157,9 +157,7 @@ def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, T
 def negatives(points: Tensor, valid: Tensor) -> Tensor:
     """Which pairs of points are negatives, shape (B, N, N), bool: both valid, and far apart in both views.
 
-    Args:
-        points: shape (2B, N, 2) [px], first views before second views.
-        valid: shape (B, N), bool.
+    ``points`` (2B, N, 2) [px]: first views before second views; ``valid``: shape (B, N).
     """
     first, second = points.chunk(2)
     apart = (torch.cdist(first, first) > MIN_NEGATIVE_DISTANCE_PX) & (

@@ -91,10 +91,8 @@ class _Viewport:
 def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[DrawnClosure]) -> bytes:
     """Draw the map as a PNG of about 1600 pixels on its long side, cropped to known area and trajectories.
 
-    Args:
-        fused: the map.
-        trajectories: each robot's poses or points in ``map``, shape (N, 2+), drawn with a dot at the first.
-        closures: closures; those between two robots are counted, and drawn unless they are too close together.
+    Each trajectory has shape (N, 2+) in ``map`` and a dot at the first pose. Closures between two robots are counted,
+    and drawn unless they are too close together.
     """
     view = _view(fused, trajectories.values())
     canvas = _canvas(view)

@@ -117,11 +117,9 @@ def joined_tiles(tiles: Iterable[MapTile]) -> OccupancyMap:
 def laid_together(maps: Sequence[tuple[OccupancyMap, FloatArray]], maximum_cells: int) -> OccupancyMap:
     """Maps moved as a whole into one frame.
 
-    A cell is occupied if it is in one of the maps, else free if it is in one, so no wall is lost.
-
-    Args:
-        maps: each with its pose in the common frame, shape (3,), metres and radians; at least one.
-        maximum_cells: of the result. Its cells are those of the first map, doubled until they are few enough.
+    A cell is occupied if it is in one of the maps, else free if it is in one, so no wall is lost. Each map has a pose
+    (3,) in the common frame, in metres and radians. Cells are those of the first map, doubled until they are few
+    enough.
     """
     boxes = [_box(occupancy, pose) for occupancy, pose in maps]
     low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)

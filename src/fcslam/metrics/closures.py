@@ -103,10 +103,8 @@ class Recall:
 def revisits_found(revisits: Rows, correct: Rows, run: PoseTable) -> Mask:
     """Find which revisits are detected by a correct closure.
 
-    Args:
-        revisits: pairs of rows of ``run``, shape (R, 2).
-        correct: ends of the correct closures as pairs of rows, shape (C, 2), in either order.
-        run: poses of the run.
+    Revisits (R, 2) and correct closures (C, 2), whose ends are in either order, are pairs of rows of ``run``; the
+    result has shape (R,).
 
     Returns:
         Shape (R,).
@@ -156,10 +154,7 @@ class Revisits:
 def find_revisits(truth: PoseTable, between_robots: bool, turn_deg: float = 180.0) -> Revisits:
     """Find all revisits of other robots' paths, or of the robots' own paths.
 
-    Args:
-        truth: poses in one coordinate frame.
-        between_robots: whether the paths are those of other robots.
-        turn_deg: largest difference of the headings; 180: any.
+    ``turn_deg`` is the largest difference of the headings; 180: any.
     """
     robots = np.unique(truth.robots).tolist()
     pairs = [(a, b) for a in robots for b in robots if (a != b) == between_robots]

@@ -231,11 +231,8 @@ class PlaceIndex(Generic[PlaceId]):
     ) -> Self:
         """Restore an index from its ``state``; it behaves exactly like the original.
 
-        Args:
-            config: that of the original.
-            state: of the original.
-            ids: the stored places, in the order in which they were added.
-            descriptors: of each place, shape (N, 32).
+        ``ids`` are those of the stored places, in the order in which they were added; the descriptors of each have
+        shape (N, 32).
         """
         index = cls(config, np.random.default_rng(0))
         index._training = Training(**state["training"]) if state["training"] else None

@@ -215,8 +215,7 @@ class Motion:
 def propose_motions(a: Place, b: Place) -> list[Motion]:
     """Find the motions that enough matching keypoints support, the best first.
 
-    Args:
-        a, b: two places with descriptors of the same detector version.
+    Both places have descriptors of the same detector version.
     """
     matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     if a.channel is Channel.CAMERA:

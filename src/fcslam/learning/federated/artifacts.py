@@ -28,11 +28,7 @@ def write_federated_artifacts(
 ) -> list[Path]:
     """Write the detector, the picture and the card; returns their paths.
 
-    Args:
-        state: its best weights are exported.
-        folder: of the run; contains the table of rounds.
-        settings: of the run.
-        judged_on: the images on which versions were evaluated, in words.
+    ``folder`` contains the table of rounds; ``judged_on`` names the images on which versions were evaluated.
 
     Raises:
         OutputError: a file cannot be written.

@@ -344,14 +344,7 @@ def _means(rows: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
 def _sample(names: Iterable[str], fraction: float, minimum: int, rng: np.random.Generator) -> list[str]:
     """Draw robots for a round.
 
-    Args:
-        names: of the connected robots.
-        fraction: share of them to draw, in (0, 1].
-        minimum: number of robots to draw at least, if enough are connected.
-        rng: source of randomness.
-
-    Returns:
-        Names in alphabetical order.
+    Returns names in alphabetical order; ``minimum`` robots at least, if enough are connected.
     """
     everyone = sorted(names)
     count = min(max(int(np.ceil(fraction * len(everyone))), minimum), len(everyone))

@@ -45,13 +45,8 @@ def decide(
     """The release gate of a fleet that learns while it maps: compare a version with the released one.
 
     It has to be better on pairs that no robot trained on, and to find places as well. Both comparisons are paired:
-    every pair is judged with both versions, and the intervals are those of the differences.
-
-    Args:
-        candidate: what each robot reports of the version.
-        released: what each reports of the released version, on the same pairs.
-        settings: thresholds.
-        seed: of the bootstrap.
+    every pair is judged with both versions, and the intervals are those of the differences. Both mappings hold what
+    each robot reports, on the same pairs; ``seed`` is that of the bootstrap.
     """
     differences = same_pairs(candidate, released)
     rows = np.concatenate([*differences.values(), np.empty((0, len(COLUMNS)))])

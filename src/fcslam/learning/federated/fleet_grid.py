@@ -41,9 +41,6 @@ class FleetGrid:
 
     A request stays with its robot until the reply is there or nobody waits for it any more. So a robot that starts
     again gets it again, and only the first reply counts.
-
-    Args:
-        clock: gives seconds since any fixed moment.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

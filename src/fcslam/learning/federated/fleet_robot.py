@@ -48,9 +48,7 @@ _T = TypeVar("_T")
 class RobotLink(HttpClient):
     """The connection of a robot with the service that it learns at.
 
-    Args:
-        url, token, ca, own: as in ``HttpClient``.
-        robot: name of the robot.
+    ``url``, ``token``, ``ca`` and ``own`` are as in ``HttpClient``; ``robot`` is its name.
     """
 
     def __init__(
@@ -127,12 +125,8 @@ def serve_requests(
 ) -> None:
     """Answer the server's requests until the robot is interrupted. Waits for a server that is not there, or gone.
 
-    Args:
-        link: to the server.
-        app: answers the requests.
-        on_notice: called with one line for a request that was refused, and while the server is not there.
-        sleep: waits for a number of seconds.
-        is_ready: asked before each request; if false, the robot asks for none now.
+    ``on_notice`` is called with one line for a request that was refused, and while the server is not there.
+    ``is_ready`` is asked before each request; if false, the robot asks for none now.
 
     Raises:
         TrainingError: the server does not accept the robot.

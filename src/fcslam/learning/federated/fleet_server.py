@@ -54,10 +54,8 @@ OnNotice = Callable[[str], None]
 class FleetApp:
     """The operations of the port. Its methods are the handlers.
 
-    Args:
-        grid: holds requests and replies.
-        authenticator: knows the tokens of robots; an open one believes the name in the path.
-        on_notice: called with one line for each kind of refused request; from the thread of the server.
+    An open ``authenticator`` believes the name in the path. ``on_notice`` is called with one line for each kind of
+    refused request, from the thread of the server.
     """
 
     def __init__(self, grid: FleetGrid, authenticator: Authenticator, on_notice: OnNotice) -> None:

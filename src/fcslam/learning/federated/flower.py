@@ -115,10 +115,6 @@ class InProcessGrid:
     """Calls the robots' apps in this process, one after another, without ports and daemons.
 
     Every robot has the whole deadline for itself, as if all worked at the same time.
-
-    Args:
-        apps: of the robots by name.
-        clock: gives seconds since any fixed moment.
     """
 
     def __init__(self, apps: Mapping[str, ClientApp], clock: Callable[[], float] = time.monotonic) -> None:

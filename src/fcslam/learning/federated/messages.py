@@ -205,10 +205,7 @@ def printable_line(text: str) -> str:
 def read_replies(replies: Iterable[Message], robots: Mapping[int, str], sent: GlobalModel) -> RoundReplies:
     """Read the replies to a training request.
 
-    Args:
-        replies: Flower's messages; ``screen`` checks their arrays afterwards.
-        robots: names of the robots that were asked, by Flower's node number.
-        sent: the weights that they were sent.
+    ``screen`` checks the arrays afterwards. ``robots`` has the names of those that were asked, by Flower's node number.
     """
     found, limit = RoundReplies(), MAX_REPLY_RATIO * sent.size_bytes
     for reply in replies:

@@ -22,12 +22,9 @@ def evaluate_relations(
 ) -> RelationErrors:
     """Errors of the run folder ``run`` against the file ``relations``.
 
-    Args:
-        run: the run folder.
-        relations: the file.
-        across_robots: only relations whose stamps belong to different robots.
-        parts: run folder that assigns stamps to robots, if not ``run``. It lets you evaluate a run of one robot with
-            the same relations as a run of several robots from the same recording.
+    ``across_robots``: only relations whose stamps belong to different robots. ``parts`` is a run folder that assigns
+    stamps to robots, if not ``run``: so a run of one robot is evaluated with the same relations as one of several
+    robots from the same recording.
 
     Raises:
         EvaluationError: one of them cannot be read, no relation is selected, or none has both its poses in one map of
