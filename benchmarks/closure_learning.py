@@ -346,8 +346,8 @@ def trained_here(
     """Training in one place, with the losses and the rate of a robot in the fleet."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
-    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible)
-    return train_codes(state, revisits, CodeInputs(), training, plan, torch.device("cpu")).network
+    plan = LocalTrainingPlan(training, 0, steps, compatible=settings.compatible)
+    return train_codes(state, revisits, CodeInputs(), plan).network
 
 
 def federated(

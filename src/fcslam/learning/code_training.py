@@ -5,7 +5,7 @@ image. The keypoints depend on the trained layers a little, so a loss keeps the 
 keeps the codes of what the robot does not see.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -25,7 +25,6 @@ from fcslam.learning.local_training import (
 )
 from fcslam.learning.network import Description, KeypointNetwork
 from fcslam.learning.objective import rehearsal_loss, revisit_objective
-from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import reduced_precision
 
 _IMAGES_AT_ONCE: Final = 8
@@ -64,38 +63,21 @@ class CodeInputs:
 
 
 def train_codes(
-    start: Mapping[str, Tensor],
-    revisits: RevisitExamples,
-    inputs: CodeInputs,
-    settings: TrainingSettings,
-    plan: LocalTrainingPlan,
-    device: torch.device,
-    on_step: Callable[[int], None] = lambda _steps: None,
-    legacy: Mapping[str, Tensor] | None = None,
-    optimizer_state: Mapping[str, Tensor] | None = None,
+    start: Mapping[str, Tensor], revisits: RevisitExamples, inputs: CodeInputs, plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
-    """Train for some steps, with the batch statistics as they are. The result depends on the arguments alone.
+    """Train for some steps from the state ``start``, which is not changed, with the batch statistics as they are.
 
-    Args:
-        start: state of a network, which is not changed.
-        revisits: points that were seen again.
-        inputs: of the images of ``revisits``, kept from call to call.
-        settings: of the whole run; the learning rate falls towards the end of its steps.
-        plan: which steps are done, and how.
-        device: to train on.
-        on_step: called with the number of steps done.
-        legacy: state of the network that the whole training started from; None for ``start``. Keypoints stay where it
-            finds them, and codes compatible with it.
-        optimizer_state: result of an earlier local training, to continue it.
+    The result depends on the arguments alone. ``inputs`` are kept from call to call. Keypoints stay where the legacy
+    detector of the plan finds them; without one, where that of ``start`` does.
 
     Raises:
-        TrainingError: nothing was seen again; ``start``, ``legacy`` or ``optimizer_state`` does not fit the network, or
-            training diverged.
+        TrainingError: nothing was seen again, a state does not fit the network, or training diverged.
     """
+    settings, device = plan.settings, plan.device
     if not revisits:
         raise TrainingError("codes are trained on places seen again, but no place was; set trained to all")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
-    before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
+    before = network_from_state(settings.encoder, start if plan.legacy is None else plan.legacy).to(device)
     known = inputs.of(network, revisits.images, settings.seed if plan.compatible else None, device)
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
 
@@ -110,7 +92,7 @@ def train_codes(
             total = total + plan.compatible * losses["compatible"]
         return total, losses
 
-    return train_layers(network, network.body.code_layers, losses_of, settings, plan, on_step, optimizer_state)
+    return train_layers(network, network.body.code_layers, losses_of, plan)
 
 
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:

@@ -100,28 +100,28 @@ class RobotClient:
             TrainingError: there are too few usable images, the weights belong to another network, training diverged,
                 or the cache cannot be used.
         """
-        encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
+        encoder = settings.training.encoder
         moments, own = load_robot_state(self.cache, run_id, round_number)
         weights = with_private(weights, own, settings.private)
         start = weights_to_network(weights, encoder).state_dict()
+        training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
+        needs_former = settings.compatible > 0.0 or settings.on_revisits
+        former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
         plan = LocalTrainingPlan(
+            settings=training,
             first_step=round_number * settings.local_steps,
             steps=settings.local_steps,
             compatible=settings.compatible,
-            frozen_statistics=frozen,
+            legacy=None if former is None else weights_to_network(former, encoder).state_dict(),
+            frozen_statistics=settings.normalisation == "frozen",
+            optimizer_state=moments,
+            device=torch.device(self.device),
+            on_step=partial(self.on_step, self.name),
         )
-        training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
-        needs_former = plan.compatible > 0.0 or settings.on_revisits
-        former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
-        legacy = None if former is None else weights_to_network(former, encoder).state_dict()
-        device, on_step = torch.device(self.device), partial(self.on_step, self.name)
         if settings.on_revisits:
-            trained = train_codes(
-                start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimizer_state=moments
-            )
+            trained = train_codes(start, self.revisits, self.inputs, plan)
         else:
-            images = self._labelled_images(weights, settings).train
-            trained = local_training(start, images, training, plan, device, on_step, legacy, optimizer_state=moments)
+            trained = local_training(start, self._labelled_images(weights, settings).train, plan)
         found = network_to_weights(trained.network)
         shared = shared_weights(found, settings.private)
         own = {name: array for name, array in found.items() if name not in shared}
