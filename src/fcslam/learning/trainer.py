@@ -112,18 +112,14 @@ class TrainingRun:
         bits: TeacherBits | None = None,
         on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
     ) -> KeypointNetwork:
-        """Train to the last step; returns the averaged network.
-
-        Args:
-            examples: to train on.
-            held_out: to validate on.
-            bits: a teacher's, if the examples have a teacher.
-            on_progress: called after every step.
+        """Train to the last step; returns the averaged network. ``bits`` are a teacher's, if the examples have one.
 
         Raises:
             TrainingError: the folder's checkpoint belongs to another run, or training diverged.
-            OutputError: a checkpoint or the log cannot be written.
+            OutputError: the folder cannot be written.
         """
+        with writing(self.folder, "choose another output folder"):
+            self.folder.mkdir(parents=True, exist_ok=True)
         self._resume()
         bits = None if bits is None else bits.to(self.device)
         views = validation_pairs(held_out, self.options.validation_pairs)
@@ -179,14 +175,11 @@ class TrainingRun:
                 f"{path}: has {checkpoint.step} steps already, more than {self.settings.steps}; give another --output"
             )
         try:
-            self._load(checkpoint)
+            self.network.load_state_dict(checkpoint.part(NETWORK))
+            self.average.load_state_dict(checkpoint.part(AVERAGE))
+            restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
         except (KeyError, RuntimeError, ValueError) as error:
             raise TrainingError(f"{path}: does not fit this network ({error})") from error
-
-    def _load(self, checkpoint: Checkpoint) -> None:
-        self.network.load_state_dict(checkpoint.part(NETWORK))
-        self.average.load_state_dict(checkpoint.part(AVERAGE))
-        restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
         self.step = checkpoint.step
 
     def _save(self) -> None:

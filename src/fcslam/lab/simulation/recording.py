@@ -10,7 +10,7 @@ import numpy as np
 
 import fcslam
 from fcslam.config import dump
-from fcslam.errors import OutputError
+from fcslam.errors import OutputError, writing
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, ray_caster
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
@@ -44,13 +44,11 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int) 
         OutputError: the folder holds something else, or cannot be written.
     """
     text = f"# What fcslam simulated here.\nfcslam: {fcslam.__version__}\nseed: {seed}\n{dump(settings)}"
-    try:
+    with writing(folder, "choose another output folder"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise OutputError(f"{folder}: is not empty; choose another place")
         write_file(folder / SETTINGS, text)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
 
 
 def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> None:

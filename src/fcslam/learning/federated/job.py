@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.config import dump
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import TrainingError, writing
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.artifacts import write_federated_artifacts
 from fcslam.learning.federated.client import RobotClient
@@ -102,12 +102,10 @@ def run_job(
 
 def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:
     """Write the settings at the end, and at the start unless an earlier start has written them."""
-    try:
+    with writing(job.output, "choose another output folder"):
         job.output.mkdir(parents=True, exist_ok=True)
         if again or not path.exists():
             path.write_text(dump(job.settings), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{job.output}: cannot be used as the output folder ({error})") from error
 
 
 def federate_locally(
