@@ -34,7 +34,7 @@ from fcslam.learning.federated.client import ClientUpdate
 from fcslam.learning.federated.client_app import build_client_app, in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
+from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
@@ -142,9 +142,9 @@ def over_a_network(
         robots(names, missing, listener.getsockname()[1]),
     ):
         end = time.monotonic() + CONNECTING_S
-        while len(grid.get_node_ids()) < len(names):
+        while len(grid.nodes()) < len(names):
             if time.monotonic() > end:
-                sys.exit(f"only {len(grid.get_node_ids())} of {len(names)} robots connected")
+                sys.exit(f"only {len(grid.nodes())} of {len(names)} robots connected")
             time.sleep(0.2)
         return train(grid, settings), peak()
 
@@ -214,7 +214,7 @@ def answer(name: str, missing: float, port: int) -> None:
     while True:
         try:
             with RobotLink(f"http://127.0.0.1:{port}", name, name) as link:
-                serve_requests(link, app, robot_context(), lambda _: None)
+                serve_requests(link, app, lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)
 

@@ -35,7 +35,7 @@ OWN = {
     "wire/keys.py": "the robot's own token",
     "cli/serving.py": "written by the training that this service started",
     "features/network_check.py": "the memory of this process",
-    "features/onnx_runtime.py": "no file",
+    "features/detector.py": "no file",
     "learning": "the folder of this user's training",
     "mission/mission_file.py": "what this process wrote",
     "page/report.py": "files of the package",

@@ -10,7 +10,7 @@ from fcslam.cloud import submaps
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
-from fcslam.lab.simulation.ground_truth import true_map
+from fcslam.lab.simulation.recording import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.submap_bytes import submap_bytes
 from fcslam.maps.fusion import fuse

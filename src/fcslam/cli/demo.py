@@ -115,9 +115,8 @@ def _prepare(output: Path) -> None:
 def _evaluate(output: Path, console: "Console") -> None:
     from fcslam.cli.evaluate.fleet_tables import show_fleet
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+    from fcslam.lab.evaluation.fleet.report import evaluate_fleet, fleet_metrics
 
     with ProgressDisplay(console) as display:
         display.start("evaluating")
@@ -131,8 +130,7 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.fleet.charts import fleet_charts
     from fcslam.lab.simulation.floorplan import PieceKind
-    from fcslam.maps.charts import Outline
-    from fcslam.maps.fleet_figure import write_figure
+    from fcslam.maps.fleet_figure import Outline, write_figure
 
     with ProgressDisplay(console) as display:
         display.start("drawing")

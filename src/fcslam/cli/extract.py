@@ -34,10 +34,9 @@ def extract(
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import changed
-    from fcslam.features.classical import OrbConfig
+    from fcslam.features.classical import OrbConfig, make_detector
     from fcslam.features.detector import OnnxConfig
-    from fcslam.features.extraction import extract_all, find_files
-    from fcslam.features.factory import make_detector
+    from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX

@@ -85,8 +85,7 @@ def local(
 
     settings = _settings(config, quick)
     require_training_libraries("flwr", extra="federated")
-    from fcslam.learning.federated.job import FederatedJob
-    from fcslam.learning.federated.local import federate_locally
+    from fcslam.learning.federated.job import FederatedJob, federate_locally
 
     console = notices()
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
@@ -122,8 +121,8 @@ def serve(
 
     settings = _settings(config, quick)
     require_training_libraries("flwr", extra="federated")
-    from fcslam.learning.federated import launch
-    from fcslam.learning.federated.job import FederatedJob
+    from fcslam.learning.federated.fleet_server import open_port, waiting
+    from fcslam.learning.federated.job import FederatedJob, run_job
     from fcslam.service.http.authentication import Authenticator, read_tokens
 
     tokens, certificate, key = find_files(credentials)
@@ -139,7 +138,8 @@ def serve(
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     with listen(host, port) as listener, ProgressDisplay(console, f"output: {job.output}") as display:
         progress, say = _callbacks(display, console, settings), once_printer(console, MAX_LINES)
-        launch.serve(job, options, listener, None if insecure else tls, authenticator, progress, say)
+        with open_port(listener, None if insecure else tls, authenticator, say) as grid:
+            run_job(job, options, progress, grid, waiting(say))
     typer.echo(str(job.output / "detector.onnx"))
 
 
@@ -168,9 +168,9 @@ def join(
     The robot runs the installed fcslam and no program of the server.
     """
     require_training_libraries("flwr", extra="federated")
-    from fcslam.learning.federated import launch
     from fcslam.learning.federated.client import RobotClient
-    from fcslam.learning.federated.fleet_robot import RobotLink
+    from fcslam.learning.federated.client_app import build_client_app
+    from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
     from fcslam.wire import keys
     from fcslam.wire.checks import check_name
 
@@ -182,9 +182,9 @@ def join(
     except PacketError as error:
         raise TrainingError(f"{error}; give another --name") from error
     found = keys.Credentials() if credentials is None else keys.read_credentials(credentials)
-    link = RobotLink(server, robot, found.token, found.ca)
     client = RobotClient(robot, images, output / "labels", compute_budget().device)
-    launch.join(link, client, once_printer(notices()))
+    with RobotLink(server, robot, found.token, found.ca) as link:
+        serve_requests(link, build_client_app(client), once_printer(notices()))
 
 
 def round_line(row: Mapping[str, str], rounds: int) -> str:

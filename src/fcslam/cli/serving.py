@@ -20,8 +20,7 @@ from fcslam.cli.training_options import LEARNING_FILE, require_training_librarie
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import load
 from fcslam.errors import FcslamError, ServiceError
-from fcslam.learning.federated.live_settings import RELEASE, FleetLearningSettings
-from fcslam.learning.federated.settings import DETECTOR
+from fcslam.learning.federated.settings import DETECTOR, RELEASE, FleetLearningSettings
 from fcslam.service.audit_log import AuditFile, AuditLog
 from fcslam.service.http.authentication import Authenticator, read_tokens
 from fcslam.service.http.events import EventStream, EventStreams

@@ -105,8 +105,7 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
     import numpy as np
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.simulation.ground_truth import write_ground_truth
-    from fcslam.lab.simulation.recording import record_robot
+    from fcslam.lab.simulation.recording import record_robot, write_ground_truth
     from fcslam.records import GroundTruth
 
     began = time.perf_counter()

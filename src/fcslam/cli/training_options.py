@@ -86,7 +86,7 @@ def learning_plan(
     from fcslam.config import load
     from fcslam.features.detector_kinds import DetectorKind
     from fcslam.learning.federated.learning_process import RobotLearningPlan
-    from fcslam.learning.federated.live_settings import RobotLearningSettings
+    from fcslam.learning.federated.settings import RobotLearningSettings
     from fcslam.records import Channel
     from fcslam.wire.http_transport import addresses
 

@@ -58,10 +58,8 @@ class Frontier(NamedTuple):
 def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -> list[Frontier]:
     """The frontiers that one of the robots can reach, that with the largest gain first.
 
-    Args:
-        occupancy: the map.
-        robots_xy: where the robots are, shape (R, 2), metres in the frame of the map.
-        radius_m: of a robot; its centre stays this far from occupied cells, and it passes no unknown cell.
+    ``robots_xy`` (R, 2) in metres, in the frame of the map. The centre of a robot stays ``radius_m`` from occupied
+    cells, and it passes no unknown cell.
     """
     free, occupied, side_m, origin = search_grid(occupancy)
     if not free.any():
@@ -107,9 +105,8 @@ class Explorer:
     def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
         """The frontier of each robot that can reach one.
 
-        Args:
-            found: of the map as it is now, with a distance for each of the robots, in their order.
-            robots: where each robot is, metres in the frame of the map.
+        The frontiers are those of the map as it is now, with a distance for each of the robots, in their order;
+        positions in metres, in the frame of the map.
         """
         for robot, at in robots.items():
             goal = self._goals.get(robot)

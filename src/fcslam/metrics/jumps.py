@@ -46,10 +46,7 @@ class Jumps:
 def find_jumps(stamps: FloatArray, poses: FloatArray, limits: JumpLimits) -> Jumps | None:
     """Find the steps of a trajectory that exceed the limits of motion.
 
-    Args:
-        stamps: shape (N,), seconds; a clock may step back.
-        poses: at the stamps, shape (N, 3), metres and radians.
-        limits: the fastest motion.
+    ``stamps`` (N,) in seconds are of a clock that may step back; ``poses`` (N, 3), metres and radians.
 
     Returns:
         The jumps; None without any.

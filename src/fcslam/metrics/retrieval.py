@@ -75,12 +75,7 @@ def recall_at(similarity: FloatArray, truth: PairTruth, k: int) -> FloatArray:
     """Recall@k of every query that has a match, shape (answerable,), in [0, 1].
 
     It is 1 if a match is among the ``k`` most similar places, and a probability in between if ties decide. Queries
-    without a match are excluded.
-
-    Args:
-        similarity: shape (Q, G).
-        truth: ground truth of the pairs.
-        k: number of retrieved places.
+    without a match are excluded. ``similarity``: shape (Q, G).
     """
     return np.array(
         [_found_within(similarity[q], truth, int(q), k) for q in np.flatnonzero(truth.answerable)], np.float64

@@ -77,10 +77,7 @@ def align(T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
 def position_errors(T_truth_map: FloatArray, T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
     """Distances (N,) in metres between true positions and estimated positions after alignment.
 
-    Args:
-        T_truth_map: the alignment, shape (3,).
-        T_truth_base: true poses, shape (N, 3).
-        T_map_base: estimated poses at the same stamps, shape (N, 3).
+    The alignment has shape (3,), the poses at the same stamps (N, 3).
     """
     moved = se2.transform(T_truth_map, T_map_base[:, :2])
     distances: FloatArray = np.linalg.norm(moved - T_truth_base[:, :2], axis=-1)
@@ -119,13 +116,6 @@ def near_pairs(
     truth: PoseTable, rng: np.random.Generator, across_robots: bool, count: int = 2000, reach_m: float = 5.0
 ) -> NDArray[np.int64]:
     """Draw up to ``count`` random pairs of rows whose true positions are less than ``reach_m`` apart.
-
-    Args:
-        truth: true poses.
-        rng: random generator.
-        across_robots: whether the pairs are of different robots, or of one robot.
-        count: largest number of pairs.
-        reach_m: largest distance.
 
     Returns:
         Shape (P, 2).

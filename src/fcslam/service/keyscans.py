@@ -10,7 +10,7 @@ from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import SPACING_M
-from fcslam.maps.closure_picture import closure_png
+from fcslam.maps.drawing import closure_png
 from fcslam.maps.palette import ROBOTS, robot_colors
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import ConstraintKind, FloatArray

@@ -11,7 +11,7 @@ import numpy as np
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
+from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.authentication import Authenticator, Role, read_tokens
@@ -74,7 +74,7 @@ class LiveFleet:
 
         def work():
             with contextlib.suppress(_EndedError), self.link(client.name) as link:
-                serve_requests(link, app or build_client_app(client), robot_context(), self._end, _end)
+                serve_requests(link, app or build_client_app(client), self._end, _end)
 
         threading.Thread(target=work, daemon=True).start()
 

@@ -12,7 +12,6 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
 from fcslam.learning.federated.held_out import judge  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
-from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
 from fcslam.learning.federated.own_examples import SPLIT_FILE, own_examples  # noqa: E402
 from fcslam.learning.federated.robot_learning import (  # noqa: E402
@@ -20,6 +19,7 @@ from fcslam.learning.federated.robot_learning import (  # noqa: E402
     LearningEndError,
     LearningRobot,
 )
+from fcslam.learning.federated.settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
 from fcslam.records import Channel, Place  # noqa: E402
 from fcslam.robot.backend import RobotBackend  # noqa: E402
 from fcslam.robot.backend_runner import InlineBackend  # noqa: E402

@@ -44,9 +44,8 @@ def fleet(
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from fcslam.cli.evaluate.fleet_tables import show_fleet
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
     from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+    from fcslam.lab.evaluation.fleet.report import evaluate_fleet, fleet_metrics
 
     with ProgressDisplay(notices()) as display:
         display.start("evaluating")
@@ -85,14 +84,9 @@ def relations(
 ) -> None:
     """Measure a run by the relations metric of Kuemmerle et al. 2009: mean, standard deviation and maximum."""
     from fcslam.cli.evaluate.fleet_tables import show_relations
-    from fcslam.lab.evaluation.fleet.relations import (
-        RelationsQuestion,
-        evaluate_relations,
-        relation_metrics,
-        write_metrics,
-    )
+    from fcslam.lab.evaluation.fleet.relations import evaluate_relations, relation_metrics, write_metrics
 
-    errors = evaluate_relations(run, reference, RelationsQuestion(across_robots, parts=parts))
+    errors = evaluate_relations(run, reference, across_robots, parts)
     show_relations(errors, "relations across robots" if across_robots else "relations")
     if csv is not None:
         write_metrics(relation_metrics(errors), csv)
@@ -153,7 +147,7 @@ def homography(
     from fcslam.lab.evaluation.detectors.homography import evaluate_homography
     from fcslam.lab.evaluation.detectors.measures import write_pairs
     from fcslam.lab.evaluation.detectors.scenes import find_scenes
-    from fcslam.metrics.framing import HomographyGroundTruth
+    from fcslam.metrics.homography import HomographyGroundTruth
 
     found = find_scenes(scenes)
     kinds = [EvaluatedDetectorKind(one) for one in detector or () if one in list(EvaluatedDetectorKind)]
@@ -212,8 +206,7 @@ def places(
     from fcslam.cli.evaluate.vision_tables import SEED, show_places
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.places.features import choose_features, describe_sets, describe_training
-    from fcslam.lab.evaluation.places.figures import curves_figure, save
-    from fcslam.lab.evaluation.places.report import evaluate_set, write_results
+    from fcslam.lab.evaluation.places.report import curves_figure, evaluate_set, save, write_results
     from fcslam.lab.evaluation.places.scoring import choose_scorers
     from fcslam.lab.evaluation.places.verification import PairVerifier
     from fcslam.places.vocabulary import Strategy, VocabularyConfig

@@ -7,13 +7,11 @@ import typer
 from rich.table import Table
 
 from fcslam.cli.output import answers
-from fcslam.lab.evaluation.fleet.closure_stages import BOTH, LIKE_HEADING_DEG
-from fcslam.lab.evaluation.fleet.closures import ClosureScope
+from fcslam.lab.evaluation.fleet.closures import BOTH, LIKE_HEADING_DEG, ClosureScope
 from fcslam.lab.evaluation.fleet.report import FleetReport
-from fcslam.metrics.closures import REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
+from fcslam.metrics.closures import EVERY_M, RADIUS_M, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
 from fcslam.metrics.grid import TOLERANCE_M
 from fcslam.metrics.relations import RelationErrors
-from fcslam.metrics.revisits import EVERY_M, RADIUS_M
 from fcslam.records import ClosureStatus
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}

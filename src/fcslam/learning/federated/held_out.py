@@ -18,8 +18,7 @@ from fcslam.features.detector import ImageFeatures, OnnxConfig
 from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
-from fcslam.places.hypotheses import rigid_hypotheses
-from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
+from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M, rigid_hypotheses
 from fcslam.records import Codes, FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")

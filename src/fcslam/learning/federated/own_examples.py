@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.geometry import se2
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair
 from fcslam.learning.federated.held_out import HeldOutPairs
-from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair
+from fcslam.learning.federated.settings import HeldOutSettings, RobotLearningSettings
 from fcslam.learning.revisits import Keyframe, revisits_in_map
 from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
@@ -35,12 +35,7 @@ class OwnExamples:
 
 
 def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
-    """Read the keyframes of a robot and find what it saw again.
-
-    Args:
-        folder: of the keyframes.
-        settings: of the robot.
-    """
+    """Read the keyframes of a robot and find what it saw again."""
     kept = read_keyframes(folder, MOST_KEYFRAMES)
     version = kept[-1].detector_version if kept else ""
     shown = [(frame, picture) for frame in kept if (picture := _picture(frame, version)) is not None]

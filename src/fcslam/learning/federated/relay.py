@@ -20,9 +20,7 @@ Operation = Annotated[str, InPath(pattern="^(next|alive|reply/[0-9]{1,18})$")]
 def learning_router(state: ServiceState, listener: Path) -> APIRouter:
     """Routes for robots that learn, which have the tokens and limits of the service.
 
-    Args:
-        state: of the service.
-        listener: Unix socket of the process in which the fleet learns; only the user of the service can open it.
+    ``listener`` is the Unix socket of the process in which the fleet learns; only the user of the service can open it.
     """
     router = APIRouter(include_in_schema=False)
     limits = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)

@@ -7,9 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.codec import record_to_weights, weights_to_record
 from fcslam.learning.federated.flower import FedAvg, FedMedian, Message, MetricRecord, RecordDict
-from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, EXAMPLES_KEY, METRICS_KEY
+from fcslam.learning.federated.messages import (
+    ARRAYS_KEY,
+    CONFIG_KEY,
+    EXAMPLES_KEY,
+    METRICS_KEY,
+    record_to_weights,
+    weights_to_record,
+)
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, trained_names, weights_error
 
@@ -42,10 +48,8 @@ class Aggregator:
     def aggregate(self, round_number: int, updates: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
         """The next global weights.
 
-        Args:
-            round_number: from 1, as Flower counts.
-            updates: the robots' replies, with the weights in them; these have passed screening.
-            old: the weights from which the robots trained.
+        ``round_number`` counts from 1, as Flower does. ``updates`` are the robots' replies that passed screening, with
+        the weights in them; they trained from ``old``.
 
         Raises:
             TrainingError: the strategy gives weights that are not finite or do not fit the network.
