@@ -1,4 +1,4 @@
-"""Rooms import only rooms below them, and `import fcslam` is light."""
+"""Rooms import only rooms above them in the table of the architecture, and `import fcslam` is light."""
 
 import ast
 import json
