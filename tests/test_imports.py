@@ -103,7 +103,7 @@ def test_every_room_is_known():
     assert rooms - {"__init__"} <= set(ROOMS)
 
 
-def test_rooms_import_only_rooms_below():
+def test_rooms_import_only_rooms_above():
     found = [
         violation
         for path in sorted(PACKAGE.rglob("*.py"))
