@@ -1,6 +1,5 @@
 """`fcslam localize`: a robot and a finished map in, the poses of the robot in the map out."""
 
-import gc
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ from fcslam.cli.mission_options import ConfigFiles, mission_config
 from fcslam.cli.options import Credentials, Force, Quiet, ServerUrl, access, output_option
 from fcslam.cli.output import RUNS, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
-from fcslam.cli.warm_up import compiled
+from fcslam.cli.warm_up import compiled, copied_process
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,11 +92,9 @@ def localize(
     if live:
         from fcslam.live.localized_robot import LocalizedRobot
         from fcslam.live.records import Wiring
-        from fcslam.robot.backend_runner import copied_worker
 
         robot = live_source(source, sensors, ros_parameters, use_sim_time)
-        gc.freeze()
-        with copied_worker() as worker:
+        with copied_process(settings.robot) as worker:
             start = partial(
                 LocalizedRobot,
                 map=map_path,

@@ -1,6 +1,5 @@
 """`fcslam play`: a recording played to a cloud service, as if its robot drove now."""
 
-import gc
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, acc
 from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.training_options import Learn, learning_plan
-from fcslam.cli.warm_up import compiled
+from fcslam.cli.warm_up import compiled, copied_process
 from fcslam.errors import InputError, PacketError, SourceError
 
 if TYPE_CHECKING:
@@ -64,7 +63,6 @@ def play(
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
-    from fcslam.robot.backend_runner import copied_worker
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
@@ -82,9 +80,8 @@ def play(
     print_notes(console, survey.notes)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
-    gc.freeze()
     with (
-        copied_worker() as worker,
+        copied_process(settings.robot) as worker,
         closing(
             Robot(
                 opened.name,

@@ -1,6 +1,5 @@
 """`fcslam robot`: a live robot, which maps and sends to a cloud service."""
 
-import gc
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +12,7 @@ from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, acc
 from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
 from fcslam.cli.training_options import Learn, learning_plan
+from fcslam.cli.warm_up import copied_process
 from fcslam.errors import InputError
 
 
@@ -45,7 +45,6 @@ def robot(
     """Map a live robot, alone or with the fleet of a cloud service."""
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
-    from fcslam.robot.backend_runner import copied_worker
     from fcslam.storage.files import keep_private
 
     keep_private()
@@ -57,8 +56,7 @@ def robot(
     live = live_source(address, sensors, ros_parameters, use_sim_time)
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
-    gc.freeze()
-    with copied_worker() as worker:
+    with copied_process(settings.robot) as worker:
         wiring = Wiring(worker, keeps_keyframes=learn)
         start = partial(Robot, server=cloud, state=state, config=settings, floor=floor, wiring=wiring)
         drive_live(live, start, output, notices(quiet), plan)
