@@ -67,14 +67,7 @@ class Instance:
         hooks: Hooks,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take the name.
-
-        Args:
-            registry: of all instances.
-            name: of this one.
-            most_missions: how many workers it runs.
-            hooks: what it calls.
-            clock: seconds.
+        """Take the name; ``most_missions``: how many workers it runs.
 
         Raises:
             ServiceError: another instance has this name.
