@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
-from fcslam.cli.mission_options import SettingsFiles, chosen_settings
-from fcslam.cli.options import examples, output_option
+from fcslam.cli.options import SettingsFiles, chosen_settings, examples, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,

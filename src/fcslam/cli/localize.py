@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Credentials, Force, Quiet, ServerUrl, access, output_option
+from fcslam.cli.options import ConfigFiles, Credentials, Force, Quiet, ServerUrl, access, mission_config, output_option
 from fcslam.cli.output import RUNS, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
 from fcslam.cli.warm_up import compiled

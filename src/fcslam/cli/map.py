@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFiles, mission_config, with_starts
-from fcslam.cli.options import Force, Quiet, WorkersOption, output_option
+from fcslam.cli.options import ConfigFiles, Force, Quiet, WorkersOption, mission_config, output_option, with_starts
 from fcslam.cli.output import RUNS, answers, new_folder, notices
 from fcslam.cli.recordings import Sensors, bag_options, open_recordings, print_faults, print_notes
 from fcslam.cli.show import Live, live_page

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.live import is_live
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access
+from fcslam.cli.options import Budget, ConfigFiles, Credentials, Floor, Quiet, ServerUrl, access, mission_config
 from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.training_options import Learn, learning_plan

@@ -8,8 +8,17 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access, output_option
+from fcslam.cli.options import (
+    Budget,
+    ConfigFiles,
+    Credentials,
+    Floor,
+    Quiet,
+    ServerUrl,
+    access,
+    mission_config,
+    output_option,
+)
 from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
 from fcslam.cli.training_options import Learn, learning_plan

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import SettingsFiles, chosen_settings
-from fcslam.cli.options import output_option
+from fcslam.cli.options import SettingsFiles, chosen_settings, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,
