@@ -17,7 +17,7 @@ from fcslam.lab.simulation.options import Scanner
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 
 RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
 ABOUT = "about"
@@ -39,6 +39,7 @@ def demo(
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
+    from fcslam.lab.simulation.engine import gl_context, mujoco
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
@@ -53,7 +54,10 @@ def demo(
         lidar=SCANNERS[Scanner.LD19],
         camera=camera,
     )
-    _check_libraries(settings)
+    if camera is None:  # before an earlier demo is removed: everything can run
+        mujoco()
+    else:
+        gl_context(16, 16).free()
     fleet = simulate_fleet(settings, seed)
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed)
@@ -75,16 +79,6 @@ def demo(
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
         for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
             typer.echo(f"{content}: {output / name}")
-
-
-def _check_libraries(settings: "SimulationSettings") -> None:
-    """Check before the work, and before an earlier demo is removed, that everything can run."""
-    from fcslam.lab.simulation.engine import gl_context, mujoco
-
-    if settings.camera:
-        gl_context(16, 16).free()
-    else:
-        mujoco()
 
 
 def _prepare(output: Path) -> None:

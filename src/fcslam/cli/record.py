@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from itertools import islice
@@ -95,11 +94,8 @@ def _record(
                 timer.start()
             counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
         timer.cancel()
-    typer.echo(f"{_listed(counts)}: {output}")
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"
+    listed = ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"
+    typer.echo(f"{listed}: {output}")
 
 
 def _convert(log: str, output: Path, options: "BagOptions | None", force: bool, console: "Console") -> None:

@@ -141,19 +141,10 @@ def refused_packets(store: MissionStore, robot: str) -> list[PacketRefusal]:
 
 
 def _check_rate(rate: RateLimit, robot: str, body: bytes) -> None:
-    """Refuse (HTTPException 413, 429) more than the robot may send."""
-    size = _unpacked_size(body)
+    """Refuse more than the robot may send (HTTPException 413, 429), and what is not a batch (PacketError)."""
+    size = sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(body))  # unpacking takes time
     if size > rate.largest:
         raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
     wait_s = rate.wait_s(robot, size)
     if wait_s > 0.0:
         raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
-
-
-def _unpacked_size(body: bytes) -> int:
-    """Size of a batch for the rate limit: the unpacked size, because unpacking takes time.
-
-    Raises:
-        PacketError: it is not a batch.
-    """
-    return sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(body))
