@@ -11,8 +11,8 @@ from fcslam.records import frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
 from fcslam.runs.map_files import area_of, map_stem, parse_map
+from fcslam.wire.fleet_client import MapClient, ServedMap
 from fcslam.wire.http_transport import Server, addresses
-from fcslam.wire.map_client import MapClient, ServedMap
 
 _ATTEMPTS: Final = 3
 """The cloud may draw its maps again while the robot reads them."""

@@ -175,13 +175,11 @@ class HttpClient:
         path: str,
         content: bytes | None = None,
         headers: Mapping[str, str] | None = None,
-        accept: str = MEDIA_TYPE,
         passes: Collection[int] = (),
     ) -> "httpx.Response":
         """The response, if its status is 200 or one of ``passes``; raises as ``BatchTransport.state``."""
         with self._explained():
-            asked = {"Accept": accept, **(headers or {})}
-            response = self._client.request(method, path, content=content, headers=asked)
+            response = self._client.request(method, path, content=content, headers=headers)
         code = response.status_code
         if code == 200 or code in passes:
             return response
@@ -245,12 +243,12 @@ class HttpTransport(HttpClient):
             robot: name of the robot.
             agent: random identifier that distinguishes two processes of the same name.
         """
-        super().__init__(url, token, ca, own, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE})
+        super().__init__(url, token, ca, own, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE})
         self._robot = quote(robot, safe="")
 
     def state(self) -> CloudState:
         """As in BatchTransport."""
-        response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
+        response = self._ask("GET", f"robots/{self._robot}/state")
         with self._reading():
             state = response.json()
             expected = {int(epoch): int(sequence) for epoch, sequence in state["next"].items()}
@@ -282,7 +280,7 @@ class HttpTransport(HttpClient):
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """As in BatchTransport."""
-        return self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*").content
+        return self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}").content
 
 
 class InstancesTransport:
