@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -170,8 +171,8 @@ def join(
     from fcslam.learning.federated import launch
     from fcslam.learning.federated.client import RobotClient
     from fcslam.learning.federated.fleet_robot import RobotLink
-    from fcslam.wire import keys
     from fcslam.wire.checks import check_name
+    from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
 
     if not images.is_dir():
         raise TrainingError(f"{images}: is not a folder; give the folder of the robot's images")
@@ -180,8 +181,8 @@ def join(
         check_name(robot, "robot")
     except PacketError as error:
         raise TrainingError(f"{error}; give another --name") from error
-    found = keys.Credentials() if credentials is None else keys.read_credentials(credentials)
-    link = RobotLink(server, robot, found.token, found.ca)
+    found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
+    link = RobotLink(server, robot, replace(found, own=None))
     client = RobotClient(robot, images, output / "labels", compute_budget().device)
     launch.join(link, client, once_printer(notices()))
 

@@ -106,9 +106,9 @@ def access(server: str | None, credentials: Path | None, budget_kBps: float | No
         InputError: the credentials cannot be read.
     """
     from fcslam.wire.http_transport import Server
-    from fcslam.wire.keys import Credentials, read_credentials
+    from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
 
-    found = Credentials() if credentials is None else read_credentials(credentials)
+    found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
     if server is None:
         return None
     own = found.own if server.startswith("https:") else None  # a certificate is shown in TLS only

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Final, TypeVar
 from urllib.parse import quote
 
@@ -31,6 +30,7 @@ from fcslam.learning.federated.flower import (
 )
 from fcslam.learning.federated.replies import printable_line
 from fcslam.wire.http_transport import HttpClient
+from fcslam.wire.keys import NO_CREDENTIALS, Credentials
 
 ALIVE_S: Final = 15.0
 """Time between two signs of life; a quarter of that after which a robot counts as gone."""
@@ -47,19 +47,12 @@ class RobotLink(HttpClient):
     """The connection of a robot with the service that it learns at.
 
     Args:
-        url, token, ca, own: as in ``HttpClient``.
+        url, shown: as in ``HttpClient``.
         robot: name of the robot.
     """
 
-    def __init__(
-        self,
-        url: str,
-        robot: str,
-        token: str | None = None,
-        ca: Path | None = None,
-        own: tuple[Path, Path] | None = None,
-    ) -> None:
-        super().__init__(url, token, ca, own)
+    def __init__(self, url: str, robot: str, shown: Credentials = NO_CREDENTIALS) -> None:
+        super().__init__(url, shown)
         self._path = f"robots/{quote(robot, safe='')}/learning/"
         self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 

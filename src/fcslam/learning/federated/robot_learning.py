@@ -96,16 +96,8 @@ class LearningRobot:
 class _IdleLink(RobotLink):
     """Asks for requests only while the robot is idle and has something to learn from."""
 
-    def __init__(
-        self,
-        robot: LearningRobot,
-        url: str,
-        name: str,
-        token: str | None,
-        ca: Path | None,
-        own: tuple[Path, Path] | None,
-    ) -> None:
-        super().__init__(url, name, token, ca, own)
+    def __init__(self, robot: LearningRobot, url: str, name: str, shown: Credentials) -> None:
+        super().__init__(url, name, shown)
         self._robot = robot
 
     def fetch(self) -> tuple[int, bytes] | None:
@@ -180,7 +172,7 @@ def main(arguments: Sequence[str]) -> int:
         client = RobotClient(given.name, given.keyframes, given.cache)
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
-        link = partial(_IdleLink, robot, given.server, given.name, shown.token, shown.ca, shown.own)
+        link = partial(_IdleLink, robot, given.server, given.name, shown)
         tell(f"learning ends: {learn(link, client, idle)}")
     except (FcslamError, OSError) as error:
         tell(f"learning ends: {error}")
