@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fcslam.live.records import RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.robot.frontend import RobotConfig
-    from fcslam.sources import Source, Survey
+    from fcslam.sources import Survey
 
 
 def play(
@@ -61,6 +61,9 @@ def play(
     quiet: Quiet = False,
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.live.playback import PlaybackPace
+    from fcslam.live.playback import play as play_records
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
     from fcslam.robot.backend_runner import copied_worker
@@ -73,7 +76,7 @@ def play(
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
-    pace = _speed(speed)
+    pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     opened = open_recording(recording, bag_options(sensors))
     _check_name(opened.name)
     survey = opened.survey()
@@ -82,50 +85,24 @@ def play(
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
     gc.freeze()
-    with (
-        copied_worker() as worker,
-        closing(
-            Robot(
-                opened.name,
-                server=cloud,
-                state=state,
-                config=settings,
-                own_map=False,
-                floor=floor,
-                wiring=Wiring(worker, playback=Playback(fingerprint, resume), keeps_keyframes=learn),
-            )
-        ) as live,
-    ):
-        _play(live, opened, survey.scan_count, pace, plan, state, console)
-        print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
-        _report(live, state, cloud.url)
-
-
-def _play(
-    live: "Robot",
-    recording: "Source",
-    scans: int,
-    speed: float | None,
-    plan: "RobotLearningPlan | None",
-    state: Path,
-    console: "Console",
-) -> None:
-    """Play a recording of ``scans`` scans to its robot, which learns afterwards if there is a plan for it."""
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.live.playback import PlaybackPace, play
-
-    pace = PlaybackPace(speed, time.monotonic, time.sleep)
-    try:
-        with compiled(console), _interruptible(), ProgressDisplay(console) as display:
-            watch = _watch(display, console, scans)
-            stay = None if plan is None else partial(_learn, plan, console, display, watch)
-            play(live, recording.records(), pace, watch, stay)
-    except KeyboardInterrupt:
-        left = live.status().waiting
-        print_line(
-            console, f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume"
+    with copied_worker() as worker:
+        wiring = Wiring(worker, playback=Playback(fingerprint, resume), keeps_keyframes=learn)
+        robot = Robot(
+            opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor, wiring=wiring
         )
-        raise
+        with closing(robot):
+            try:
+                with compiled(console), _interruptible(), ProgressDisplay(console) as display:
+                    watch = _watch(display, console, survey.scan_count)
+                    stay = None if plan is None else partial(_learn, plan, console, display, watch)
+                    play_records(robot, opened.records(), pace, watch, stay)
+            except KeyboardInterrupt:
+                left = robot.status().waiting
+                size = f"{left.packets} packets ({left.bytes / 1e3:.0f} kB)"
+                print_line(console, f"{size} wait in {state}; to continue, give --resume")
+                raise
+            print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry_jumps)})
+            _report(robot, state, cloud.url)
 
 
 def _learn(
