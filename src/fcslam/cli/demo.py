@@ -37,6 +37,7 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
+    from fcslam.cli.evaluate.fleet_tables import report_fleet
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
     from fcslam.lab.simulation.engine import gl_context, mujoco
@@ -73,7 +74,8 @@ def demo(
     with live_page(output / RUN) if live else nullcontext() as page:
         map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
         begin(3, "evaluate: compare with the truth")
-        _evaluate(output, console)
+        report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console, explained=False)
+        typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
         begin(4, "draw")
         _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
@@ -104,21 +106,6 @@ def _prepare(output: Path) -> None:
                 place.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
-
-
-def _evaluate(output: Path, console: "Console") -> None:
-    from fcslam.cli.evaluate.fleet_tables import show_fleet
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
-    from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
-
-    with ProgressDisplay(console) as display:
-        display.start("evaluating")
-        report = evaluate_fleet(output / RUN, output / RECORDINGS)
-        write_metrics(fleet_metrics(report), output / TABLE)
-    show_fleet(report, explained=False)
-    typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
 
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:

@@ -72,6 +72,7 @@ Credentials = Annotated[
         "if it is not one of this system), client.pem and client.key (the robot's certificate).",
     ),
 ]
+STATE = typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it.")
 Budget = Annotated[
     float | None,
     typer.Option(

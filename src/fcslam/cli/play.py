@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.live import is_live
-from fcslam.cli.options import Budget, ConfigFiles, Credentials, Floor, Quiet, ServerUrl, access, mission_config
+from fcslam.cli.options import STATE, Budget, ConfigFiles, Credentials, Floor, Quiet, ServerUrl, access, mission_config
 from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.training_options import Learn, learning_plan
@@ -41,10 +41,7 @@ def play(
     server: ServerUrl = None,
     credentials: Credentials = None,
     budget_kBps: Budget = None,
-    state: Annotated[
-        Path,
-        typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
-    ],
+    state: Annotated[Path, STATE],
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,

@@ -2,14 +2,19 @@
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import typer
+from rich.console import Console
 from rich.table import Table
 
 from fcslam.cli.output import answers
+from fcslam.cli.progress import ProgressDisplay
 from fcslam.lab.evaluation.fleet.closure_stages import BOTH, LIKE_HEADING_DEG
 from fcslam.lab.evaluation.fleet.closures import ClosureScope
-from fcslam.lab.evaluation.fleet.report import FleetReport
+from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
+from fcslam.lab.evaluation.fleet.relations import write_metrics
+from fcslam.lab.evaluation.fleet.report import FleetReport, evaluate_fleet
 from fcslam.metrics.closures import REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
 from fcslam.metrics.grid import TOLERANCE_M
 from fcslam.metrics.relations import RelationErrors
@@ -19,13 +24,18 @@ from fcslam.records import ClosureStatus
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
-def show_fleet(report: FleetReport, explained: bool = True) -> None:
-    """Print the report as tables and, if ``explained``, the definitions behind them."""
+def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console, explained: bool = True) -> None:
+    """Compare a run with the truth. Print tables and, if ``explained``, what they mean; write the numbers to ``csv``."""
+    with ProgressDisplay(notices) as display:
+        display.start("evaluating")
+        report = evaluate_fleet(run, truth)
     console, closures = answers(), (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
     for line in (*_findings(report), *(_explanations(report) if explained else ())):
         typer.echo(line)
+    if csv is not None:
+        write_metrics(fleet_metrics(report), csv)
 
 
 def _percent(share: float) -> str:

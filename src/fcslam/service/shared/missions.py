@@ -231,7 +231,7 @@ class SharedMissions:
             self._instance.look()
         known = self._instance.known.get(name)
         if known is None:
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self._instance.known)}")
+            raise UnknownMissionError(name, self._instance.known)
         return known
 
     def _open_here(self, name: str) -> SharedMission:
