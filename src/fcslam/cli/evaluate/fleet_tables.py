@@ -25,7 +25,7 @@ _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
 def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console, explained: bool = True) -> None:
-    """Compare a run with the truth. Print tables and, if ``explained``, what they mean; write the numbers to ``csv``."""
+    """Compare a run with the truth: print tables, and what they mean if ``explained``; write the numbers to ``csv``."""
     with ProgressDisplay(notices) as display:
         display.start("evaluating")
         report = evaluate_fleet(run, truth)
