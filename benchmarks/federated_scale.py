@@ -42,6 +42,7 @@ from fcslam.learning.federated.initial_weights import read_detector_weights
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
+from fcslam.wire.keys import Credentials
 
 DETECTOR = common.REPOSITORY / "src/fcslam/features/networks/detector.onnx"
 PROCESSES = 4
@@ -213,7 +214,7 @@ def answer(name: str, missing: float, port: int) -> None:
     app = build_client_app(client)
     while True:
         try:
-            with RobotLink(f"http://127.0.0.1:{port}", name, name) as link:
+            with RobotLink(f"http://127.0.0.1:{port}", name, Credentials(name)) as link:
                 serve_requests(link, app, lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)

@@ -17,7 +17,7 @@ from fcslam.lab.simulation.options import Scanner
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 
 RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
 ABOUT = "about"
@@ -37,8 +37,10 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
+    from fcslam.cli.evaluate.fleet_tables import report_fleet
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
+    from fcslam.lab.simulation.engine import gl_context, mujoco
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
@@ -53,7 +55,10 @@ def demo(
         lidar=SCANNERS[Scanner.LD19],
         camera=camera,
     )
-    _check_libraries(settings)
+    if camera is None:  # before an earlier demo is removed: everything can run
+        mujoco()
+    else:
+        gl_context(16, 16).free()
     fleet = simulate_fleet(settings, seed)
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed)
@@ -69,22 +74,13 @@ def demo(
     with live_page(output / RUN) if live else nullcontext() as page:
         map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
         begin(3, "evaluate: compare with the truth")
-        _evaluate(output, console)
+        report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console, explained=False)
+        typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
         begin(4, "draw")
         _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
         for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
             typer.echo(f"{content}: {output / name}")
-
-
-def _check_libraries(settings: "SimulationSettings") -> None:
-    """Check before the work, and before an earlier demo is removed, that everything can run."""
-    from fcslam.lab.simulation.engine import gl_context, mujoco
-
-    if settings.camera:
-        gl_context(16, 16).free()
-    else:
-        mujoco()
 
 
 def _prepare(output: Path) -> None:
@@ -110,20 +106,6 @@ def _prepare(output: Path) -> None:
                 place.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
-
-
-def _evaluate(output: Path, console: "Console") -> None:
-    from fcslam.cli.evaluate.fleet_tables import show_fleet
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet, fleet_metrics
-
-    with ProgressDisplay(console) as display:
-        display.start("evaluating")
-        report = evaluate_fleet(output / RUN, output / RECORDINGS)
-        write_metrics(fleet_metrics(report), output / TABLE)
-    show_fleet(report, explained=False)
-    typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
 
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
-from fcslam.cli.mission_options import SettingsFiles, chosen_settings
-from fcslam.cli.options import examples, output_option
+from fcslam.cli.options import SettingsFiles, chosen_settings, examples, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,
@@ -171,8 +171,8 @@ def join(
     from fcslam.learning.federated.client import RobotClient
     from fcslam.learning.federated.client_app import build_client_app
     from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
-    from fcslam.wire import keys
     from fcslam.wire.checks import check_name
+    from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
 
     if not images.is_dir():
         raise TrainingError(f"{images}: is not a folder; give the folder of the robot's images")
@@ -181,9 +181,9 @@ def join(
         check_name(robot, "robot")
     except PacketError as error:
         raise TrainingError(f"{error}; give another --name") from error
-    found = keys.Credentials() if credentials is None else keys.read_credentials(credentials)
+    found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
     client = RobotClient(robot, images, output / "labels", compute_budget().device)
-    with RobotLink(server, robot, found.token, found.ca) as link:
+    with RobotLink(server, robot, replace(found, own=None)) as link:
         serve_requests(link, build_client_app(client), once_printer(notices()))
 
 

@@ -1,25 +1,21 @@
 """Ports on which commands listen, and their certificates."""
 
 import os
+import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from fcslam.errors import ServiceError
 
-if TYPE_CHECKING:
-    import socket
 
-
-def listen(host: str, port: int) -> "socket.socket":
+def listen(host: str, port: int) -> socket.socket:
     """Listen on an address; port 0 is a free one.
 
     Raises:
         ServiceError: the port is in use, or the address is not of this machine.
     """
-    import socket
-
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=512)

@@ -8,20 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Credentials, Force, Quiet, ServerUrl, access, output_option
+from fcslam.cli.options import ConfigFiles, Credentials, Force, Quiet, ServerUrl, access, mission_config, output_option
 from fcslam.cli.output import RUNS, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
 from fcslam.cli.warm_up import compiled, copied_process
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission.localization import LocalizationProgress
     from fcslam.runs import Run
-    from fcslam.wire.http_transport import Server
 
 
 def localize(
@@ -87,8 +83,12 @@ def localize(
     if live and update:
         raise InputError("--update draws what a recording saw; record the drive, and localize the recording")
     if cloud is not None:
+        from fcslam.live.served_map import fetch_maps
+
         keep_private()
-        _fetch(map_path, cloud, console)
+        trouble = fetch_maps(map_path, cloud)
+        copied = f"copied the maps of {cloud.url} to {map_path}"
+        print_line(console, f"{trouble}; the robot uses the earlier copy in {map_path}" if trouble else copied)
     if live:
         from fcslam.live.localized_robot import LocalizedRobot
         from fcslam.live.records import Wiring
@@ -123,15 +123,6 @@ def localize(
         run.save(output, force)
     print_faults(console, {recording.name: recording.faults})
     _report(run, recording.name, output)
-
-
-def _fetch(folder: Path, server: "Server", console: "Console") -> None:
-    """Copy the maps of the cloud to ``folder``, or say why an earlier copy is used."""
-    from fcslam.live.served_map import fetch_maps
-
-    trouble = fetch_maps(folder, server)
-    copied = f"copied the maps of {server.url} to {folder}"
-    print_line(console, f"{trouble}; the robot uses the earlier copy in {folder}" if trouble else copied)
 
 
 def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationProgress], None]":

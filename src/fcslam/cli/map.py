@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFiles, mission_config, with_starts
-from fcslam.cli.options import Force, Quiet, WorkersOption, output_option
+from fcslam.cli.options import ConfigFiles, Force, Quiet, WorkersOption, mission_config, output_option, with_starts
 from fcslam.cli.output import RUNS, answers, new_folder, notices
 from fcslam.cli.recordings import Sensors, bag_options, open_recordings, print_faults, print_notes
 from fcslam.cli.show import Live, live_page
@@ -225,6 +224,7 @@ def _report(
 
     from fcslam.anchoring.anchors import anchoring_lines
     from fcslam.cloud.sessions import robot_and_epoch
+    from fcslam.metrics.jumps import find_jumps
 
     values = {name: metric.value for name, metric in run.metrics.items()}
     has_floors = any(trajectory.floor for trajectory in run.trajectories.values())
@@ -254,7 +254,10 @@ def _report(
                 why = f"the clock stepped back; this session begins at {begin_s:.3f} s"
             typer.echo(f"{session.robot}: {why}")
         ends[robot] = session.stamps[-1]
-    _print_jumps(run, settings)
+    for trajectory in run.trajectories.values():
+        jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
+        if jumps is not None:
+            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
     maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:
         typer.echo(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
@@ -264,16 +267,6 @@ def _report(
         typer.echo(line)
     for name in sorted(name for name in run.map_files if name.endswith(".png")):
         typer.echo(f"map: {output / name}")
-
-
-def _print_jumps(run: "Run", settings: "MissionConfig") -> None:
-    """Warn of every trajectory with steps that no robot can make."""
-    from fcslam.metrics.jumps import find_jumps
-
-    for trajectory in run.trajectories.values():
-        jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
-        if jumps is not None:
-            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
 
 
 def _print_separations(run: "Run") -> None:

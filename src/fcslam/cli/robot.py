@@ -7,8 +7,18 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Budget, Credentials, Floor, Quiet, ServerUrl, access, output_option
+from fcslam.cli.options import (
+    STATE,
+    Budget,
+    ConfigFiles,
+    Credentials,
+    Floor,
+    Quiet,
+    ServerUrl,
+    access,
+    mission_config,
+    output_option,
+)
 from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
 from fcslam.cli.training_options import Learn, learning_plan
@@ -29,10 +39,7 @@ def robot(
     server: ServerUrl = None,
     credentials: Credentials = None,
     budget_kBps: Budget = None,
-    state: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
-    ] = None,
+    state: Annotated[Path | None, STATE] = None,
     output: Annotated[Path | None, output_option("Run folder, with the robot's own map.", RUNS)] = None,
     floor: Floor = "",
     config: ConfigFiles = None,

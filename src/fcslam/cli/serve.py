@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet, WorkersOption
+from fcslam.cli.options import ConfigFiles, Quiet, WorkersOption, mission_config
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 

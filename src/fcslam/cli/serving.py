@@ -21,7 +21,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import load
 from fcslam.errors import FcslamError, ServiceError
 from fcslam.learning.federated.settings import DETECTOR, RELEASE, FleetLearningSettings
-from fcslam.service.audit_log import AuditFile, AuditLog
+from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.authentication import Authenticator, read_tokens
 from fcslam.service.http.events import EventStream, EventStreams
 from fcslam.service.http.limits import RateLimit
@@ -77,8 +77,9 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
         return Supervisor(folder.path, events.publish, command)
 
     missions = Missions(data, config, time.monotonic, time.time, launch)
-    audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
-    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, data / "learning")
+    return ServiceState(
+        missions, authenticator, RateLimit(time.monotonic), events, AuditFile(data / "audit.jsonl"), data / "learning"
+    )
 
 
 def shared_state(
@@ -115,9 +116,8 @@ def shared_state(
         events = EventStreams(lambda: missions.open_mission.name)
         hooks = Hooks(launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM))
         missions = SharedMissions(data, config, server, name, missions_here, robots_here, hooks)
-        log = AuditLog(audit, time.time)
         missions.closing = opened.pop_all().close
-        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log)
+        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit)
 
 
 def _limit(variable: str, least: int, otherwise: int) -> int:

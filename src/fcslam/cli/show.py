@@ -7,6 +7,7 @@ import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from socket import socket
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,12 +20,9 @@ from fcslam.cli.warm_up import compiled
 from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from socket import socket
-
     from rich.console import Console
 
     from fcslam.page.live_map import LiveMap
-    from fcslam.page.shown_run import ShownRun
 
 LARGEST_BYTES = 2 * 2**30
 """Largest total size of the files of a run folder: the page's server holds most of them in memory."""
@@ -53,14 +51,21 @@ def show(
     force: Force = False,
 ) -> None:
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
+    from fcslam.page.report import report_html
     from fcslam.page.shown_run import ShownRun
+    from fcslam.storage.files import write_file
 
     if html is not None and html.exists() and not (force and html.is_file()):
         raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
     console = notices()
     with _run_folder(run, console) as folder, ShownRun(folder, folder.resolve().name) as shown:
         if html is not None:
-            _write_report(shown, html, run)
+            content = report_html(shown).encode()
+            try:
+                write_file(html, content)
+            except OSError as error:
+                raise OutputError(f"{html}: cannot be written ({error})") from error
+            typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
             return
         from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
 
@@ -113,7 +118,7 @@ def live_page(run: Path) -> "Iterator[LiveMap]":
                 signal.pause()
 
 
-def _announce(what: str, listening: "socket", open_browser: bool | None) -> None:
+def _announce(what: str, listening: socket, open_browser: bool | None) -> None:
     address = f"http://{HOST}:{listening.getsockname()[1]}/"
     typer.echo(f"{what} at {address}")
     if open_browser is None:
@@ -121,15 +126,3 @@ def _announce(what: str, listening: "socket", open_browser: bool | None) -> None
         open_browser = sys.platform == "darwin" or bool(has_display)
     if open_browser:
         webbrowser.open(address)
-
-
-def _write_report(shown: "ShownRun", html: Path, run: Path) -> None:
-    from fcslam.page.report import report_html
-    from fcslam.storage.files import write_file
-
-    content = report_html(shown).encode()
-    try:
-        write_file(html, content)
-    except OSError as error:
-        raise OutputError(f"{html}: cannot be written ({error})") from error
-    typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")

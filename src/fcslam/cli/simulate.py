@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import chosen_settings
-from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, output_option
+from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, chosen_settings, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
 from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import SettingsFiles, chosen_settings
-from fcslam.cli.options import output_option
+from fcslam.cli.options import SettingsFiles, chosen_settings, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,
@@ -45,8 +44,9 @@ def train(
 ) -> None:
     """Train a detector of keypoints with 256-bit descriptors on images without labels."""
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.learning.settings import TrainingSettings
 
-    settings = _settings(config, quick)
+    settings = chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), config)
     require_training_libraries()
     from fcslam.learning.artifacts import write_training_artifacts
     from fcslam.learning.stages import train_detector
@@ -72,12 +72,6 @@ def train(
     held_out = len(found.held_out) if found.are_held_out else 0
     seconds, images_read = time.perf_counter() - began, len(found.train)
     print_line(console, f"{seconds:.0f} s; {images_read} images, {held_out} held out, {found.skipped} left out")
-
-
-def _settings(chosen: list[str] | None, quick: bool) -> "TrainingSettings":
-    from fcslam.learning.settings import TrainingSettings
-
-    return chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), chosen)
 
 
 def _start_network(

@@ -151,26 +151,22 @@ class DaskCluster:
 
     async def _connect(self) -> None:
         from distributed import Client
+        from distributed.security import Security
 
+        try:  # TLS as Dask is configured (``distributed.comm.tls``)
+            security = Security(require_encryption=self._address.startswith("tls://"))
+        except (OSError, ssl.SSLError, ValueError) as error:
+            raise InputError(f"{self._address}: the certificates cannot be used ({_text(error)})") from error
         client = Client(
             self._address,
             asynchronous=True,
             timeout=CONNECT_S,
             set_as_default=False,
-            security=self._security(),
+            security=security,
             name="fcslam",
         )
         self._client = client
         await client
-
-    def _security(self) -> Any:
-        """TLS as Dask is configured (``distributed.comm.tls``)."""
-        from distributed.security import Security
-
-        try:
-            return Security(require_encryption=self._address.startswith("tls://"))
-        except (OSError, ssl.SSLError, ValueError) as error:
-            raise InputError(f"{self._address}: the certificates cannot be used ({_text(error)})") from error
 
     async def _look(self, must_fit: bool) -> None:
         """Follow which workers there are.

@@ -59,6 +59,7 @@ from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server, addresses
+from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
@@ -160,12 +161,12 @@ class Robot(LiveTracker):
             if folder is not None:
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, LARGEST_OUTBOX_BYTES)))
             if access is not None and outbox is not None:
-                urls, shown = addresses(access.url), (access.token, access.ca, access.certificate)
+                urls, shown = addresses(access.url), Credentials(access.token, access.ca, access.certificate)
                 transport = InstancesTransport(
-                    [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, *shown))) for url in urls]
+                    [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, shown))) for url in urls]
                 )
                 if own_map:
-                    followed = [FleetClient(url, *shown) for url in urls]
+                    followed = [FleetClient(url, shown) for url in urls]
                     self.fleet = stack.enter_context(following(followed, name, self._place, budget_kBps))
                     self._joint = JointMap(self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)

@@ -11,8 +11,9 @@ from fcslam.records import frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
 from fcslam.runs.map_files import area_of, map_stem, parse_map
+from fcslam.wire.fleet_client import MapClient, ServedMap
 from fcslam.wire.http_transport import Server, addresses
-from fcslam.wire.map_client import MapClient, ServedMap
+from fcslam.wire.keys import Credentials
 
 _ATTEMPTS: Final = 3
 """The cloud may draw its maps again while the robot reads them."""
@@ -36,7 +37,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     prepare_output(folder, force=True)
     troubles = []
     for address in addresses(server.url):
-        with closing(MapClient(address, server.token, server.ca, server.certificate)) as client:
+        with closing(MapClient(address, Credentials(server.token, server.ca, server.certificate))) as client:
             try:
                 _read(client, address).save(folder, force=True)
                 return None

@@ -122,9 +122,18 @@ class MapArea(NamedTuple):
 def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
     """As ``parse_map``, without a copy of the image, which may be large."""
     try:
-        return _image(pgm, description)
+        width, height, begin = _size(pgm)
+        if len(pgm) - begin != width * height:
+            raise ValueError(f"the image has {len(pgm) - begin} pixels, not {width} x {height}")
+        resolution_m, origin_xy, occupied_threshold, free_threshold = _own_description(description)
     except ValueError as error:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+    occupancy = (255 - np.arange(256)) / 255.0
+    known = np.full(256, Occupancy.UNKNOWN, np.uint8)
+    known[occupancy < free_threshold] = Occupancy.FREE
+    known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
+    pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
+    return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
 
 
 def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
@@ -155,19 +164,6 @@ def area_of(name: str, header: bytes, description: str) -> MapArea:
     except ValueError as error:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
     return MapArea(resolution_m, (x, y, x + width * resolution_m, y + height * resolution_m))
-
-
-def _image(pgm: bytes, description: str) -> MapImage:
-    width, height, begin = _size(pgm)
-    if len(pgm) - begin != width * height:
-        raise ValueError(f"the image has {len(pgm) - begin} pixels, not {width} x {height}")
-    resolution_m, origin_xy, occupied_threshold, free_threshold = _own_description(description)
-    occupancy = (255 - np.arange(256)) / 255.0
-    known = np.full(256, Occupancy.UNKNOWN, np.uint8)
-    known[occupancy < free_threshold] = Occupancy.FREE
-    known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
-    pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
-    return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
 
 
 def _size(pgm: bytes) -> tuple[int, int, int]:

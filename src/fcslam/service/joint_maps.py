@@ -143,8 +143,7 @@ def read_joint_maps(path: Path) -> JointMaps:
     return JointMaps(sessions, grids, frames, radius_m)
 
 
-@dataclass(frozen=True, slots=True)
-class LivePose:
+class LivePose(NamedTuple):
     """A pose that a robot says it has."""
 
     map: int

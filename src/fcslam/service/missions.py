@@ -2,7 +2,7 @@
 
 import fcntl
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
@@ -27,6 +27,9 @@ IMPORT, EXPORT = ".import", ".export"
 
 class UnknownMissionError(ServiceError):
     """There is no mission of a name."""
+
+    def __init__(self, name: str, names: Iterable[str]) -> None:
+        super().__init__(f"there is no mission '{name}'; there are {', '.join(names)}")
 
 
 class OpenMission:
@@ -179,7 +182,7 @@ class Missions:
             ServiceError: no mission has this name.
         """
         if not MissionFolder.of(self.root, name).store.exists():
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise UnknownMissionError(name, self.names)
         self._switch(name)
 
     def result(self, name: str, number: int) -> Path | None:
@@ -202,7 +205,7 @@ class Missions:
             self.open_mission.store.export(path)
             return
         if not folder.store.exists():
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise UnknownMissionError(name, self.names)
         store = MissionStore(folder.store)
         try:
             store.export(path)

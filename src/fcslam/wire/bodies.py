@@ -354,13 +354,9 @@ def _same(body: Any) -> Any:
     return body
 
 
-_MOST_AXES = max(limits.KEYPOINT_AXES.values())
-
-
 def _hello_version(hello: Hello) -> int:
-    return (
-        limits.WORDS_VERSION if hello.vocabularies else limits.FLOOR_VERSION if hello.floor else limits.PROTOCOL_VERSION
-    )
+    floored = limits.FLOOR_VERSION if hello.floor else limits.PROTOCOL_VERSION
+    return limits.WORDS_VERSION if hello.vocabularies else floored
 
 
 def _keyscan_version(keyscan: Keyscan) -> int:
@@ -369,16 +365,20 @@ def _keyscan_version(keyscan: Keyscan) -> int:
     return limits.PROTOCOL_VERSION if keyscan.sweep is None else limits.SWEEP_VERSION
 
 
-def _keyscan_bytes(message: pb.Keyscan) -> int:
-    return limits.BYTES_PER_RANGE * min(message.count, limits.MAXIMUM_BEAMS)
+def _always(number: int) -> Callable[[Any], int]:
+    return lambda _: number
 
 
-def _place_bytes(message: pb.Place) -> int:
-    return (limits.BYTES_PER_AXIS * _MOST_AXES + CODE_BYTES) * min(message.count, limits.MAXIMUM_KEYPOINTS)
+def _for_each(size: int, most: int) -> Callable[[Any], int]:
+    """Bytes of a message's streams with ``size`` for each item; more than ``most`` are refused before."""
+    return lambda message: size * min(message.count, most)
 
 
-def _word_place_bytes(message: pb.WordPlace) -> int:
-    return (limits.BYTES_PER_AXIS * _MOST_AXES + limits.BYTES_PER_WORD) * min(message.count, limits.MAXIMUM_KEYPOINTS)
+_KEYPOINT_BYTES = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values())
+_RANGES = _for_each(limits.BYTES_PER_RANGE, limits.MAXIMUM_BEAMS)
+_DESCRIBED = _for_each(_KEYPOINT_BYTES + CODE_BYTES, limits.MAXIMUM_KEYPOINTS)
+_IN_WORDS = _for_each(_KEYPOINT_BYTES + limits.BYTES_PER_WORD, limits.MAXIMUM_KEYPOINTS)
+_WORDS, _TAG, _FIX = map(_always, (limits.WORDS_VERSION, limits.TAG_VERSION, limits.FIX_VERSION))
 
 
 class Codec(NamedTuple):
@@ -389,31 +389,21 @@ class Codec(NamedTuple):
     read: Callable[[Any, pb.Packet], Any]
     round: Callable[[Any], Any] = _same
     """Return a record as it is after writing and reading, without doing either; most kinds keep every number."""
-    version: int | Callable[[Any], int] = limits.PROTOCOL_VERSION
-    """Version of the packet, perhaps by the record."""
-    unpacked_bytes: Callable[[Any], int] = lambda _: 0
+    version: Callable[[Any], int] = _always(limits.PROTOCOL_VERSION)
+    """Version of the packet of a record."""
+    unpacked_bytes: Callable[[Any], int] = _always(0)
     """Bytes of the streams of a message, unpacked, by its counts."""
-
-    def version_of(self, body: Any) -> int:
-        """Version of the packet of a record."""
-        return self.version if isinstance(self.version, int) else self.version(body)
 
 
 CODECS = {
     PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello, version=_hello_version),
-    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _keyscan_bytes),
+    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _RANGES),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, limits.PROTOCOL_VERSION, _place_bytes),
-    PacketKind.WORD_PLACE: Codec(
-        WordPlace, _write_word_place, _read_word_place, _round_word_place, limits.WORDS_VERSION, _word_place_bytes
-    ),
-    PacketKind.MAP_TILE: Codec(
-        MapTile, _write_map_tile, _read_map_tile, _same, limits.WORDS_VERSION, lambda _: limits.BYTES_PER_TILE
-    ),
-    PacketKind.TAG_SIGHTING: Codec(
-        TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, limits.TAG_VERSION
-    ),
-    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix, version=limits.FIX_VERSION),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, unpacked_bytes=_DESCRIBED),
+    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place, _WORDS, _IN_WORDS),
+    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, _same, _WORDS, _always(limits.BYTES_PER_TILE)),
+    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, _TAG),
+    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix, version=_FIX),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

@@ -28,8 +28,10 @@ from fcslam.records import (
 )
 from fcslam.runs.map_files import Occupancy
 from fcslam.wire import limits
-from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
+
+_OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
 
 
 def check(packet: Packet) -> None:
@@ -42,7 +44,8 @@ def check(packet: Packet) -> None:
     _check_count(packet.epoch, "epoch", limits.MAXIMUM_EPOCH)
     _check_count(packet.sequence, "sequence", limits.MAXIMUM_SEQUENCE)
     _require(math.isfinite(packet.time), "time is not finite")
-    if (robot := _robot_of(packet.body)) != packet.robot:
+    robot = packet.body.id.robot if isinstance(packet.body, _OF_KEYSCANS) else packet.body.robot
+    if robot != packet.robot:
         raise PacketError(f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
     _CHECKS[type(packet.body)](packet.body, packet)
 
@@ -55,13 +58,6 @@ def check_name(name: str, what: str) -> None:
     """
     if NAME.fullmatch(name) is None:
         raise PacketError(f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
-
-
-_OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
-
-
-def _robot_of(body: Body) -> str:
-    return body.id.robot if isinstance(body, _OF_KEYSCANS) else body.robot
 
 
 def _check_hello(hello: Hello, packet: Packet) -> None:

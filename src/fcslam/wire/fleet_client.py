@@ -1,7 +1,7 @@
-"""HTTP client of a robot that follows its fleet: the joint map in tiles, and where all robots are."""
+"""HTTP clients of a robot that follows its fleet (the joint map in tiles, all robots), or reads the maps of a cloud."""
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 from pydantic import TypeAdapter
@@ -30,21 +30,20 @@ class FleetClient(HttpClient):
     def exchange(self, robot: str, map_index: int | None, pose: tuple[float, ...] | None) -> FleetReply:
         """Say where the robot is in its map, if it knows, and read where all robots are."""
         content = json.dumps({"map": map_index, "pose": pose} if pose and map_index is not None else {})
-        response = self._ask(
-            "POST", f"robots/{robot}/fleet", content.encode(), {"Content-Type": "application/json"}, "application/json"
-        )
+        headers = {"Content-Type": "application/json"}
+        response = self._ask("POST", f"robots/{robot}/fleet", content.encode(), headers)
         with self._reading():
             return FleetReply.model_validate_json(response.content)
 
     def frontiers(self, robot: str) -> tuple[MapFrontiers, ...]:
         """The frontiers of the map that a robot is in; none if it is in no map."""
-        response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}", accept="application/json")
+        response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}")
         with self._reading():
             return _FRONTIERS.validate_json(response.content)
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
-        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", accept="application/json", passes=(404,))
+        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", passes=(404,))
         if response.status_code == 404:  # a cloud of an older version
             return ()
         with self._reading():
@@ -57,7 +56,44 @@ class FleetClient(HttpClient):
         """
         headers = {"If-None-Match": known} if known else {}
         path, nothing = f"robots/{robot}/map?limit={limit_bytes}", (304, 404)
-        response = self._ask("GET", path, headers=headers, accept="*/*", passes=nothing)
+        response = self._ask("GET", path, headers=headers, passes=nothing)
         if response.status_code in nothing:
             return None
         return response.content, response.headers.get("ETag", "")
+
+
+class ServedMap(NamedTuple):
+    """One of the maps of a cloud."""
+
+    number: int
+    floor: str
+    """Floor of its robots; empty: none."""
+    robots: tuple[str, ...]
+    extent_m: tuple[float, ...]
+    """Lowest x and y, highest x and y, metres; empty before there is a map."""
+
+
+class MapClient(HttpClient):
+    """Reads the maps of one cloud; it needs the rights of a viewer. Each method raises as ``BatchTransport.state``."""
+
+    def maps(self) -> list[ServedMap]:
+        """The maps of the cloud now."""
+        response = self._ask("GET", "maps")
+        with self._reading():
+            return [
+                ServedMap(
+                    int(one["map"]),
+                    str(one["floor"]),
+                    tuple(map(str, one["robots"])),
+                    tuple(map(float, one["extent"] or ())),
+                )
+                for one in response.json()
+            ]
+
+    def image(self, number: int) -> bytes:
+        """The PGM file of a map."""
+        return self._ask("GET", f"maps/{number}.pgm").content
+
+    def description(self, number: int) -> bytes:
+        """The YAML file of a map."""
+        return self._ask("GET", f"maps/{number}.yaml").content

@@ -33,7 +33,7 @@ def encode(packet: Packet) -> bytes:
     kind, codec = CODEC_OF_TYPE[type(packet.body)]
     body: dict[str, Any] = {kind: codec.write(packet.body)}
     message = pb.Packet(
-        version=codec.version_of(packet.body),
+        version=codec.version(packet.body),
         robot=packet.robot,
         epoch=packet.epoch,
         sequence=packet.sequence,
@@ -84,7 +84,7 @@ def decode(data: bytes) -> Packet:
     body = codec.read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
     check(packet)
-    if message.version != (version := codec.version_of(body)):
+    if message.version != (version := codec.version(body)):
         raise PacketError(f"version {message.version} of a packet of version {version}")
     return packet
 

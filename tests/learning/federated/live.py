@@ -15,6 +15,7 @@ from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.authentication import Authenticator, Role, read_tokens
+from fcslam.wire.keys import Credentials
 from tests.learning.federated.fakes import version
 
 LIMIT_S = 120.0
@@ -67,7 +68,7 @@ class LiveFleet:
 
     def link(self, robot, owner=None):
         """The link of a robot that shows the token of ``owner``."""
-        return RobotLink(f"https://{self.address}", robot, self.token(owner or robot), self.ca)
+        return RobotLink(f"https://{self.address}", robot, Credentials(self.token(owner or robot), self.ca))
 
     def start(self, client, app=None):
         """Let a robot answer requests until the server ends."""

@@ -42,17 +42,10 @@ def fleet(
     ] = None,
 ) -> None:
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
-    from fcslam.cli.evaluate.fleet_tables import show_fleet
+    from fcslam.cli.evaluate.fleet_tables import report_fleet
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet, fleet_metrics
 
-    with ProgressDisplay(notices()) as display:
-        display.start("evaluating")
-        report = evaluate_fleet(run, truth)
-    show_fleet(report)
-    if csv is not None:
-        write_metrics(fleet_metrics(report), csv)
+    report_fleet(run, truth, csv, notices())
     if figure is not None:
         from fcslam.lab.evaluation.fleet.charts import fleet_charts
         from fcslam.maps.fleet_figure import write_figure

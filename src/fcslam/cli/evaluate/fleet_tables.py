@@ -2,13 +2,17 @@
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import typer
+from rich.console import Console
 from rich.table import Table
 
 from fcslam.cli.output import answers
+from fcslam.cli.progress import ProgressDisplay
 from fcslam.lab.evaluation.fleet.closures import BOTH, LIKE_HEADING_DEG, ClosureScope
-from fcslam.lab.evaluation.fleet.report import FleetReport
+from fcslam.lab.evaluation.fleet.relations import write_metrics
+from fcslam.lab.evaluation.fleet.report import FleetReport, evaluate_fleet, fleet_metrics
 from fcslam.metrics.closures import EVERY_M, RADIUS_M, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
 from fcslam.metrics.grid import TOLERANCE_M
 from fcslam.metrics.relations import RelationErrors
@@ -17,13 +21,18 @@ from fcslam.records import ClosureStatus
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
-def show_fleet(report: FleetReport, explained: bool = True) -> None:
-    """Print the report as tables and, if ``explained``, the definitions behind them."""
+def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console, explained: bool = True) -> None:
+    """Compare a run with the truth: print tables, and what they mean if ``explained``; write the numbers to ``csv``."""
+    with ProgressDisplay(notices) as display:
+        display.start("evaluating")
+        report = evaluate_fleet(run, truth)
     console, closures = answers(), (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
     for line in (*_findings(report), *(_explanations(report) if explained else ())):
         typer.echo(line)
+    if csv is not None:
+        write_metrics(fleet_metrics(report), csv)
 
 
 def _percent(share: float) -> str:

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Final, TypeVar
 from urllib.parse import quote
 
@@ -31,6 +30,7 @@ from fcslam.learning.federated.flower import (
 )
 from fcslam.learning.federated.messages import printable_line
 from fcslam.wire.http_transport import HttpClient
+from fcslam.wire.keys import NO_CREDENTIALS, Credentials
 
 ALIVE_S: Final = 15.0
 """Time between two signs of life; a quarter of that after which a robot counts as gone."""
@@ -48,18 +48,11 @@ _T = TypeVar("_T")
 class RobotLink(HttpClient):
     """The connection of a robot with the service that it learns at.
 
-    ``url``, ``token``, ``ca`` and ``own`` are as in ``HttpClient``; ``robot`` is its name.
+    ``url`` and ``shown`` are as in ``HttpClient``; ``robot`` is its name.
     """
 
-    def __init__(
-        self,
-        url: str,
-        robot: str,
-        token: str | None = None,
-        ca: Path | None = None,
-        own: tuple[Path, Path] | None = None,
-    ) -> None:
-        super().__init__(url, token, ca, own)
+    def __init__(self, url: str, robot: str, shown: Credentials = NO_CREDENTIALS) -> None:
+        super().__init__(url, shown)
         self._path = f"robots/{quote(robot, safe='')}/learning/"
         self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 

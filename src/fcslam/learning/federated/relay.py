@@ -27,9 +27,7 @@ def learning_router(state: ServiceState, listener: Path) -> APIRouter:
 
     @router.post(f"{PATH}/{{operation:path}}", dependencies=state.require(Role.ROBOT))
     async def learn(request: Request, robot: Name, operation: Operation) -> Response:
-        wait_s = state.rate.wait_s(robot, 0)
-        if wait_s > 0.0:
-            raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
+        state.rate.check(robot)
         transport = httpx.AsyncHTTPTransport(uds=str(listener), verify=False)
         address = f"http://learning{PATH.format(robot=robot)}/{operation}"
         try:

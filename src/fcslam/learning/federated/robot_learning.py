@@ -156,7 +156,7 @@ def main(arguments: Sequence[str]) -> int:
         client = RobotClient(given.name, given.keyframes, given.cache)
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
-        link = partial(RobotLink, given.server, given.name, shown.token, shown.ca, shown.own)
+        link = partial(RobotLink, given.server, given.name, shown)
         tell(f"learning ends: {learn(link, client, robot, idle)}")
     except (FcslamError, OSError) as error:
         tell(f"learning ends: {error}")

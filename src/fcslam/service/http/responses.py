@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from fastapi.responses import Response
 from pydantic import Field
 
 from fcslam.config import StrictModel
@@ -274,6 +273,8 @@ def file_of(
     *media_types: str, refused: Sequence[int] = (404,), model: dict[str, Any] | None = None, is_tagged: bool = False
 ) -> dict[str, Any]:
     """Arguments of a route that sends a file; ``is_tagged``: a client that has it gets 304."""
+    from starlette.responses import Response  # who writes a report needs the models, and may have no web server
+
     responses = {**refusals(*refused), 200: content(*media_types, model=model)}
     if is_tagged:
         responses[304] = {"description": "as you have it"}

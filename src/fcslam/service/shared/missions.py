@@ -131,14 +131,8 @@ class SharedMissions:
     ) -> None:
         """Take the instance's name, and create the first mission if the server has no mission.
 
-        Args:
-            root: folder of this instance's own files, which can be made again from the store.
-            config: of new missions.
-            server: the store.
-            name: of the instance.
-            most_missions: workers that the instance runs at a time.
-            most_robots: robots that send to it at a time.
-            hooks: what it calls.
+        Files in ``root`` are this instance's own, and can be made again from the store. At a time, the instance runs
+        ``most_missions`` workers, and ``most_robots`` robots send to it.
 
         Raises:
             ServiceError: the folder cannot be used, or another instance has the name.
@@ -231,7 +225,7 @@ class SharedMissions:
             self._instance.look()
         known = self._instance.known.get(name)
         if known is None:
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self._instance.known)}")
+            raise UnknownMissionError(name, self._instance.known)
         return known
 
     def _open_here(self, name: str) -> SharedMission:
