@@ -58,13 +58,9 @@ def checked_lasers(lasers: Lasers | None) -> dict[str, LaserModel]:
 
 
 def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, laser: LaserModel) -> LaserScan:
-    """A scan as a record; negative ranges are made invalid.
+    """A scan as a record; negative ranges are made invalid. The stamp and the pose were checked before.
 
-    Args:
-        ranges_m: shape (N,); N may vary from scan to scan, the field of view does not.
-        stamp: checked, seconds.
-        T_odom_base: checked, shape (3,).
-        laser: the laser.
+    The ranges have shape (N,); N may vary from scan to scan, the field of view does not.
 
     Raises:
         InputError: the ranges are not numbers, or not as many as the laser can have beams.
@@ -106,13 +102,9 @@ def checked_camera(camera: CameraModel | None) -> CameraModel | None:
 
 
 def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None, camera: CameraModel) -> CameraImage:
-    """An image as a record, encoded as JPEG: grey values are enough for keypoints.
+    """An image as a record, encoded as JPEG: grey values are enough for keypoints. The rest was checked before.
 
-    Args:
-        image: shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
-        stamp: checked, seconds.
-        T_odom_base: checked, shape (3,); None: unknown.
-        camera: the camera.
+    The image has shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
 
     Raises:
         InputError: the image has another type, or another shape than those of the camera.

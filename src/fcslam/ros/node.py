@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -155,7 +156,9 @@ class RobotNode:
         is_silent = False
         try:
             while not self._stop.is_set():
-                message = self._next()
+                message: _Message | None = None
+                with suppress(queue.Empty):
+                    message = self._inbox.get(timeout=_POLL_S)
                 now_s = time.monotonic()
                 before = self.scans
                 records = (
@@ -253,12 +256,6 @@ class RobotNode:
         if point is not None and own is not None:  # the robot arrives as it looks when it drives straight there
             goal = np.array((*point, np.arctan2(*(point - own[:2])[::-1])))
         self._outputs.frontiers(now_ns, free, taken, goal)
-
-    def _next(self) -> _Message | None:
-        try:
-            return self._inbox.get(timeout=_POLL_S)
-        except queue.Empty:
-            return None
 
     def _map(self, record: SensorRecord) -> None:
         pose = self._robot.add(record)

@@ -135,13 +135,9 @@ class LiveSensors:
         """Usual beams of each laser, once they are known."""
 
     def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
-        """Read the next message; yields the records that are complete.
+        """Read the next message; yields the records that are complete at ``now_s`` of a clock that only grows.
 
-        Args:
-            topic: where the message comes from.
-            payload: its bytes.
-            now_s: any clock that only grows.
-            received_ns: the time of a message without a stamp.
+        ``received_ns`` is the time of a message without a stamp.
 
         Raises:
             NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
@@ -306,16 +302,12 @@ class LiveSensors:
     def _transforms(self, content: object, received_ns: int) -> list[Message]:
         transforms = list(transforms_of(content, received_ns))
         for transform in transforms if self._rig is None else ():
-            if self._is_own(transform.child):
+            prefix = transform.child.rpartition("/")[0]  # another one is that of another robot on the same tf
+            if not prefix or not self._prefix or prefix == self._prefix:
                 self._tree.add(transform.parent, transform.child, transform.T_parent_child)
         if self._topics.odometry is not None or self.is_without_odometry:
             return []
         return [odometry_in(each) for each in transforms if self._edge in (None, (each.parent, each.child))]
-
-    def _is_own(self, frame: str) -> bool:
-        """Whether a frame is not that of another robot on the same tf."""
-        prefix, _, _ = frame.rpartition("/")
-        return not prefix or not self._prefix or prefix == self._prefix
 
     def _rig_now(self, now_s: float) -> Rig | None:
         """The rig if enough is known; None to wait for more."""

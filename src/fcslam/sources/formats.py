@@ -42,9 +42,10 @@ class Format:
 
 
 def _text_format(dialect: Dialect) -> Format:
-    return Format(
-        dialect.name, lambda _, head: bool(dialect.recognises(head)), lambda path, name, _: TextLog(path, name, dialect)
-    )
+    def recognises(_: Path, head: bytes) -> bool:
+        return bool(dialect.recognises(head))
+
+    return Format(dialect.name, recognises, lambda path, name, _: TextLog(path, name, dialect))
 
 
 FORMATS: tuple[Format, ...] = (
@@ -76,7 +77,7 @@ def open_fleet(
         for each in source.robots(name) if isinstance(source, RosBag) else [source]:
             file, which = robot_in(path)[0], each.stream.robot.name if isinstance(each, RosBag) else ""
             for other_file, other_which, other in given:
-                if which == other_which and _is_same(file, other_file):
+                if which == other_which and _files(file) == _files(other_file):
                     raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")
             given.append((file, which, each))
             sources.append(each)
@@ -87,9 +88,8 @@ def open_fleet(
     return [agreed.get(id(source), source) for source in sources]
 
 
-def _is_same(a: Path, b: Path) -> bool:
-    """Whether two recordings have the same files."""
-    return [part.resolve() for part in parts_of(a)] == [part.resolve() for part in parts_of(b)]
+def _files(recording: Path) -> list[Path]:
+    return [part.resolve() for part in parts_of(recording)]
 
 
 def check_copies(sources: Sequence[Source]) -> None:

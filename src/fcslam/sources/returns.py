@@ -104,7 +104,7 @@ class RangeSample:
         Args:
             path: of the recording.
             which: the laser, empty or with a blank before it.
-            remedy: what to check where nearly no beam has a return.
+            remedy: what to check if nearly no beam has a return.
 
         Raises:
             SourceError: the laser measures nothing or in another unit.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.errors import FcslamError
-from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
+from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
@@ -40,7 +40,9 @@ class Rig(NamedTuple):
         scan, upside_down = posed.scan, self.upside_down[posed.scan.laser]
         if scan.ranges_at_stamp is not None and scan.sweep is not None:
             scan = scan._replace(raw_ranges_m=scan.ranges_at_stamp(scan.sweep), sweep=None)
-        ranges_m = _turned(measured_ranges(scan), upside_down)
+        ranges_m = measured_ranges(scan)
+        ranges_m = np.ascontiguousarray(ranges_m[::-1]) if upside_down else ranges_m
+        ranges_m.setflags(write=False)
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
         return LaserScan(scan.stamp, ranges_m, laser, pose_array(posed.T_odom_base), sweep)
@@ -136,11 +138,3 @@ def mounted_camera(
 def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
     """The beams of a laser that is mounted upside down, as seen from above."""
     return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
-
-
-def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
-    """Reverse the ranges (beam_count,) of a laser that is mounted upside down."""
-    if upside_down:
-        ranges_m = np.ascontiguousarray(ranges_m[::-1])
-    ranges_m.setflags(write=False)
-    return ranges_m

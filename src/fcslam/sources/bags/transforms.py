@@ -128,11 +128,8 @@ class TransformTree:
 
         On the way up from ``frame``, it is the first whose parent has "odom" in its name. Without one, it is the first
         that moves and is neither a joint of the robot nor its pose in a map. The parent is empty if none fits; the
-        child is then the last frame to which ``frame`` is fixed.
-
-        Args:
-            frame: any of the robot.
-            odom_frame, base_frame: names of the parent and the child; None: any.
+        child is then the last frame to which ``frame`` is fixed. ``odom_frame`` and ``base_frame`` name the parent and
+        the child; None: any.
         """
         above = [link for child in self._above(frame) for link in self._links if link[1] == child]
         above = [link for link in above if _matches(link, odom_frame, base_frame)]

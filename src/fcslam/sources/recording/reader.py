@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cached_property
 from math import isnan, nan
 from pathlib import Path
+from typing import BinaryIO
 from zlib import crc32
 
 import numpy as np
@@ -33,12 +34,13 @@ from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
 from fcslam.sources.pose import UNKNOWN_POSE, pose_array
-from fcslam.sources.recording.frames import Frame, RangesFile, frame_count, merged_frames
+from fcslam.sources.recording.frames import Frame, frame_count, merged_frames, opened
 from fcslam.sources.recording.layout import (
     GROUND_TRUTH,
     IMAGES_FILE,
     META,
     ODOMETRY_FILE,
+    RANGES,
     SCANS,
     SCANS_FILE,
     Meta,
@@ -94,7 +96,7 @@ class Recording:
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
         lasers, camera = self._survey.lasers, self._survey.camera
-        with RangesFile(self._path) as ranges:
+        with opened(self._path / RANGES) as ranges:
             for number, frame in self._entries(scans, audit):
                 if frame.is_scan:
                     laser = lasers[frame.laser].with_beams(frame.beams(lasers))
@@ -135,7 +137,8 @@ class Recording:
     def _survey(self) -> Survey:
         """Summary from one pass over the whole recording; rejects a recording that cannot be mapped."""
         audit, scans, odometry, notes = _audit(), PathSummary(), PathSummary(), list[str]()
-        RangesFile(self._path).check()
+        with opened(self._path / RANGES):
+            pass  # it is there
         for _, frame in self._checked(audit):
             if frame.is_scan:
                 if not scans.count and frame.T_odom_base == UNKNOWN_POSE:
@@ -202,7 +205,7 @@ def _is_sane(frame: Frame, lasers: Sequence[LaserModel]) -> bool:
     return abs(frame.stamp) < _MAX_STAMP_S and (unknown or all(abs(value) < _MAX_COORDINATE for value in pose))
 
 
-def _ranges(frame: Frame, file: RangesFile, audit: Audit) -> Ranges:
+def _ranges(frame: Frame, file: BinaryIO, audit: Audit) -> Ranges:
     """Ranges in metres, shape (beam_count,); negative ones become NaN. Raises ValueError if they are damaged."""
     ranges = frame.ranges_m(file)
     negative = ranges < 0.0

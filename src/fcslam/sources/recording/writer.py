@@ -165,15 +165,11 @@ class RecordingWriter:
         self._appenders[frames.name].append(frames.packed(self._next_sequence, *values))
         self._next_sequence += 1
 
-    def _count(self, frames: FrameFile) -> int:
-        """Frames in a file; 0 if the recording has none of this kind."""
-        appender = self._appenders.get(frames.name)
-        return (appender.size - HEADER_BYTES) // frames.frame_bytes if appender else 0
-
     def _append_image(self, image: CameraImage) -> None:
         """Write the file before the frame: a frame without a file is a fault, a file without a frame is overwritten."""
         suffix, encoded = image_suffix(image.encoded), image.encoded
-        image_path(self._folder, self._count(IMAGES_FILE), suffix).write_bytes(encoded)
+        written = (self._appenders[IMAGES_FILE.name].size - HEADER_BYTES) // IMAGES_FILE.frame_bytes
+        image_path(self._folder, written, suffix).write_bytes(encoded)
         pose = _NO_POSE if image.T_odom_base is None else image.T_odom_base
         self._append(IMAGES_FILE, image.stamp, pose, suffix.encode(), len(encoded), crc32(encoded))
 
