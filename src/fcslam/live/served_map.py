@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import CloudError, EvaluationError, SourceError, UnavailableError
-from fcslam.records import frozen
+from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
 from fcslam.runs.map_files import area_of, map_stem, parse_map
@@ -62,11 +62,12 @@ def _read(client: MapClient, server: str) -> Run:
             for suffix, content in (("yaml", client.description(one.number)), ("pgm", client.image(one.number)))
         }
         if all(_fits(one, files, server) for one in served):
-            stamps, poses = frozen(np.empty(0)), frozen(np.empty((0, 3)))  # they stay in the cloud
+            poses: tuple[FloatArray, FloatArray] = (
+                frozen(np.empty(0)),
+                frozen(np.empty((0, 3))),
+            )  # they stay in the cloud
             trajectories = {
-                robot: RobotTrajectory(robot, one.number, stamps, poses, one.floor)
-                for one in served
-                for robot in one.robots
+                robot: RobotTrajectory(robot, one.number, *poses, one.floor) for one in served for robot in one.robots
             }
             return Run(trajectories=trajectories, map_files=files)
     raise UnavailableError(f"{server}: its maps change all the time")

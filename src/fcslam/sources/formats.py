@@ -38,7 +38,6 @@ class Format:
     """Whether a path and its first bytes (decompressed; empty for a folder) have this format."""
     open: Callable[[Path, str, BagOptions | None], Source]
     """Opens a path with the robot's name, and options, which are for bags only."""
-    takes_options: bool = False
 
 
 def _text_format(dialect: Dialect) -> Format:
@@ -51,7 +50,7 @@ def _text_format(dialect: Dialect) -> Format:
 FORMATS: tuple[Format, ...] = (
     *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES, CSM)),
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
-    Format(_BAG, is_bag, RosBag, takes_options=True),
+    Format(_BAG, is_bag, RosBag),
 )
 """Tried in this order. To add a format, add an entry."""
 
@@ -144,7 +143,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
     """
     path, robot = robot_in(Path(path))
     kind = format_of(path)
-    if (options is not None or robot is not None) and not kind.takes_options:
+    if (options is not None or robot is not None) and kind.name != _BAG:
         raise SourceError(
             f"{path}: a {kind.name} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
             "only, leave them out"
