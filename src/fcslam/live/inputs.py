@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from fcslam.cloud.sessions import check_robot
 from fcslam.errors import InputError, PacketError
 from fcslam.geometry.beams import is_field_of_view, misfit, spread
-from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan
+from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan, frozen
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
 
@@ -79,8 +79,7 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
                 "each"
             )
     ranges[ranges < 0.0] = np.nan
-    ranges.setflags(write=False)
-    return LaserScan(stamp, ranges, laser.with_beams(beams), T_odom_base)
+    return LaserScan(stamp, frozen(ranges, np.float32), laser.with_beams(beams), T_odom_base)
 
 
 def checked_camera(camera: CameraModel | None) -> CameraModel | None:

@@ -47,7 +47,11 @@ def record(
         reliable = [point.quality.reliable for point in offered if point.topic == topic]
         latched = last_part(topic) == TF_STATIC
         quality = Quality((bool(reliable) and all(reliable)) or latched, latched, _DEPTH)
-        network.subscribe(topic, kind, quality, lambda payload, topic=topic: inbox.put(topic, time.time_ns(), payload))
+
+        def deliver(payload: bytes, topic: str = topic) -> None:
+            inbox.put(topic, time.time_ns(), payload)
+
+        network.subscribe(topic, kind, quality, deliver)
     counts: Counter[str] = Counter()
     kept = ""
     try:
