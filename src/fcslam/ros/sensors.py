@@ -8,6 +8,7 @@ whose odometry is silent from the start is mapped without.
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from math import inf
 
 from fcslam.errors import NetworkError
@@ -196,11 +197,9 @@ class LiveSensors:
         """Yield all that waits, as no more messages come."""
         if self._rig is None:
             return
-        for joiner in self._joiners.values():
-            for turn in joiner.flush():
-                for number, item in self._merger.add(0, turn):
-                    yield from self._paired(number, item)
-        for number, item in self._merger.flush():
+        turns = (turn for joiner in self._joiners.values() for turn in joiner.flush())
+        merged = chain.from_iterable(self._merger.add(0, turn) for turn in turns)
+        for number, item in chain(merged, self._merger.flush()):
             yield from self._paired(number, item)
         for number, entry in self._pairing.flush():
             yield from self._recorded(number, entry)

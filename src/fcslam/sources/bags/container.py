@@ -313,11 +313,8 @@ class _Part:
     @property
     def remedy(self) -> str:
         """Commands that mend a damaged file of this kind."""
-        if self.is_ros1:
-            return "copy it again, or mend it with `rosbag reindex`"
-        if self._magic.startswith(_MCAP):
-            return "copy it again, or mend it with `mcap recover`"
-        return "copy it again, or mend it with `ros2 bag reindex`"
+        of_ros2 = "mcap recover" if self._magic.startswith(_MCAP) else "ros2 bag reindex"
+        return f"copy it again, or mend it with `{'rosbag reindex' if self.is_ros1 else of_ros2}`"
 
 
 def _chosen(reader: _Reader, topics: Sequence[Topic]) -> Iterator[tuple[Topic, int, bytes]]:

@@ -134,7 +134,7 @@ class BagStream:
     @cached_property
     def tree(self) -> TransformTree:
         """The frames and transforms of the robot."""
-        return self.robot.tree
+        return self.bag.census.tree(self.robot.transforms)
 
     @cached_property
     def candidates(self) -> Candidates:
