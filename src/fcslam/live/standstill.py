@@ -27,8 +27,8 @@ class Standstill:
     def follow(self, pose: RobotPose) -> None:
         """Take the pose of the next scan, by odometry if there is one."""
         T = pose.T_map_base if pose.T_odom_base is None else pose.T_odom_base
-        x, y, turned = (0.0, 0.0, 0.0) if self._reference is None else se2.between(self._reference, T)
-        has_moved = self._reference is None or np.hypot(x, y) > MOVED_M or abs(turned) > MOVED_RAD
+        moved = None if self._reference is None else se2.between(self._reference, T)
+        has_moved = moved is None or np.hypot(moved[0], moved[1]) > MOVED_M or abs(moved[2]) > MOVED_RAD
         if has_moved or pose.stamp < self._since:
             self._reference, self._since = T, pose.stamp
             if self._stands:
