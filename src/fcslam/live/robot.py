@@ -508,8 +508,10 @@ class Robot(LiveTracker):
 
     def _correct(self, part: int, correction: Correction) -> None:
         """Take a correction of the robot's own map, in any thread."""
-        is_server_away = self._uplink is None or self._uplink.trouble is not None
-        self._map_poses.correct(part, correction, is_server_away)
+        self._map_poses.correct(part, correction, self._is_server_away())
+
+    def _is_server_away(self) -> bool:
+        return self._uplink is None or self._uplink.trouble is not None
 
     def _floor(self, part: int) -> str:
         return self._floors[self._first_on_floor(part)]
