@@ -82,11 +82,7 @@ class Anchored:
 def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers) -> Anchored:
     """Place each map by the floor plan, else by surveyed tags, else by fixes, else by its walls.
 
-    Args:
-        result: the maps, each in a frame of its own.
-        anchors: what is known.
-        placed: maps that a user placed; they stay about there.
-        fuse: draws a map.
+    Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
     files: dict[str, bytes] = {}
     reports, pictures = [], []

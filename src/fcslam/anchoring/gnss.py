@@ -85,14 +85,9 @@ class _Measured:
 
 
 def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
-    """Place a map on the earth, conclusively or not at all.
+    """Place a map on the earth, conclusively or not at all; None if it has no fix.
 
-    Args:
-        part: the map.
-        is_fixed: the map keeps its frame and its poses; else it is turned so that x is east and y is north.
-
-    Returns:
-        The map and where it lies; None if it has no fix.
+    A map that ``is_fixed`` keeps its frame and its poses; another one is turned so that x is east and y is north.
     """
     robots = part.robots
     kept = [fix for robot in robots for fix in robot.fixes]

@@ -97,10 +97,10 @@ class MapTags:
     def __init__(self, robots: Sequence[MappedRobot], sightings: Sequence[TagSighting]) -> None:
         """``robots`` of the map; sightings by others do not count."""
         self._robots = {robot.robot: robot for robot in robots}
-        self._sightings = [one for one in sightings if one.id.robot in self._robots]
         by_tag: dict[Tag, list[TagSighting]] = {}
-        for one in self._sightings:
-            by_tag.setdefault(one.tag, []).append(one)
+        for one in sightings:
+            if one.id.robot in self._robots:
+                by_tag.setdefault(one.tag, []).append(one)
         self.places = {tag: self._places(seen) for tag, seen in sorted(by_tag.items())}
         """Of each tag, the place with most sightings first."""
 
@@ -225,13 +225,7 @@ class Surveyed:
 
 
 def placed_by_tags(part: MapPart, sightings: Sequence[TagSighting], survey: Survey) -> Surveyed:
-    """Place a map by surveyed tags, and straighten it. Tags that are not where they should be do not count.
-
-    Args:
-        part: the map.
-        sightings: of all tags.
-        survey: where tags are.
-    """
+    """Place a map by surveyed tags, and straighten it. Tags that are not where they should be do not count."""
     tags = MapTags(part.robots, sightings)
     known = [tag for tag in tags.places if tag in survey]
     if not known:

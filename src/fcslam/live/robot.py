@@ -21,13 +21,8 @@ from fcslam.api import settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
-from fcslam.live.fleet_view import FleetView, following
-from fcslam.live.inputs import (
-    Lasers,
-    checked_camera,
-    checked_image,
-    checked_stamp,
-)
+from fcslam.live.fleet_view import FleetView
+from fcslam.live.inputs import Lasers, checked_camera, checked_image, checked_stamp
 from fcslam.live.joint_map import JointMap
 from fcslam.live.map_poses import MapPoses
 from fcslam.live.own_map import OwnMap
@@ -167,7 +162,8 @@ class Robot(LiveTracker):
                 )
                 if own_map:
                     followed = [FleetClient(url, shown) for url in urls]
-                    self.fleet = stack.enter_context(following(followed, name, self._place, budget_kBps))
+                    self.fleet = FleetView(followed, name, self._place, budget_kBps)
+                    stack.enter_context(closing(self.fleet)).start()
                     self._joint = JointMap(self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)
             keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from fcslam.ros.transform_stream import TransformStream
 from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.transforms import planar, transform_of
+from fcslam.sources.bags.transforms import last_part, planar, transform_of
 from fcslam.storage.files import write_file
 
 if TYPE_CHECKING:
@@ -155,7 +156,9 @@ class RobotNode:
         is_silent = False
         try:
             while not self._stop.is_set():
-                message = self._next()
+                message: _Message | None = None
+                with suppress(queue.Empty):
+                    message = self._inbox.get(timeout=_POLL_S)
                 now_s = time.monotonic()
                 before = self.scans
                 records = (
@@ -254,12 +257,6 @@ class RobotNode:
             goal = np.array((*point, np.arctan2(*(point - own[:2])[::-1])))
         self._outputs.frontiers(now_ns, free, taken, goal)
 
-    def _next(self) -> _Message | None:
-        try:
-            return self._inbox.get(timeout=_POLL_S)
-        except queue.Empty:
-            return None
-
     def _map(self, record: SensorRecord) -> None:
         pose = self._robot.add(record)
         if self.sensors.restarts != self._restarts:
@@ -330,9 +327,9 @@ class RobotNode:
         for topic, kind in self._topics.kinds.items():
             # Ask for reliable messages where all publishers offer them: then none is lost.
             reliable = all(point.quality.reliable for point in offered if point.topic == topic)
-            latched = topic.rsplit("/", 1)[-1] == TF_STATIC
+            latched = last_part(topic) == TF_STATIC
             quality = Quality(reliable or latched, latched, _DEPTHS.get(kind, _DEPTH))
-            self._network.subscribe(topic, kind, quality, self._deliver(topic))
+            self._network.subscribe(topic, kind, quality, partial(self._deliver, topic))
         commands: list[tuple[str, str, Callable[[bytes], object]]] = [
             (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
             (FINISH, EMPTY, lambda _: self.stop()),
@@ -348,15 +345,12 @@ class RobotNode:
                 CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
             )
 
-    def _deliver(self, topic: str) -> Callable[[bytes], None]:
-        def deliver(payload: bytes) -> None:
-            if self._inbox.qsize() < _LONGEST_INBOX:
-                self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
-                return
-            self._lost_messages += 1
-            self._tell_once("messages come faster than this computer can map; some are lost")
-
-        return deliver
+    def _deliver(self, topic: str, payload: bytes) -> None:
+        if self._inbox.qsize() < _LONGEST_INBOX:
+            self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
+            return
+        self._lost_messages += 1
+        self._tell_once("messages come faster than this computer can map; some are lost")
 
     def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
         """Obey a command later."""

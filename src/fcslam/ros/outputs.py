@@ -145,13 +145,9 @@ class Outputs:
         self._send("closures", MARKERS, self._codec.make(MARKERS, markers=[lines]))
 
     def frontiers(self, now_ns: int, free_xy: FloatArray, taken_xy: FloatArray, T_map_goal: FloatArray | None) -> None:
-        """Publish where the map can be explored further, and where this robot shall go.
+        """Publish where the map can be explored further, and where this robot shall go if that changed.
 
-        Args:
-            now_ns: the time now.
-            free_xy: frontiers that no robot has, shape (N, 2), metres in ``map``.
-            taken_xy: those that robots have, shape (M, 2).
-            T_map_goal: that of this robot; None: it has none. It is published when it changes.
+        Frontiers that no robot has, and those that robots have, have shape (N, 2), metres in ``map``.
         """
         with self._lock:
             self._begin(FLEET_FRONTIERS, MARKERS, LATCHED)
@@ -222,13 +218,10 @@ class Outputs:
         separations: Sequence[tuple[tuple[int, int], str]],
         own: int | None,
     ) -> None:
-        """Publish where the robots of the own map are, and which robots are in which map.
+        """Publish where the robots of the own map are, and which of all robots, this one as well, are in which map.
 
-        Args:
-            now_ns: the time now.
-            teammates: all robots of the fleet, this one as well.
-            separations: for every two maps that are apart: their indices and the reason.
-            own: index of the robot's own map; None: it is in none, so no pose is in its frame.
+        ``separations`` are the indices of every two maps that are apart, and the reason. ``own`` is the index of the
+        robot's own map; None: no pose is in its frame.
         """
         make, frame = self._codec.make, self._map_frame
         with self._lock:

@@ -8,6 +8,7 @@ whose odometry is silent from the start is mapped without.
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from math import inf
 
 from fcslam.errors import NetworkError
@@ -135,13 +136,9 @@ class LiveSensors:
         """Usual beams of each laser, once they are known."""
 
     def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
-        """Read the next message; yields the records that are complete.
+        """Read the next message; yields the records that are complete at ``now_s`` of a clock that only grows.
 
-        Args:
-            topic: where the message comes from.
-            payload: its bytes.
-            now_s: any clock that only grows.
-            received_ns: the time of a message without a stamp.
+        ``received_ns`` is the time of a message without a stamp.
 
         Raises:
             NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
@@ -200,11 +197,9 @@ class LiveSensors:
         """Yield all that waits, as no more messages come."""
         if self._rig is None:
             return
-        for joiner in self._joiners.values():
-            for turn in joiner.flush():
-                for number, item in self._merger.add(0, turn):
-                    yield from self._paired(number, item)
-        for number, item in self._merger.flush():
+        turns = (turn for joiner in self._joiners.values() for turn in joiner.flush())
+        merged = chain.from_iterable(self._merger.add(0, turn) for turn in turns)
+        for number, item in chain(merged, self._merger.flush()):
             yield from self._paired(number, item)
         for number, entry in self._pairing.flush():
             yield from self._recorded(number, entry)
@@ -306,16 +301,12 @@ class LiveSensors:
     def _transforms(self, content: object, received_ns: int) -> list[Message]:
         transforms = list(transforms_of(content, received_ns))
         for transform in transforms if self._rig is None else ():
-            if self._is_own(transform.child):
+            prefix = transform.child.rpartition("/")[0]  # another one is that of another robot on the same tf
+            if not prefix or not self._prefix or prefix == self._prefix:
                 self._tree.add(transform.parent, transform.child, transform.T_parent_child)
         if self._topics.odometry is not None or self.is_without_odometry:
             return []
         return [odometry_in(each) for each in transforms if self._edge in (None, (each.parent, each.child))]
-
-    def _is_own(self, frame: str) -> bool:
-        """Whether a frame is not that of another robot on the same tf."""
-        prefix, _, _ = frame.rpartition("/")
-        return not prefix or not self._prefix or prefix == self._prefix
 
     def _rig_now(self, now_s: float) -> Rig | None:
         """The rig if enough is known; None to wait for more."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.errors import FcslamError
-from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
+from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
@@ -16,7 +16,6 @@ from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.gate import usual_beams
 from fcslam.sources.images import check_image
-from fcslam.sources.pose import pose_array
 
 _LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
@@ -40,18 +39,19 @@ class Rig(NamedTuple):
         scan, upside_down = posed.scan, self.upside_down[posed.scan.laser]
         if scan.ranges_at_stamp is not None and scan.sweep is not None:
             scan = scan._replace(raw_ranges_m=scan.ranges_at_stamp(scan.sweep), sweep=None)
-        ranges_m = _turned(measured_ranges(scan), upside_down)
+        ranges_m = measured_ranges(scan)
+        ranges_m = frozen(ranges_m[::-1] if upside_down else ranges_m, np.float32)
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
-        return LaserScan(scan.stamp, ranges_m, laser, pose_array(posed.T_odom_base), sweep)
+        return LaserScan(scan.stamp, ranges_m, laser, frozen(posed.T_odom_base), sweep)
 
     def image(self, posed: PosedImage) -> CameraImage:
         """The record of an image; raises ValueError if it is damaged, or of another camera, or there is none."""
         if self.camera is None:
             raise ValueError("no camera")
         check_image(posed.image.encoded, self.camera)
-        T_odom_base = None if posed.T_odom_base is None else pose_array(posed.T_odom_base)
-        return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, T_odom_base)
+        pose = posed.T_odom_base
+        return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, None if pose is None else frozen(pose))
 
 
 def usual_scan(scans: Sequence[ScanMessage]) -> ScanMessage:
@@ -136,11 +136,3 @@ def mounted_camera(
 def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
     """The beams of a laser that is mounted upside down, as seen from above."""
     return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
-
-
-def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
-    """Reverse the ranges (beam_count,) of a laser that is mounted upside down."""
-    if upside_down:
-        ranges_m = np.ascontiguousarray(ranges_m[::-1])
-    ranges_m.setflags(write=False)
-    return ranges_m

@@ -8,14 +8,14 @@ shows that there is odometry.
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord
+from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
@@ -40,10 +40,10 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import FEWEST_POSES, PathSummary
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
-from fcslam.sources.pose import pose_array
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
+_audit = partial(Audit, "message")
 _EACH_LASER = "give one for each laser, in the same order"
 
 _MOST_JUMPS = 0.2
@@ -119,7 +119,7 @@ class RosBag:
                 watch.add(number, record)
                 yield record
             elif isinstance(entry, OdometryReading):
-                yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
+                yield Odometry(entry.stamp, frozen(entry.T_odom_base))
             else:
                 try:
                     yield rig.image(entry)
@@ -345,7 +345,3 @@ def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
     x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
     mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
     return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
-
-
-def _audit() -> Audit:
-    return Audit("message")

@@ -134,7 +134,7 @@ class BagStream:
     @cached_property
     def tree(self) -> TransformTree:
         """The frames and transforms of the robot."""
-        return self.robot.tree
+        return self.bag.census.tree(self.robot.transforms)
 
     @cached_property
     def candidates(self) -> Candidates:
@@ -263,19 +263,17 @@ class BagStream:
         """Decode one message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
             scan = self._scan_in(message)
-            return [self._corrected(scan)._replace(laser=laser) for laser in self._lasers_of(message.topic, scan.frame)]
+            return [
+                self._corrected(scan)._replace(laser=number)
+                for number, laser in enumerate(self.lasers)
+                if laser.topic == message.topic and laser.frame in (None, scan.frame)
+            ]
         if message.topic == self.topics.camera:
             return [self._image_in(message)]
         ahead_s = self._clock_ahead_s + self._options.correction.odometry_delay_s
         return [
             reading._replace(stamp=reading.stamp - ahead_s)
             for reading in (self._readings_in(message, self.odometry) if self.odometry else ())
-        ]
-
-    def _lasers_of(self, topic: Topic, frame: str) -> list[int]:
-        """The number of the laser whose scans in ``frame`` are on ``topic``; none if it is of another robot."""
-        return [
-            number for number, laser in enumerate(self.lasers) if laser.topic == topic and laser.frame in (None, frame)
         ]
 
     @cached_property

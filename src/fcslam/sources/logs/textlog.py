@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.records import Beams, LaserModel, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, Ranges, SensorRecord, frozen
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
@@ -34,7 +34,7 @@ from fcslam.sources.logs.laser import (
 )
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
-from fcslam.sources.pose import UNKNOWN_POSE, Pose, pose_array
+from fcslam.sources.pose import UNKNOWN_POSE, Pose
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -106,7 +106,7 @@ class TextLog:
         (laser,) = self._reading.survey.lasers
         unit = self._dialect.metres_per_range_unit
         for number, entry in self._entries(scans, parse_ahead(self._all_lines(), unit), audit):
-            T_odom_base = pose_array(entry.T_odom_base)
+            T_odom_base: FloatArray = frozen(entry.T_odom_base)
             if isinstance(entry, OdometryLine):
                 if self._reading.has_odometry:
                     yield Odometry(entry.stamp, T_odom_base)

@@ -20,8 +20,8 @@ from fcslam.metrics.trajectory import interpolate
 from fcslam.records import CameraModel, FloatArray, LaserModel, Ranges
 from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.runs import read_tum
-from fcslam.sources.recording.frames import RangesFile, merged_frames
-from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, SCANS_FILE, image_path, read_meta
+from fcslam.sources.recording.frames import merged_frames, opened
+from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, RANGES, SCANS_FILE, image_path, read_meta
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
     images, stamps, scans = [], [], []
     scan = None
     meta = read_meta(robot)
-    with RangesFile(robot) as ranges:
+    with opened(robot / RANGES) as ranges:
         for frame in merged_frames(robot, [SCANS_FILE, IMAGES_FILE]):
             if frame.fault is not None:
                 continue
