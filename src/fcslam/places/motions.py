@@ -219,16 +219,15 @@ def propose_motions(a: Place, b: Place) -> list[Motion]:
     """
     matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     if a.channel is Channel.CAMERA:
-        matches = _level(a, b, matches)
+        matches = level_matches(a.keypoints, b.keypoints, matches)
     proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
     return [Motion(h.T_a_b, _information(b, h, matches), share) for h in proposed if h.inlier_count >= LEAST_INLIERS]
 
 
-def _level(a: Place, b: Place, matches: Matches) -> Matches:
-    """Keep the matches whose keypoints have the same height to within ``LARGEST_LEVEL_M``."""
-    heights_a, heights_b = a.keypoints[matches.pairs[:, 0], 2], b.keypoints[matches.pairs[:, 1], 2]
-    level = np.abs(heights_a - heights_b) <= LARGEST_LEVEL_M
+def level_matches(a: NDArray[np.floating], b: NDArray[np.floating], matches: Matches) -> Matches:
+    """The matches of keypoints (N, 3) and (M, 3) that have the same height to within ``LARGEST_LEVEL_M``."""
+    level = np.abs(a[matches.pairs[:, 0], 2] - b[matches.pairs[:, 1], 2]) <= LARGEST_LEVEL_M
     return Matches(matches.pairs[level], matches.distances[level])
 
 
