@@ -176,11 +176,7 @@ def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
 
 
 def motion_errors(T_true: FloatArray, T_estimated: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Errors of estimated motions (N, 3), metres and radians, against true ones (N, 3).
-
-    Returns:
-        Norm of the translation error in metres and absolute rotation error in degrees, shape (N,) each.
-    """
+    """Errors of estimated motions (N, 3), metres and radians, against true ones: metres and degrees, shape (N,) each."""
     error = se2.between(T_true, T_estimated)
     return frozen(np.hypot(error[:, 0], error[:, 1])), frozen(np.degrees(np.abs(error[:, 2])))
 

@@ -61,18 +61,12 @@ class Hypothesis:
 def rigid_hypotheses(
     keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches
 ) -> list[Hypothesis]:
-    """Find the motions that most matches support, the best first.
+    """The motions that most matches of keypoints (N, 2) and (M, 2) support, the best first.
 
     Every two of the ``SEEDS`` closest matches propose a motion (two-point alignment). All matches score it, and least
-    squares over the inliers refines the best. The search is deterministic and never proposes a reflection.
-
-    Args:
-        keypoints_a: shape (N, 2), metres in place a's coordinate frame.
-        keypoints_b: shape (M, 2), metres in place b's coordinate frame.
-        matches: pairs of their indices.
-
-    Returns:
-        At most ``MOST_HYPOTHESES``; an empty list if no motion has ``MINIMUM_INLIERS``.
+    squares over the inliers refines the best. The search is deterministic and never proposes a reflection. There are at
+    most ``MOST_HYPOTHESES``, and none without ``MINIMUM_INLIERS``. Keypoints are in metres in their place's coordinate
+    frame.
     """
     if len(matches.pairs) < MINIMUM_INLIERS:
         return []
