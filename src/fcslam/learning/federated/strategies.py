@@ -27,10 +27,8 @@ state of a strategy."""
 class Aggregator:
     """One of Flower's strategies with momentum between rounds.
 
-    Args:
-        settings: choose the strategy and the momentum.
-        state: the ``state`` of an earlier aggregator to continue; empty for a new run.
-        strategy: makes a strategy in place of the one that the settings name.
+    ``state`` is that of an earlier aggregator to continue; empty for a new run. ``strategy`` makes a strategy in place
+    of the one that the settings name.
     """
 
     def __init__(
