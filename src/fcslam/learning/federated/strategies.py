@@ -79,7 +79,7 @@ def apply_server_momentum(
 
     A mean of updates is less noisy than each of them, so it can be followed further. With u = ``aggregated`` - ``old``:
     m <- share m + u, w <- w + u + share m. Batch statistics are taken as aggregated: they are measured and not trained,
-    and variances must not become negative. Returns w and m, which is empty before the first round.
+    and variances must not become negative. ``momentum`` is empty before the first round. Returns w and m.
     """
     following, next_momentum = {name: aggregated[name] for name in old}, {}
     for name in trained_names(old, frozen_statistics=True):
