@@ -67,8 +67,7 @@ from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.held_out import PlacePoints
-from fcslam.learning.federated.held_out import inliers as place_inliers
+from fcslam.learning.federated.held_out import inliers
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.settings import FederatedSettings
@@ -486,14 +485,6 @@ def keypoint_counts(first: Keyframe, second: Keyframe, T_first_second: FloatArra
     found = mutual_matches(first.features.descriptors, second.features.descriptors).pairs
     found = found[shown[found[:, 0]]]
     return int(np.sum(gaps[found[:, 0], found[:, 1]] <= CORRECT_PX)), int(partner.sum()), len(found)
-
-
-def inliers(first: Keyframe, second: Keyframe) -> int:
-    """Keypoints that the best motion explains, as the cloud proposes it; 0 without a motion."""
-    points = (
-        PlacePoints(each.positions[each.placed], each.features.descriptors[each.placed]) for each in (first, second)
-    )
-    return place_inliers(*points)
 
 
 def by_building(rows: Sequence[tuple], arm: str, on: str) -> FloatArray:

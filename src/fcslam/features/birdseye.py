@@ -80,10 +80,9 @@ def describe(points: FloatArray) -> BirdseyeFeatures:
 
 
 def likelihood_picture(points: FloatArray) -> Picture:
-    """Draw the likelihood field of points (N, 2), metres in the submap's coordinate frame.
+    """The likelihood field of points (N, 2), metres in the submap's coordinate frame, shape (rows, columns).
 
-    Returns:
-        ``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point, shape (rows, columns).
+    It is ``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point.
     """
     cells = points / _CELL_M + 0.5 * _SIDE_CELLS
     inside = cells[((cells >= 0.0) & (cells < _SIDE_CELLS)).all(axis=1)]

@@ -189,11 +189,7 @@ class OnnxDetector:
         return FloatFeatures(found.keypoints_px, found.scores, frozen(sampled / lengths, np.float32))
 
     def infer(self, image: GreyImage) -> tuple[Probabilities, Logits]:
-        """Run the network on an image (H, W).
-
-        Returns:
-            Keypoint probabilities (H, W), and logits (256, rows, columns) of the cells that cover the image.
-        """
+        """Keypoint probabilities (H, W) of an image, and logits (256, rows, columns) of the cells that cover it."""
         height, width = image.shape
         if not image.size:
             return np.empty(image.shape, np.float32), np.zeros((CODE_BITS, 1, 1), np.float32)

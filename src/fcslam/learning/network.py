@@ -199,15 +199,7 @@ def cell_log_probabilities(point_logits: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
-    """Logits at points, interpolated linearly.
-
-    Args:
-        code_logits: shape (B, 256, H/8, W/8).
-        points_px: shape (B, N, 2), x and y in pixels.
-
-    Returns:
-        Shape (B, N, 256).
-    """
+    """Logits (B, N, 256) at points (B, N, 2), x and y in pixels, interpolated linearly in (B, 256, H/8, W/8)."""
     rows, columns = code_logits.shape[-2:]
     size = points_px.new_tensor([columns * CELL_PX, rows * CELL_PX])
     grid = (2.0 * points_px + 1.0) / size - 1.0

@@ -52,14 +52,9 @@ def objective(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise, and the losses in it by name.
 
-    Args:
-        maps: output of the network for ``batch.images``.
-        batch: images and ground truth.
-        weights: of the losses.
-        progress: share of the training that is done, in [0, 1].
-        grid_shift: rows and columns by which the detector's cells are shifted, 0 to 7, so that the network does not
-            learn one grid of cells.
-        bits: the teacher's, if there is a teacher.
+    ``progress`` is the share of the training that is done, in [0, 1]. ``grid_shift``: rows and columns by which the
+    detector's cells are shifted, 0 to 7, so that the network does not learn one grid of cells. ``bits`` are a
+    teacher's.
     """
     logits = sample_codes(maps.code_logits.float(), batch.points)
     first, second = logits.chunk(2)
@@ -92,14 +87,9 @@ def revisit_objective(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise for points that were seen again, and the losses in it by name.
 
-    The codes of a point in both views must agree and differ from those of all other points of the batch, also in
-    images of other places. The balance of the bits, and the negatives, keep codes from becoming all the same.
-
-    Args:
-        described: by the network, for the batch's images.
-        before: by the network that training started from.
-        batch: the points.
-        weights: of the losses.
+    The codes of a point in both views must agree and differ from those of all other points of the batch, also in images
+    of other places. The balance of the bits, and the negatives, keep codes from becoming all the same. ``before`` is
+    described by the network that training started from.
     """
     soft = torch.tanh(sample_codes(described.code_logits.float(), batch.points))
     first, second = (side[batch.valid] for side in soft.chunk(2))

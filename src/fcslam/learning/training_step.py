@@ -91,13 +91,7 @@ def step_losses(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise at a step, and the losses in it by name.
 
-    Args:
-        network: in training mode, on the device of the batch.
-        batch: of this step.
-        settings: of the whole run.
-        step: number of the step in the whole run, from 0.
-        bits: the teacher's, if there is a teacher.
-        legacy: the detector whose codes are still in use, if there is one.
+    The network is in training mode, on the device of the batch; ``step`` counts from 0 over the whole run.
     """
     with reduced_precision(batch.images.device):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))

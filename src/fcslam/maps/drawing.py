@@ -276,10 +276,8 @@ def closure_png(
 ) -> bytes:
     """Draw returns of both ends of a closure as a PNG.
 
-    Args:
-        points: returns of each end in the base of the first end's keyscan, shape (N, 2), metres.
-        poses: poses (x, y, theta) of both ends' keyscans there, shape (3,), metres and radians.
-        colors: of both ends, as in ``palette``.
+    The returns (N, 2) of each end and the poses (3,) of both keyscans are in the base of the first one, in metres and
+    radians. The colors are as in ``palette``.
     """
     canvas = np.full((SIDE_PX, SIDE_PX, 3), _bgr(palette.FLOOR), np.uint8)
     centre = (poses[0][:2] + poses[1][:2]) / 2.0

@@ -48,8 +48,7 @@ def earth_frame(folder: Path, number: int) -> EarthFrame | None:
 def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
     """A map of a run folder as ``svg`` or ``tif``, or its ``pgm`` and ``yaml`` as ``zip``.
 
-    Returns:
-        None if there is no such map, or if it is to be on the earth and its place there is not known.
+    None if there is no such map, or if it is to be on the earth and its place there is not known.
 
     Raises:
         EvaluationError: the files of the map are broken.

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label, uniform_filter
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from fcslam.geometry.cell_graph import cell_graph
 from fcslam.records import FloatArray
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
@@ -189,24 +189,9 @@ def start_cells(
 def path_lengths(passable: Cells, starts: Sequence[tuple[int, int] | None], side_m: float) -> Iterator[FloatArray]:
     """Length of the shortest path from each cell ``starts`` to all cells, shape (H, W) each; infinite without one."""
     numbers = np.cumsum(passable).reshape(passable.shape) - 1
-    graph = _graph(passable, numbers, side_m)
+    graph = cell_graph(passable, side_m, np.ones(passable.shape))
     for start in starts:
         field = np.full(passable.shape, np.inf)
         if start is not None:
             field[passable] = dijkstra(graph, indices=numbers[start])
         yield field
-
-
-def _graph(passable: Cells, numbers: NDArray[np.int64], side_m: float) -> csr_array:
-    """Lengths of the steps between neighbouring passable cells."""
-    starts, ends, lengths = [], [], []
-    height, width = passable.shape
-    for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = slice(0, height - row), slice(max(0, -column), width - max(0, column))
-        there = slice(row, None), slice(max(0, column), width + min(0, column))
-        both = passable[here] & passable[there]
-        starts.append(numbers[here][both])
-        ends.append(numbers[there][both])
-        lengths.append(np.full(len(starts[-1]), side_m * float(np.hypot(row, column))))
-    ways = np.concatenate(starts + ends), np.concatenate(ends + starts)
-    return csr_array((np.concatenate(lengths + lengths), ways), shape=(int(numbers.max(initial=-1)) + 1,) * 2)

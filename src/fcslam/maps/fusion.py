@@ -55,12 +55,9 @@ def fuse(
 ) -> OccupancyMap:
     """Compute the occupancy map of keyscans; their order does not matter, their stamps do.
 
-    Args:
-        keyscans: N keyscans of any robots.
-        T_map_base: their poses in ``map``, shape (N, 3), metres and radians.
-        lasers: the lasers that each robot announced.
-        config: the occupancy grid.
-        senders: the robot of each session, if points on other robots are not drawn. None: all are.
+    ``T_map_base`` (N, 3) are the poses of the keyscans in ``map``, in metres and radians; ``lasers`` those that each
+    robot announced. ``senders`` names the robot of each session, if points on other robots are not drawn; None: all
+    are.
 
     Raises:
         ValueError: the numbers of poses and keyscans or of ranges and beams differ, or a pose is not finite.

@@ -44,13 +44,8 @@ def without_teammates(
     """The scans without the points that lie on other robots.
 
     Between two poses of its path, a robot may be anywhere on the line between them. After the last one it stands there.
-
-    Args:
-        scans: N scans with poses in ``map``.
-        stamps: of the scans, shape (N,), seconds of the same clock as the paths.
-        senders: the robot that made each scan, N names.
-        paths: the paths of each robot, one for each of its sessions.
-        config: radius of a robot, and thresholds of free cells.
+    The N scans have poses in ``map``; their stamps are of the same clock as the paths, and ``senders`` names the robot
+    that made each scan. ``paths`` has one for each session of a robot.
     """
     found = [
         suspects

@@ -101,13 +101,9 @@ class Recall:
 
 
 def revisits_found(revisits: Rows, correct: Rows, run: PoseTable) -> Mask:
-    """Find which revisits are detected by a correct closure.
+    """Which revisits are detected by a correct closure, shape (R,).
 
-    Revisits (R, 2) and correct closures (C, 2), whose ends are in either order, are pairs of rows of ``run``; the
-    result has shape (R,).
-
-    Returns:
-        Shape (R,).
+    Revisits (R, 2) and correct closures (C, 2), whose ends are in either order, are pairs of rows of ``run``.
     """
     metres, robots = path_lengths(run), run.robots
     both_ways = np.concatenate((correct, correct[:, ::-1]))

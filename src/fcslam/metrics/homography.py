@@ -126,11 +126,8 @@ def matching_score(
 ) -> float:
     """Share of the keypoints in common view whose nearest neighbour is correct to 3 px, mean of both directions.
 
-    Args:
-        points: keypoints of image 1, (N, 2), and of image 2, (M, 2), pixels.
-        nearest: row of each keypoint's nearest neighbour by descriptor in the other image, (N,) and (M,).
-        H: homography (3, 3) from image 1 to image 2.
-        size: width and height of both images, pixels.
+    ``nearest`` are the rows of each keypoint's nearest neighbour by descriptor in the other image, (N,) and (M,). H (3,
+    3) takes image 1 to image 2.
     """
     first, second = points
     forward = _share_right(first, second[nearest[0]], H, size)
@@ -168,12 +165,8 @@ class Repeatability:
 def repeatability(first: FloatArray, second: FloatArray, H: FloatArray, size: Size, most: int) -> Repeatability:
     """Compute the repeatability of keypoints, each set the strongest first.
 
-    Args:
-        first: keypoints of image 1, shape (N, 2), pixels.
-        second: keypoints of image 2, shape (M, 2), pixels.
-        H: homography (3, 3) from image 1 to image 2; distances are measured in image 2.
-        size: width and height of both images, pixels.
-        most: number of the strongest keypoints in common view that count in each image.
+    Keypoints (N, 2) and (M, 2) in pixels; H (3, 3) takes image 1 to image 2, in which distances are measured. The
+    ``most`` strongest keypoints in common view count in each image.
     """
     here = warp(H, first[in_common_view(first, H, size)][:most])
     there = second[in_common_view(second, inverse(H), size)][:most]

@@ -44,12 +44,9 @@ class Jumps:
 
 
 def find_jumps(stamps: FloatArray, poses: FloatArray, limits: JumpLimits) -> Jumps | None:
-    """Find the steps of a trajectory that exceed the limits of motion.
+    """The steps of a trajectory that exceed the limits of motion; None without any.
 
     ``stamps`` (N,) in seconds are of a clock that may step back; ``poses`` (N, 3), metres and radians.
-
-    Returns:
-        The jumps; None without any.
     """
     if len(stamps) < 2:
         return None

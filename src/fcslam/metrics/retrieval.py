@@ -175,10 +175,7 @@ def _curve(scores: FloatArray, right: FloatArray, to_find: int) -> PrecisionReca
 def excluding_recent(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDArray[np.bool_]:
     """Mask of the places (columns) that a query (row) may retrieve: those at least ``gap`` before it, shape (N, N).
 
-    A place is always similar to those just before it, so retrieving them is not a loop.
-
-    Args:
-        stamps: shape (N,), ascending; times, or numbers of places.
-        gap: in the unit of the stamps.
+    A place is always similar to those just before it, so retrieving them is not a loop. ``stamps`` (N,) ascend: times,
+    or numbers of places.
     """
     return np.asarray((stamps[:, None] - stamps >= gap) & np.tri(len(stamps), k=-1, dtype=np.bool_))

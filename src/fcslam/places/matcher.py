@@ -216,11 +216,9 @@ class PlaceMatcher:
     ) -> list[PlaceMatch]:
         """Compare a new place with the stored places that may be the same, then store it.
 
-        Args:
-            place: the new place, j.
-            predicted: T_i_j, shape (3,), of the stored places i that the joint map predicts to be near; forgotten
-                places are ignored.
-            is_unaligned: whether a stored place belongs to a robot in another map, whose relative pose is unknown.
+        ``predicted`` has T_i_j (3,) of the stored places i that the joint map predicts to be near; forgotten places are
+        ignored. ``is_unaligned`` says whether a stored place belongs to a robot in another map, whose relative pose is
+        unknown.
         """
         comparable = bool(predicted) or any(is_unaligned(i) for i in self._places)
         result = self._query(place) if comparable else QueryResult[KeyscanId]()  # Algorithm 1, lines 11-13
@@ -236,9 +234,8 @@ class PlaceMatcher:
     def match_at(self, place: Place, expected: Mapping[KeyscanId, FloatArray]) -> list[PlaceMatch]:
         """The stored places that a new place overlaps about where known starts of their robots put it.
 
-        Args:
-            place: the new place, j, which is not stored here.
-            expected: T_i_j, shape (3,), of the stored places i; forgotten places are ignored.
+        ``place`` is j, which is not stored here; ``expected`` has T_i_j (3,) of the stored places i; forgotten places
+        are ignored.
         """
         kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
         pairs = [self._pair(self._places[i], place, T_i_j, NO_PRIOR) for i, T_i_j in kept]

@@ -61,18 +61,12 @@ class Hypothesis:
 def rigid_hypotheses(
     keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches
 ) -> list[Hypothesis]:
-    """Find the motions that most matches support, the best first.
+    """The motions that most matches of keypoints (N, 2) and (M, 2) support, the best first.
 
     Every two of the ``SEEDS`` closest matches propose a motion (two-point alignment). All matches score it, and least
-    squares over the inliers refines the best. The search is deterministic and never proposes a reflection.
-
-    Args:
-        keypoints_a: shape (N, 2), metres in place a's coordinate frame.
-        keypoints_b: shape (M, 2), metres in place b's coordinate frame.
-        matches: pairs of their indices.
-
-    Returns:
-        At most ``MOST_HYPOTHESES``; an empty list if no motion has ``MINIMUM_INLIERS``.
+    squares over the inliers refines the best. The search is deterministic and never proposes a reflection. There are at
+    most ``MOST_HYPOTHESES``, and none without ``MINIMUM_INLIERS``. Keypoints are in metres in their place's coordinate
+    frame.
     """
     if len(matches.pairs) < MINIMUM_INLIERS:
         return []
@@ -219,16 +213,15 @@ def propose_motions(a: Place, b: Place) -> list[Motion]:
     """
     matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     if a.channel is Channel.CAMERA:
-        matches = _level(a, b, matches)
+        matches = level_matches(a.keypoints, b.keypoints, matches)
     proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
     return [Motion(h.T_a_b, _information(b, h, matches), share) for h in proposed if h.inlier_count >= LEAST_INLIERS]
 
 
-def _level(a: Place, b: Place, matches: Matches) -> Matches:
-    """Keep the matches whose keypoints have the same height to within ``LARGEST_LEVEL_M``."""
-    heights_a, heights_b = a.keypoints[matches.pairs[:, 0], 2], b.keypoints[matches.pairs[:, 1], 2]
-    level = np.abs(heights_a - heights_b) <= LARGEST_LEVEL_M
+def level_matches(a: NDArray[np.floating], b: NDArray[np.floating], matches: Matches) -> Matches:
+    """The matches of keypoints (N, 3) and (M, 3) that have the same height to within ``LARGEST_LEVEL_M``."""
+    level = np.abs(a[matches.pairs[:, 0], 2] - b[matches.pairs[:, 1], 2]) <= LARGEST_LEVEL_M
     return Matches(matches.pairs[level], matches.distances[level])
 
 

@@ -88,12 +88,9 @@ def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings
 
 
 def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin: str) -> CoordinatorState | None:
-    """Read a checkpoint of this run.
+    """The state in a checkpoint of this run; None if there is no file.
 
     ``initial`` and ``origin``: the weights that the run starts from, and their detector version.
-
-    Returns:
-        The state, or None if there is no file.
 
     Raises:
         TrainingError: the file is broken, or belongs to a run with other settings, weights or network.

@@ -65,12 +65,9 @@ def run_job(
     grid: RobotGrid,
     wait: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Run a job, or continue it.
+    """Run a job, or continue it; returns the files for the user: detector, picture of the rounds, and model card.
 
     ``wait``: as in ``CoordinatorHooks``.
-
-    Returns:
-        The files for the user: the detector, the picture of the rounds, and the model card.
 
     Raises:
         TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
@@ -115,13 +112,10 @@ def federate_locally(
     callbacks: ProgressCallbacks,
     most_images: int | None = None,
 ) -> list[Path]:
-    """Run or continue federated training.
+    """Run or continue federated training; returns the files for the user, see ``run_job``.
 
     ``folders`` hold the images of each robot, which has the name of its folder. It trains on its first ``most_images``
     alone; None for all.
-
-    Returns:
-        The files for the user, see ``run_job``.
 
     Raises:
         TrainingError: two folders have the same name, a folder is unusable, no robot can train, or the output folder

@@ -83,13 +83,11 @@ class LearningRobot:
         return bool(self._client.revisits)
 
     def _look(self) -> None:
-        examples = own_examples(self._folder, self._settings)
-        self._client.revisits, self._client.held_out = examples.revisits, examples.held_out
-        self._client.inputs = CodeInputs()
-        revisits = examples.revisits
+        revisits, held_out = own_examples(self._folder, self._settings)
+        self._client.revisits, self._client.held_out, self._client.inputs = revisits, held_out, CodeInputs()
         tell(
             f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
-            f"{len(examples.held_out.revisits)} pairs held out"
+            f"{len(held_out.revisits)} pairs held out"
         )
 
 

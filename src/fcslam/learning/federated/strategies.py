@@ -27,10 +27,8 @@ state of a strategy."""
 class Aggregator:
     """One of Flower's strategies with momentum between rounds.
 
-    Args:
-        settings: choose the strategy and the momentum.
-        state: the ``state`` of an earlier aggregator to continue; empty for a new run.
-        strategy: makes a strategy in place of the one that the settings name.
+    ``state`` is that of an earlier aggregator to continue; empty for a new run. ``strategy`` makes a strategy in place
+    of the one that the settings name.
     """
 
     def __init__(
@@ -81,16 +79,7 @@ def apply_server_momentum(
 
     A mean of updates is less noisy than each of them, so it can be followed further. With u = ``aggregated`` - ``old``:
     m <- share m + u, w <- w + u + share m. Batch statistics are taken as aggregated: they are measured and not trained,
-    and variances must not become negative.
-
-    Args:
-        aggregated: mean of the robots' weights.
-        old: weights from which the robots trained.
-        momentum: of the last round; empty before the first.
-        share: of the momentum that is kept, in [0, 1).
-
-    Returns:
-        The next weights, and the momentum for the next round.
+    and variances must not become negative. ``momentum`` is empty before the first round. Returns w and m.
     """
     following, next_momentum = {name: aggregated[name] for name in old}, {}
     for name in trained_names(old, frozen_statistics=True):

@@ -143,12 +143,9 @@ def measure(
 
 
 def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
-    """Percentile bootstrap of any measure of ``count`` samples.
+    """Any measure of ``count`` samples, and its interval by percentile bootstrap.
 
     ``measure`` is given the indices (N,) of samples; draws with NaN are ignored.
-
-    Returns:
-        The measure of all samples and its interval.
     """
     whole = measure(np.arange(count))
     drawn = np.array([measure(rng.integers(count, size=count)) for _ in range(DRAWS if count else 0)])
