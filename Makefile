@@ -32,7 +32,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py benchmarks/vocabulary_growth.py benchmarks/wall_tags.py benchmarks/relation_closures.py benchmarks/subpixel_loss.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
+.PHONY: help install gl learning demo test test-fast test-system test-all test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
 # Where this is set, each process of a test compiles the package and the tests anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -42,6 +42,7 @@ help:
 	@echo "make test         all tests that need no recordings"
 	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
+	@echo "make test-all     test and test-system in one run"
 	@echo "make test-training federated training, with attackers and with deployed daemons; run make learning first"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
@@ -99,6 +100,9 @@ test-fast: $(INSTALLED)
 
 test-system: $(INSTALLED)
 	@$(PYTEST) -m system -rs
+
+test-all: $(INSTALLED)
+	@$(PYTEST) -m "not training" -rs
 
 # Needs what `make learning` installs.
 test-training: $(INSTALLED)

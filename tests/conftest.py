@@ -1,5 +1,6 @@
 """One small fleet for all tests that need one: simulated once, its packets made once."""
 
+import gc
 import re
 import tempfile
 from pathlib import Path
@@ -34,6 +35,17 @@ SLOW = frozenset({"drawn", "packets", "logs", "desk", "postgres_server"})
 SECURITY = Path(__file__).parents[1] / "docs" / "develop" / "security.md"
 THREATS = frozenset(re.findall(r"`(test_\w+)`", SECURITY.read_text(encoding="utf-8")))
 """The tests that the page on security names: they play an attacker."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Collecting tests leaves no garbage, and they stay to the end: nobody looks through them again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items):
@@ -109,8 +121,8 @@ def postgres(postgres_server):
 
 @pytest.fixture(scope="session")
 def drawn() -> SimulatedFleet:
-    """Three robots, 12 m each, that meet."""
-    return small_fleet.draw(3, 12.0)
+    """Three robots, 8 m each, that meet."""
+    return small_fleet.draw(3, 8.0)
 
 
 @pytest.fixture(scope="session")

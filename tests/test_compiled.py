@@ -1,6 +1,5 @@
-"""Compiled functions work without a folder for their machine code, and warm-ups compile all that a robot needs."""
+"""Compiled functions work with a folder for their machine code and without one."""
 
-import json
 import os
 import subprocess
 import sys
@@ -18,30 +17,6 @@ from fcslam.service.warmup import is_cold
 assert hamming(*np.zeros((2, 4), np.uint64)) == 0
 assert is_cold()
 assert tell_uncached(notices(False))
-"""
-
-AFTER_ALL = """
-import json, sys
-from numba.core.dispatcher import Dispatcher
-from fcslam.mission.driving import one_by_one
-from fcslam.robot.frontend import RobotConfig
-from fcslam.service.warmup import WARM_UPS, is_cold
-from fcslam.sources import open_source
-
-def compiled():
-    return {
-        f"{value.py_func.__module__}.{value.py_func.__name__}": sorted(map(str, value.signatures))
-        for name, module in list(sys.modules.items()) if name.startswith("fcslam.")
-        for value in vars(module).values() if isinstance(value, Dispatcher)
-    }
-
-for run in WARM_UPS:
-    run()
-before = compiled()
-with one_by_one([open_source(path) for path in sys.argv[1:]], RobotConfig()) as robots:
-    legs = [leg for robot in robots for leg in robot]
-after = compiled()
-print(json.dumps([is_cold(), len(legs), [name for name in after if after[name] != before.get(name)]]))
 """
 
 
@@ -105,13 +80,3 @@ def test_the_cache_holds_what_was_compiled(tmp_path):
     )
     outputs = [run(script, NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout for _ in range(2)]
     assert outputs == ["False 2 True 0\n", "True 2 True 1\n"]
-
-
-@pytest.mark.slow
-def test_after_the_warm_ups_a_robot_finds_all_its_code_compiled(logs):
-    done = run(AFTER_ALL, *logs)
-    assert done.returncode == 0, done.stderr
-    is_cold, legs, compiled = json.loads(done.stdout)
-    assert not is_cold
-    assert legs > 3
-    assert compiled == []

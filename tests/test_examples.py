@@ -48,7 +48,7 @@ def needs(*modules):
 def two(tmp_path_factory):
     """The run folder of map_logs.py, and what it printed."""
     folder = tmp_path_factory.mktemp("examples")
-    return folder / "two", started("map_logs.py", "two", cwd=folder)
+    return folder / "two", start("map_logs.py", "two", cwd=folder)
 
 
 @pytest.mark.parametrize("program", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
@@ -115,6 +115,7 @@ def test_a_network_of_ones_own_is_a_detector(tmp_path):
 
 @pytest.mark.slow
 @needs("torch", "onnx", "flwr")
+@pytest.mark.usefixtures("brief_validation")
 def test_a_strategy_of_ones_own_aggregates(tmp_path):
     for robot in range(3):
         (tmp_path / f"robot{robot}").mkdir()

@@ -38,7 +38,7 @@ def shown(tmp_path_factory):
     (output / "notes").write_text("mine")
     (output / "recordings" / "stale").write_text("of the first run")
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        assert run_demo(output, "--no-camera") == 0
+        assert run_demo(output, "--no-camera", "--path-length", "8") == 0
     return output, out.getvalue().splitlines(), err.getvalue().splitlines()
 
 
@@ -47,7 +47,7 @@ def test_it_ends_with_a_run_a_figure_and_a_table(shown):
     shown, _, _ = shown
     run = open_run(shown / "run")
     assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
-    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 10.0
+    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 7.0
     assert cv2.imread(str(shown / "figure.png")).shape[1] == 2000
     figures = told(shown)
     assert figures["maps"] == 1
@@ -61,7 +61,7 @@ def test_it_replaces_itself_and_nothing_else(shown):
     shown, _, _ = shown
     assert (shown / "notes").read_text() == "mine"
     assert not (shown / "recordings" / "stale").exists()
-    assert "path_length_m: 12.0" in (shown / "recordings" / "simulation.yaml").read_text()
+    assert "path_length_m: 8.0" in (shown / "recordings" / "simulation.yaml").read_text()
 
 
 @pytest.mark.slow

@@ -345,21 +345,20 @@ def test_what_is_drawn_needs_the_run_folder(run, tmp_path, capsys):
 def test_of_people_who_edit_at_once_nobody_loses_an_edit(run):
     session, trajectory = next(iter(open_run(run).trajectories.items()))
     context = get_context("spawn")
-    people = [
-        context.Process(target=edit_often, args=(run, name, session, float(trajectory.stamps[0])))
-        for name in ("anna", "ben")
-    ]
-    for person in people:
-        person.start()
-    for person in people:
-        person.join()
-    assert [person.exitcode for person in people] == [0, 0]
+    both = context.Barrier(2)
+    anna, ben = ((run, name, session, float(trajectory.stamps[0]), both) for name in ("anna", "ben"))
+    other = context.Process(target=edit_often, args=anna)
+    other.start()
+    edit_often(*ben)
+    other.join()
+    assert other.exitcode == 0
     edits = read_mission(run).edits
     assert [edit.number for edit in edits] == list(range(1, 7))
     assert sorted(edit.author for edit in edits) == [name for name in ("anna", "ben") for _ in range(3)]
 
 
-def edit_often(run, author, session, stamp):
+def edit_often(run, author, session, stamp, both):
+    both.wait(60.0)
     for number in range(3):
         region = MapRegion(RegionUse.AREA, str(number), session, stamp, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
         edit_mission(run, [region], author, 0.0)

@@ -10,14 +10,14 @@ from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig, FusionStrategy
 from fcslam.errors import InputError, PacketError
 from fcslam.places.matcher import MatchDecision, MatcherConfig
-from fcslam.places.words import train_words, write_vocabularies
+from fcslam.places.words import WordVocabulary, write_vocabularies
 from fcslam.records import Channel, KeyscanId, MapTile, WordPlace, frozen
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
 from tests.scripted import LASER, keyscan, motion
 
 CODES = np.random.default_rng(0).integers(0, 256, (64, 32), np.uint8)
-VOCABULARY = train_words(Channel.LIDAR, "test-1", CODES, 64, seed=0)
+VOCABULARY = WordVocabulary(Channel.LIDAR, "test-1", frozen(np.unique(CODES, axis=0), np.uint8))
 STEP = np.array([1.0, 0.0, 0.0])
 HELLO = Hello("a", 0, (LASER,), {Channel.LIDAR: "test-1"}, vocabularies={Channel.LIDAR: VOCABULARY.digest})
 BARE = replace(keyscan("a", 0, 0.0), ranges_m=frozen([], np.float32))

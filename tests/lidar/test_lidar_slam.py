@@ -204,7 +204,7 @@ def test_motions_combined_solve_as_the_keyscans_between_would():
 
 def test_a_well_known_area_holds_no_more_submaps_however_often_it_is_crossed():
     """A robot that goes to and fro on one spot's surroundings; what it forgets costs no closure of the newest visit."""
-    truth = drive([(1.5, 1.5), (6.0, 1.5)] * 8)
+    truth = drive([(1.5, 1.5), (6.0, 1.5)] * 5)
     there = recording(truth, truth, ring())
     few = LidarConfig(closing=ClosingConfig(most_nearby=3))
     mapped, unlimited = Mapped(there, few), Mapped(there)

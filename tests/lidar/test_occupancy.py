@@ -238,8 +238,8 @@ def test_a_person_who_left_is_cleared_by_beams_without_return(later):
 @pytest.mark.parametrize(("seen_from_m", "lost"), [(1.2, 0.0), (4.0, 0.05)], ids=["black", "lossy"])
 def test_a_wall_stays_whose_returns_are_missing_at_times(seen_from_m, lost):
     """A black wall returns no beam from afar, where the robot is most of the time; or any beam may fail."""
-    near = [short_scan(-2.0 + 0.08 * k, 2.0, seen_from_m, lost, k) for k in range(50)]
-    far = [short_scan(-2.0 + 0.02 * k, 0.5, seen_from_m, lost, k) for k in range(200)]
+    near = [short_scan(-2.0 + 0.16 * k, 2.0, seen_from_m, lost, k) for k in range(25)]
+    far = [short_scan(-2.0 + 0.04 * k, 0.5, seen_from_m, lost, k) for k in range(100)]
     for periods in ([near + far], [near, far]):
         *_, grid = cast_periods(periods, CONFIG)
         cells = classify(grid, CONFIG)

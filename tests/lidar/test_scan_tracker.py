@@ -143,9 +143,9 @@ def test_a_slip_is_found_although_a_wrong_match_explains_what_is_known(slip):
 
 @pytest.mark.slow
 def test_without_returns_poses_follow_odometry(truth, odometry):
-    scans = [replace(s, ranges_m=frozen(np.full(360, np.nan), np.float32)) for s in recording(truth, odometry, ring())]
-    poses, _ = track(scans)
-    np.testing.assert_allclose(poses, odometry, atol=1e-9)
+    seen = recording(truth[:100], odometry[:100], ring())
+    poses, _ = track([replace(scan, ranges_m=frozen(np.full(360, np.nan), np.float32)) for scan in seen])
+    np.testing.assert_allclose(poses, odometry[:100], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -196,7 +196,7 @@ def test_somebody_who_walks_by_does_not_take_the_robot_along(truth, odometry):
 
 @pytest.mark.slow
 def test_the_buffer_does_not_grow_with_the_drive(truth):
-    """Twice round the ring needs no more than once: at most two fields, each as large as the stretch it holds."""
+    """A drive twice as long needs no more: at most two fields, each as large as the stretch it holds."""
 
     def memory(rounds):
         poses = ring_drive(rounds)
@@ -207,7 +207,7 @@ def test_the_buffer_does_not_grow_with_the_drive(truth):
         assert all(field.arrays.table.shape == (TABLE, TABLE) for field in fields)
         return max(len(field.points) for field in fields), max(field.arrays.labels.nbytes for field in fields)
 
-    once, twice = memory(1.0), memory(2.0)
+    once, twice = memory(0.7), memory(1.4)
     assert twice[0] < 1.3 * once[0]
     assert twice[1] <= 2 * once[1]
 

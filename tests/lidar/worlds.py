@@ -91,7 +91,7 @@ def _nearest(ray, segments, laser):
 
 def scan_at(pose, segments, laser=LASER, noise_m=0.0, rng=None):
     """Points seen from one pose."""
-    return point_scan(ranges(pose, segments, laser, noise_m, rng)[0], laser)
+    return point_scan(frozen(ranges(pose, segments, laser, noise_m, rng)[0], np.float32), laser)
 
 
 def drive(waypoints, step_m=0.1, step_rad=0.1):

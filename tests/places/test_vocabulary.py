@@ -19,7 +19,12 @@ def clustered_codes(rng, count, centres=None):
     if centres is None:
         centres = rng.integers(0, 256, (16, 32), dtype=np.uint8)
     codes = centres[rng.integers(0, len(centres), count)]
-    return code_words(codes ^ np.packbits(rng.random((count, 256)) < 0.03, axis=1))
+    return trained_on(codes ^ np.packbits(rng.random((count, 256)) < 0.03, axis=1))
+
+
+def trained_on(codes):
+    """Codes as an index trains on them. Of a read-only array the same code would be compiled once more."""
+    return code_words(codes).copy()
 
 
 def distances(code, centres):
@@ -103,13 +108,13 @@ def test_majorities_of_bits_are_those_of_counting_them(seed, count, clusters):
     rng = np.random.default_rng(seed)
     bits = rng.random((count, 256)) < rng.random(256)
     labels = rng.integers(0, clusters, count)
-    found = _majorities(code_words(np.packbits(bits, axis=1)), labels, clusters)
+    found = _majorities(trained_on(np.packbits(bits, axis=1)), labels, clusters)
     expected = [2 * bits[labels == label].sum(axis=0) > (labels == label).sum() for label in range(clusters)]
     np.testing.assert_array_equal(np.unpackbits(found.view(np.uint8), axis=1), expected)
 
 
 def test_limits_of_the_shape_hold():
-    codes = code_words(np.random.default_rng(4).integers(0, 256, (500, 32), dtype=np.uint8))
+    codes = trained_on(np.random.default_rng(4).integers(0, 256, (500, 32), dtype=np.uint8))
     for depth in (1, 2, 3):
         tree = grow_tree(codes, TreeShape(branching=3, depth=depth, smallest_split=10, iterations=8), np.uint64(0))
         assert 1 < (tree.child_count == 0).sum() <= 3**depth

@@ -21,7 +21,7 @@ class Robot:
     """An outbox and its sender, on a clock that only moves when the sender sleeps."""
 
     def __init__(self, path, network):
-        self.now = 0.0
+        self.now, self.network = 0.0, network
         self.corrections, self.kept, self.refused = [], [], []
         self.aside = self.refused.append
         self.outbox = Outbox(path, "alice", 10**9)
@@ -95,7 +95,7 @@ def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large
 
 
 def test_a_cloud_that_is_away_costs_nothing_but_time(robot):
-    network = robot.sender._transport
+    network = robot.network
     network.faults += ["request lost"] * 12
     robot.outbox.put([said(k) for k in range(10)])
     delays = [robot.step() for _ in range(12)]
@@ -119,7 +119,7 @@ def test_waiting_grows_to_a_bound_and_is_spread_over_all_of_it():
 def test_a_cloud_that_asks_for_patience_gets_it(robot):
     robot.step()
     robot.outbox.put([said(0)])
-    robot.sender._transport.faults.append("busy")
+    robot.network.faults.append("busy")
     assert 2.0 <= robot.step() <= 3.0
 
 
@@ -128,11 +128,11 @@ def test_what_collects_goes_together_and_what_is_too_much_goes_at_once(robot):
     robot.outbox.put(large)
     assert robot.step() == 0.0, "more than a batch holds"
     assert robot.step() == SEND_INTERVAL_S
-    assert robot.sender._transport.requests == 3, "the state, and two batches"
+    assert robot.network.requests == 3, "the state, and two batches"
 
 
 def test_a_robot_at_rest_asks_now_and_then_and_hears_of_corrections_once(robot):
-    network = robot.sender._transport
+    network = robot.network
     robot.outbox.put([said(0)])
     robot.step()
     network.cloud.correction = 3
@@ -168,7 +168,7 @@ def test_a_correction_of_an_earlier_start_is_about_another_odometry(tmp_path):
 
 def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
     packets = [said(k, time=2000.0 + k) for k in range(6)]
-    network = robot.sender._transport
+    network = robot.network
     network.cloud.unwanted = {content(encode(packets[k])) for k in (2, 3)}
     robot.outbox.put(packets)
     for _ in range(5):
@@ -185,8 +185,8 @@ def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
     def no_room(*_):
         raise StateError("no room")
 
-    robot.sender._refused = no_room
-    robot.sender._transport.cloud.unwanted = {content(encode(said(1)))}
+    robot.aside = no_room
+    robot.network.cloud.unwanted = {content(encode(said(1)))}
     robot.outbox.put([said(0, HELLO), said(1)])
     with pytest.raises(StateError, match="no room"):
         robot.step()
@@ -196,7 +196,7 @@ def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
 
 def test_what_was_refused_in_an_answer_that_was_lost_is_set_aside(robot):
     packets = [said(k, time=2000.0 + k) for k in range(3)]
-    network = robot.sender._transport
+    network = robot.network
     network.cloud.unwanted = {content(encode(packets[1]))}
     robot.outbox.put(packets)
     network.faults = ["none", "answer lost"]
@@ -212,14 +212,14 @@ def test_what_was_refused_in_an_answer_that_was_lost_is_set_aside(robot):
 def test_a_robot_says_that_it_is_removed_and_no_longer_when_it_is_back(robot):
     robot.outbox.put([said(k) for k in range(2)])
     for removed in (False, True, False):
-        robot.sender._transport.cloud.removed = removed
+        robot.network.cloud.removed = removed
         robot.now += 10.0
         robot.sender.step()
         assert (robot.sender.removed_notice is not None) == removed
 
 
 def test_what_the_cloud_refuses_after_it_confirmed_it_is_told(robot):
-    network = robot.sender._transport
+    network = robot.network
     robot.outbox.put([said(k) for k in range(3)])
     robot.step()
     assert robot.sender.refused_notice is None
@@ -237,7 +237,7 @@ def test_what_the_cloud_refuses_after_it_confirmed_it_is_told(robot):
 
 @pytest.mark.parametrize("most", [1, 3, 7])
 def test_a_batch_that_is_too_large_is_sent_in_parts(robot, most):
-    network = robot.sender._transport
+    network = robot.network
     network.cloud.most = most
     robot.outbox.put([said(k, LIDAR_PLACE) for k in range(20)])
     for _ in range(30):
@@ -247,7 +247,7 @@ def test_a_batch_that_is_too_large_is_sent_in_parts(robot, most):
 
 
 def test_a_single_packet_that_is_too_large_is_told(robot):
-    robot.sender._transport.cloud.most = 0
+    robot.network.cloud.most = 0
     robot.outbox.put([said(0)])
     with pytest.raises(OversizeError):
         robot.step()
@@ -255,12 +255,7 @@ def test_a_single_packet_that_is_too_large_is_told(robot):
 
 
 def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
-    class Deaf(Network):
-        def send(self, *_):
-            return HttpResponse()
-
-    deaf = Deaf(FakeCloud())
-    robot.sender._transport = deaf
+    robot.network.send = lambda *_: HttpResponse()
     robot.outbox.put([said(0)])
     delays = [robot.step() for _ in range(8)]
     assert "confirms no packet" in robot.sender.trouble
@@ -295,13 +290,12 @@ def test_a_cloud_that_opens_another_mission_is_found_out_and_gets_the_next_start
 def test_another_mission_is_found_out_though_the_cloud_takes_nothing(robot):
     """It asks for what comes first, which this robot sent to the mission before."""
 
-    class FarBehind(Network):
-        def send(self, *_):
-            raise UnavailableError("packet 2 is far ahead; send packet 0 first")
+    def far_behind(*_):
+        raise UnavailableError("packet 2 is far ahead; send packet 0 first")
 
     robot.outbox.put([said(0), said(1)])
     robot.step()
-    robot.sender._transport = FarBehind(FakeCloud())
+    robot.network.cloud, robot.network.send = FakeCloud(), far_behind
     robot.outbox.put([said(2)])
     robot.step()
     assert "far ahead" in robot.sender.trouble
@@ -313,7 +307,7 @@ def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
     def turned_away():
         raise CloudError("no token")
 
-    robot.sender._transport.state = turned_away
+    robot.network.state = turned_away
     robot.outbox.put([said(0)])
     robot.sender.run(threading.Event())
     assert str(robot.sender.failure) == "no token"
@@ -321,7 +315,7 @@ def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
 
 
 def test_a_detector_is_fetched_once_and_one_that_is_not_there_not_asked_for_again(robot):
-    cloud = robot.sender._transport.cloud
+    cloud = robot.network.cloud
     missing = replace(DETECTOR_UPDATE.file, version="gone")
     cloud.detector_updates = {DETECTOR_UPDATE.file: b"network", missing: None}
     for ordinal in range(5):

@@ -29,7 +29,7 @@ SHIPPED = describe_detector_file(BUNDLED_NETWORK)
 
 @pytest.fixture(scope="module")
 def seen():
-    return records_of([(1.5, 1.5), (14.5, 1.5), (14.5, 4.0)], 10)[0]
+    return records_of([(1.5, 1.5), (12.5, 1.5)], 10)[0]
 
 
 def driven(robot, records, switch_after=None):
@@ -146,7 +146,7 @@ def test_no_image_leaves_with_what_is_described_again(seen):
 @pytest.fixture(scope="module")
 def fleet(seen):
     """Robot old drove with ORB and never met the other's words; robot new has had the network from the start."""
-    others = records_of([(4.0, 1.6), (14.4, 1.6), (14.4, 8.0)], 11)[0]
+    others = records_of([(3.0, 1.6), (12.5, 1.6)], 11)[0]
     last = max(k for k, record in enumerate(seen) if isinstance(record, LaserScan))
     return {
         "switched": driven(RobotFrontend("old", WITH_ORB), seen, last),

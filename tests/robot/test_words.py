@@ -18,6 +18,7 @@ from fcslam.robot.words import Sends, WordsConfig, tiles_of
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import measure
+from tests import small_fleet
 
 
 def test_a_map_comes_back_from_its_tiles():
@@ -84,17 +85,21 @@ def config(packets, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def sent(drawn, config):
-    robot = drawn.robots[0]
+def robot():
+    return small_fleet.draw(1, path_length_m=12.0).robots[0]
+
+
+@pytest.fixture(scope="module")
+def sent(robot, config):
     frontend = RobotFrontend(robot.name, config)
     return [*(packet for scan in robot.scans() for packet in frontend.process(scan)), *frontend.finish()]
 
 
-def test_neither_ranges_nor_descriptors_leave_the_robot(sent, packets):
+def test_neither_ranges_nor_descriptors_leave_the_robot(robot, sent):
     kinds = Counter(type(packet.body) for packet in sent)
     assert set(kinds) == {Hello, Keyscan, Constraint, WordPlace, MapTile}
     assert not any(len(packet.body.ranges_m) for packet in sent if isinstance(packet.body, Keyscan))
-    whole = [packet for packet in packets if packet.robot == sent[0].robot]
+    whole = small_fleet.sent_by(robot)
     assert kinds[WordPlace] == sum(isinstance(packet.body, Place) for packet in whole)
     assert sum(measure(packet).size for packet in sent) < sum(measure(packet).size for packet in whole) / 3
 

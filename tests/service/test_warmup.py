@@ -1,4 +1,4 @@
-"""After the warm-up nothing is left to be compiled, whatever robots send."""
+"""After the warm-ups nothing is left to be compiled, whatever robots see and send."""
 
 import json
 import subprocess
@@ -12,7 +12,10 @@ SCRIPT = """
 import json, sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
-from fcslam.service.warmup import warm_up_decoding, warm_up_fleet
+from fcslam.mission.driving import one_by_one
+from fcslam.robot.frontend import RobotConfig
+from fcslam.service.warmup import WARM_UPS, is_cold, warm_up_decoding, warm_up_fleet
+from fcslam.sources import open_source
 
 def compiled():
     found = {}
@@ -49,16 +52,25 @@ result = cloud.finalize()
 tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
 run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False)
 between = sum(c.i.robot != c.j.robot for c in result.closures)
-print(json.dumps([sum(map(len, cold.values())), sum(map(len, warm.values())), of_decoding, news(warm), between]))
+of_fleet = news(warm)
+for run in WARM_UPS:
+    run()
+hot = compiled()
+with one_by_one([open_source(path) for path in sys.argv[2:]], RobotConfig()) as robots:
+    legs = sum(len(list(robot)) for robot in robots)
+print(json.dumps([sum(map(len, cold.values())), sum(map(len, warm.values())), sum(map(len, hot.values())),
+                  is_cold(), of_decoding, of_fleet, news(hot), between, legs]))
 """
 
 
 @pytest.mark.slow
-def test_after_the_warm_up_a_fleet_finds_all_its_code_compiled(tmp_path, packets):
+def test_after_the_warm_ups_fleet_and_robots_find_all_their_code_compiled(tmp_path, packets, logs):
     stream = tmp_path / "stream.json"
     stream.write_text(json.dumps([encode(packet).hex() for packet in packets]))
-    done = subprocess.run([sys.executable, "-c", SCRIPT, stream], capture_output=True, text=True, check=True)
-    cold, warm, of_decoding, of_fleet, between = json.loads(done.stdout)
-    assert warm > cold, "the warm-up compiles something"
+    done = subprocess.run([sys.executable, "-c", SCRIPT, stream, *logs], capture_output=True, text=True, check=True)
+    cold, warm, hot, is_cold, of_decoding, of_fleet, of_robots, between, legs = json.loads(done.stdout)
+    assert cold < warm < hot, "the warm-ups compile something"
+    assert not is_cold
     assert between > 0, "the fleet gives the matcher and the verification something to do"
-    assert (of_decoding, of_fleet) == ({}, {})
+    assert legs > 3
+    assert (of_decoding, of_fleet, of_robots) == ({}, {}, {})

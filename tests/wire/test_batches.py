@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 from fcslam.errors import PacketError
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES
-from fcslam.wire.packets import encode
-from tests.wire.examples import EXAMPLES
+from tests.wire.examples import GOLDEN
 
-PACKETS = [encode(example) for example in EXAMPLES.values()]
+PACKETS = [path.read_bytes() for path in sorted(GOLDEN.iterdir())]
 
 
 def lengths_first(packets):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
+from fcslam.cloud import recognition
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.recognition import VocabularyState
 from fcslam.errors import ServiceError, StoreError
@@ -31,8 +32,8 @@ from fcslam.wire.batches import read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
-from tests.scripted import LASER
-from tests.service.http.desk import POSES, A, B, Desk, put_detector
+from tests.scripted import LASER, ScriptedMatcher
+from tests.service.http.desk import POSES, SCRIPT, A, B, Desk, put_detector
 
 ROOT = Path(__file__).parents[3]
 
@@ -45,6 +46,18 @@ def mapped(desk):
     for robot, data in (("a", A), ("b", B)):
         desk.told(desk.send(robot, data))
     return desk
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """The same for all tests that only look."""
+    with pytest.MonkeyPatch.context() as patch, Desk(tmp_path_factory.mktemp("shown") / "data") as desk:
+        patch.setattr(recognition, "PlaceMatcher", ScriptedMatcher)
+        patch.setattr(ScriptedMatcher, "script", SCRIPT)
+        for robot, data in (("a", A), ("b", B)):
+            desk.told(desk.send(robot, data))
+        patch.undo()
+        yield desk
 
 
 def get(desk, path, as_="eye"):
@@ -159,26 +172,26 @@ def one_map(robots, layers):
     return {**summary, "robots": robots, "layers": layers}
 
 
-def test_viewers_see_the_fleet(mapped):
-    fleet = get(mapped, "fleet").json()
+def test_viewers_see_the_fleet(shown):
+    fleet = get(shown, "fleet").json()
     assert (fleet["robots"], fleet["maps"], fleet["packets"]) == (["a", "b"], 1, len(A) + len(B))
-    robots = get(mapped, "robots").json()
+    robots = get(shown, "robots").json()
     assert [(robot["session"], robot["map"], robot["packets"]) for robot in robots] == [
         ("a", 0, len(A)),
         ("b", 0, len(B)),
     ]
-    assert get(mapped, "robots/a").json()["refused"] == []
-    assert mapped.ask("GET", f"{API}/robots/c", "eye").status_code == 404
-    accepted = get(mapped, "closures?status=accepted").json()
+    assert get(shown, "robots/a").json()["refused"] == []
+    assert shown.ask("GET", f"{API}/robots/c", "eye").status_code == 404
+    accepted = get(shown, "closures?status=accepted").json()
     assert len(accepted) == 4
     assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
-    assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
-    assert get(mapped, "maps").json() == [one_map(["a", "b"], ["quality", "changes"])]
+    assert get(shown, "closures?status=accepted&limit=3").json() == accepted[1:]
+    assert get(shown, "maps").json() == [one_map(["a", "b"], ["quality", "changes"])]
 
 
-def test_the_extent_of_a_map_is_that_of_its_image(mapped):
-    (map_,) = get(mapped, "maps").json()
-    image, description = get(mapped, "maps/0.pgm").content, yaml.safe_load(get(mapped, "maps/0.yaml").text)
+def test_the_extent_of_a_map_is_that_of_its_image(shown):
+    (map_,) = get(shown, "maps").json()
+    image, description = get(shown, "maps/0.pgm").content, yaml.safe_load(get(shown, "maps/0.yaml").text)
     width, height = map(int, image.split(maxsplit=3)[1:3])
     (x, y, _), side = description["origin"], description["resolution"]
     assert map_["extent"] == pytest.approx([x, y, x + width * side, y + height * side])
@@ -204,8 +217,8 @@ def test_viewers_see_the_floors(desk, scripted, monkeypatch):
     assert refused.json() == {"error": "a and b are on different floors, which no closure joins"}
 
 
-def test_viewers_get_the_files_of_the_live_run(mapped):
-    live = mapped.state.mission.folder.live
+def test_viewers_get_the_files_of_the_live_run(shown):
+    live = shown.state.mission.folder.live
     for path, name in {
         "maps/0.png": "map.png",
         "maps/0.pgm": "map.pgm",
@@ -213,14 +226,14 @@ def test_viewers_get_the_files_of_the_live_run(mapped):
         "pose_graph.g2o": "pose_graph.g2o",
         "trajectories/b.tum": "trajectories/b.tum",
     }.items():
-        assert get(mapped, path).content == (live / name).read_bytes()
+        assert get(shown, path).content == (live / name).read_bytes()
     for path in ("maps/1.png", "trajectories/c.tum", "maps/0.exe", "trajectories/..%2F..%2Fmission.tum"):
-        assert mapped.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
+        assert shown.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
 
 
 @pytest.mark.parametrize("path", [f"maps/{10**300}.png", f"maps/0/tiles/0/{10**30}/0.png"])
-def test_numbers_that_no_map_has_are_refused_and_no_fault_of_the_service(mapped, path):
-    assert mapped.ask("GET", f"{API}/{path}", "eye").status_code == 400
+def test_numbers_that_no_map_has_are_refused_and_no_fault_of_the_service(shown, path):
+    assert shown.ask("GET", f"{API}/{path}", "eye").status_code == 400
 
 
 def test_before_the_first_map_there_is_none(desk):
@@ -229,27 +242,27 @@ def test_before_the_first_map_there_is_none(desk):
     assert desk.ask("GET", f"{API}/maps/0.png", "eye").status_code == 404
 
 
-def test_tiles_show_what_the_map_shows(mapped):
+def test_tiles_show_what_the_map_shows(shown):
     import cv2
 
-    fine = get(mapped, "maps/0/tiles/8/0/0.png")
+    fine = get(shown, "maps/0/tiles/8/0/0.png")
     assert fine.headers["content-type"] == "image/png"
     picture = cv2.imdecode(np.frombuffer(fine.content, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture.shape == (512, 512)
     far = cv2.imdecode(
-        np.frombuffer(get(mapped, "maps/0/tiles/8/5000/-5000.png").content, np.uint8), cv2.IMREAD_GRAYSCALE
+        np.frombuffer(get(shown, "maps/0/tiles/8/5000/-5000.png").content, np.uint8), cv2.IMREAD_GRAYSCALE
     )
     assert set(np.unique(far)) == {205}, "where the map ends nothing is known"
-    assert mapped.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
+    assert shown.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
 
 
 @pytest.mark.parametrize("part", ["tiles/5/0/0.png", "layers/changes"])
-def test_a_part_of_a_map_that_did_not_change_is_not_sent_again(mapped, part):
+def test_a_part_of_a_map_that_did_not_change_is_not_sent_again(shown, part):
     path = f"{API}/maps/0/{part}"
-    first = mapped.ask("GET", path, "eye")
-    again = mapped.ask("GET", path, "eye", headers={"If-None-Match": first.headers["ETag"]})
+    first = shown.ask("GET", path, "eye")
+    again = shown.ask("GET", path, "eye", headers={"If-None-Match": first.headers["ETag"]})
     assert (again.status_code, again.content) == (304, b"")
-    other = mapped.ask("GET", path, "eye", headers={"If-None-Match": '"of another map"'})
+    other = shown.ask("GET", path, "eye", headers={"If-None-Match": '"of another map"'})
     assert (other.status_code, other.content) == (200, first.content)
 
 
@@ -344,24 +357,24 @@ def test_edits_of_every_kind_reach_the_result_and_their_undos_leave_no_trace(map
     assert result()[1] == plain
 
 
-def test_who_has_the_first_poses_of_a_trajectory_gets_the_others_unless_those_moved(mapped):
+def test_who_has_the_first_poses_of_a_trajectory_gets_the_others_unless_those_moved(shown):
     path = "trajectories/a.tum"
-    whole = get(mapped, path)
+    whole = get(shown, path)
     text, digest = whole.text, whole.headers["Fcslam-Digest"]
     assert whole.headers["Fcslam-After"] == "0"
-    again = get(mapped, f"{path}?after={len(text)}&digest={digest}")
+    again = get(shown, f"{path}?after={len(text)}&digest={digest}")
     assert (again.text, again.headers["Fcslam-After"], again.headers["Fcslam-Digest"]) == ("", str(len(text)), digest)
     first = text[: text.index("\n", 100) + 1]
-    rest = get(mapped, f"{path}?after={len(first)}&digest={hashlib.sha256(first.encode()).hexdigest()}")
+    rest = get(shown, f"{path}?after={len(first)}&digest={hashlib.sha256(first.encode()).hexdigest()}")
     assert first + rest.text == text
     for moved in (
         f"after={len(first)}&digest={digest}",
         f"after={len(text) + 1}&digest={digest}",
         f"after={len(text)}",
     ):
-        assert get(mapped, f"{path}?{moved}").text == text
+        assert get(shown, f"{path}?{moved}").text == text
     for wrong in ("after=-1", "after=x", "digest=x", f"digest={digest}0"):
-        assert mapped.ask("GET", f"{API}/{path}?{wrong}", "eye").status_code == 400
+        assert shown.ask("GET", f"{API}/{path}?{wrong}", "eye").status_code == 400
 
 
 def test_closures_that_did_not_change_are_not_sent_again(mapped):
@@ -565,8 +578,8 @@ def test_measures_say_what_came_in(mapped):
     assert lines["fcslam_packets_queued"] == lines["fcslam_oldest_packet_age_seconds"] == 0
 
 
-def test_every_panel_of_the_dashboard_asks_for_a_metric_that_there_is(mapped):
-    text = get(mapped, "../../metrics").text
+def test_every_panel_of_the_dashboard_asks_for_a_metric_that_there_is(shown):
+    text = get(shown, "../../metrics").text
     there = {line.split()[2] for line in text.splitlines() if line.startswith("# TYPE fcslam_")}
     there -= {name for name in there if name.endswith("_created")}
     dashboard = json.loads((ROOT / "docs" / "howto" / "grafana.json").read_text(encoding="utf-8"))
