@@ -23,7 +23,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
 from fcslam.errors import EvaluationError
-from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.budget import Budget
@@ -86,7 +86,7 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     with tempfile.TemporaryDirectory() as place:
         run_of(result, tracks, (), dump(config), config.map, with_local_maps=False).save(Path(place) / "run")
         try:
-            errors = evaluate_relations(Path(place) / "run", relations, RelationsQuestion(across_robots=True))
+            errors = evaluate_relations(Path(place) / "run", relations, across_robots=True)
             measured = (
                 f"{errors.used} of {errors.total}", errors.translation.mean, errors.translation.maximum,
                 errors.rotation.mean,

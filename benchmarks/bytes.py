@@ -25,7 +25,7 @@ from relation_closures import evaluate_closures
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.lab.evaluation.fleet.closures import ClosureScope
-from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend
@@ -153,7 +153,7 @@ def thinned_row(run: Path, reference: Path) -> tuple:
     found = common.metrics(run)
     up = sum(found.get(f"{kind}_bytes", 0.0) for kind in UPLINK)
     judged = evaluate_closures(run, reference).scores[ClosureScope.FLEET, ClosureStatus.ACCEPTED].graph
-    errors = evaluate_relations(run, reference, RelationsQuestion(across_robots=True))
+    errors = evaluate_relations(run, reference, across_robots=True)
     accuracy = (errors.translation.mean, errors.translation.maximum, errors.rotation.mean)
     traffic = (found["place_packets"], up / found["recorded_time"], found["place_bytes"] / up)
     closures = (found["intra_robot_closures_accepted"], found["inter_robot_closures_accepted"])

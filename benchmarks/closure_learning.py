@@ -61,13 +61,13 @@ from fcslam.lab.evaluation.places.simulated_views import lidar_overlap
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
+from fcslam.learning.code_batches import MOST_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient
 from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.held_out import PlacePoints
-from fcslam.learning.federated.held_out import inliers as place_inliers
+from fcslam.learning.federated.held_out import inliers
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.settings import FederatedSettings
@@ -76,13 +76,12 @@ from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
-from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.revisits import Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
 from fcslam.metrics.bootstrap import Interval, mean_interval
-from fcslam.metrics.framing import HomographyGroundTruth
+from fcslam.metrics.homography import HomographyGroundTruth
 from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig
@@ -346,8 +345,8 @@ def trained_here(
     """Training in one place, with the losses and the rate of a robot in the fleet."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
-    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible)
-    return train_codes(state, revisits, CodeInputs(), training, plan, torch.device("cpu")).network
+    plan = LocalTrainingPlan(training, 0, steps, compatible=settings.compatible)
+    return train_codes(state, revisits, CodeInputs(), plan).network
 
 
 def federated(
@@ -486,14 +485,6 @@ def keypoint_counts(first: Keyframe, second: Keyframe, T_first_second: FloatArra
     found = mutual_matches(first.features.descriptors, second.features.descriptors).pairs
     found = found[shown[found[:, 0]]]
     return int(np.sum(gaps[found[:, 0], found[:, 1]] <= CORRECT_PX)), int(partner.sum()), len(found)
-
-
-def inliers(first: Keyframe, second: Keyframe) -> int:
-    """Keypoints that the best motion explains, as the cloud proposes it; 0 without a motion."""
-    points = (
-        PlacePoints(each.positions[each.placed], each.features.descriptors[each.placed]) for each in (first, second)
-    )
-    return place_inliers(*points)
 
 
 def by_building(rows: Sequence[tuple], arm: str, on: str) -> FloatArray:

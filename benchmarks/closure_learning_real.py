@@ -42,12 +42,12 @@ from fcslam.lab.evaluation.places.tum_sequence import Sequence as TumSequence
 from fcslam.lab.evaluation.places.tum_sequence import read_sequence
 from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_overlap
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
-from fcslam.learning.federated.live_settings import LIVE_ROUNDS
+from fcslam.learning.federated.settings import LIVE_ROUNDS
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import TrainingExample
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair
 from fcslam.learning.revisits import BORDER_PX, FEWEST_SHARED, correspond_predicted
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.metrics.bootstrap import Interval, mean_interval

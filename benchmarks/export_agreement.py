@@ -54,11 +54,16 @@ def _trained(checkpoint: Path, version: str) -> Network:
     """The checkpoint's network, which must be the one of that version."""
     import torch
 
+    from fcslam.learning.checkpoint import read_checkpoint
     from fcslam.learning.export import detector_version
-    from fcslam.learning.trainer import trained_network
+    from fcslam.learning.network import KeypointNetwork
+    from fcslam.learning.trainer import AVERAGE
 
     torch.set_num_threads(1)
-    network = trained_network(checkpoint)
+    trained = read_checkpoint(checkpoint)
+    network = KeypointNetwork(trained.settings["encoder"])
+    network.load_state_dict(trained.part(AVERAGE))
+    network.eval()
     if detector_version(network) != version:
         sys.exit(f"{checkpoint}: holds {detector_version(network)}, but detector.onnx is {version}; export it anew")
 

@@ -34,7 +34,7 @@ from fcslam.learning.federated.client import ClientUpdate
 from fcslam.learning.federated.client_app import build_client_app, in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
+from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
@@ -42,6 +42,7 @@ from fcslam.learning.federated.initial_weights import read_detector_weights
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
+from fcslam.wire.keys import Credentials
 
 DETECTOR = common.REPOSITORY / "src/fcslam/features/networks/detector.onnx"
 PROCESSES = 4
@@ -142,9 +143,9 @@ def over_a_network(
         robots(names, missing, listener.getsockname()[1]),
     ):
         end = time.monotonic() + CONNECTING_S
-        while len(grid.get_node_ids()) < len(names):
+        while len(grid.nodes()) < len(names):
             if time.monotonic() > end:
-                sys.exit(f"only {len(grid.get_node_ids())} of {len(names)} robots connected")
+                sys.exit(f"only {len(grid.nodes())} of {len(names)} robots connected")
             time.sleep(0.2)
         return train(grid, settings), peak()
 
@@ -213,8 +214,8 @@ def answer(name: str, missing: float, port: int) -> None:
     app = build_client_app(client)
     while True:
         try:
-            with RobotLink(f"http://127.0.0.1:{port}", name, name) as link:
-                serve_requests(link, app, robot_context(), lambda _: None)
+            with RobotLink(f"http://127.0.0.1:{port}", name, Credentials(name)) as link:
+                serve_requests(link, app, lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)
 

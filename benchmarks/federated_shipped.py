@@ -27,7 +27,7 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import evaluate_homography
 from fcslam.lab.evaluation.detectors.measures import difference, mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.metrics.framing import HomographyGroundTruth
+from fcslam.metrics.homography import HomographyGroundTruth
 
 if TYPE_CHECKING:
     from fcslam.lab.evaluation.detectors.homography import HomographyReport

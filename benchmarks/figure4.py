@@ -30,7 +30,7 @@ from vocabulary_growth import (
 )
 
 from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.lab.evaluation.places.figures import COLOURS, panel_figure, save
+from fcslam.lab.evaluation.places.report import COLOURS, panel_figure, save
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import FloatArray

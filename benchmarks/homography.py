@@ -28,7 +28,7 @@ from fcslam.lab.evaluation.detectors.homography import (
 from fcslam.lab.evaluation.detectors.measures import difference, interval, mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.metrics.bootstrap import Interval
-from fcslam.metrics.framing import HomographyGroundTruth
+from fcslam.metrics.homography import HomographyGroundTruth
 
 SCENES = ("oxford_affine", "hpatches_subset")
 SEED = 1

@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.features.classical import make_detector
 from fcslam.features.detector import FeatureDetector
-from fcslam.features.factory import make_detector
 from fcslam.learning.images import find_images, read_image
 from fcslam.mission.mission import MissionConfig
 

@@ -118,7 +118,7 @@ def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | N
             parts["localization"] = localization_loss(logits.sigmoid(), batch.homographies)
         return torch.stack(list(parts.values())).sum(), parts
 
-    train_layers(network, network.point_layers, losses_of, settings, LocalTrainingPlan(0, settings.steps))
+    train_layers(network, network.body.point_layers, losses_of, LocalTrainingPlan(settings, 0, settings.steps))
     export_onnx(network, folder / "0.onnx")
     return [folder / "0.onnx"]
 

@@ -251,7 +251,7 @@ def against_truth(first: list[Any], now: Any, plain: Any, drivers: list[Any]) ->
 
 def building_now(drivers: list[Any]) -> Any:
     """The building as the last robot found it, seen from wherever a robot could stand in it."""
-    from fcslam.lab.simulation.ground_truth import true_map
+    from fcslam.lab.simulation.recording import true_map
     from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 
     plan, here = drivers[-1].plan, []
@@ -266,7 +266,7 @@ def building_as_seen(drivers: list[Any]) -> Any:
     """Each cell as the last robot that saw it found it."""
     import numpy as np
 
-    from fcslam.lab.simulation.ground_truth import true_map
+    from fcslam.lab.simulation.recording import true_map
     from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
     from fcslam.runs.map_files import Occupancy
 

@@ -37,7 +37,7 @@ import fcslam
 from fcslam import sources
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import evaluate_relations
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.metrics.trajectory import align
@@ -152,7 +152,7 @@ def part(folder: Path, log: str, work: Path) -> tuple:
     run, cpu_s = localized(parts[-1], work / log)
     run.save(work / f"{log}-localized")
     reference = common.relations_path(folder, log)
-    errors = evaluate_relations(work / f"{log}-localized", reference, RelationsQuestion())
+    errors = evaluate_relations(work / f"{log}-localized", reference)
     scans = run.metrics["scans"].value
     means = errors.translation.mean, errors.rotation.mean, errors.translation.maximum
     return (log, *found(run), *means, cpu_s, 10.0 * cpu_s / scans)

@@ -19,8 +19,7 @@ from pathlib import Path
 import common
 
 from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.lab.evaluation.places.figures import curves_figure
-from fcslam.lab.evaluation.places.report import SetResult, evaluate_set
+from fcslam.lab.evaluation.places.report import SetResult, curves_figure, evaluate_set
 from fcslam.lab.evaluation.places.scoring import DescribedSet, choose_scorers
 from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval

@@ -18,7 +18,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import evaluate_relations
 
 CASES = (*((name, 1) for name in common.SPLITS), ("intel", 3))
 TITLE = "Figures"
@@ -54,7 +54,7 @@ def measured(folder: Path, name: str, robots: int, repetitions: int) -> tuple:
         for _ in range(repetitions):
             before, cost = load_s(), common.run_fcslam(*arguments)
             costs.append((cost.cpu_s / (0.5 * (before + load_s())), cost.cpu_s))
-        errors = evaluate_relations(Path(place), common.relations_path(folder, name), RelationsQuestion())
+        errors = evaluate_relations(Path(place), common.relations_path(folder, name))
         return name, robots, common.metrics(Path(place))["maps"], errors.translation.mean, *min(costs)
 
 

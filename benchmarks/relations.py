@@ -18,7 +18,7 @@ from pathlib import Path
 
 import common
 
-from fcslam.lab.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.lab.evaluation.fleet.relations import evaluate_relations
 from fcslam.lidar.frontend import Tracker
 from fcslam.metrics.relations import RelationErrors
 
@@ -70,7 +70,7 @@ def main() -> None:
             one, several = Path(place) / f"{name}-1", Path(place) / f"{name}-{parts}"
             cost_one = measure(chosen, log, one, 1)
             cost_several = measure(chosen, log, several, parts)
-            errors = [evaluate_relations(run, reference, RelationsQuestion()) for run in (one, several)]
+            errors = [evaluate_relations(run, reference) for run in (one, several)]
             alone.append((name, used(errors[0]), *six(errors[0]), *cost_one))
             maps = int(common.metrics(several)["maps"])
             cpu_ratio = cost_several[0] / cost_one[0]
@@ -97,7 +97,7 @@ def report_tracker(chosen, folder: Path) -> None:
             run = Path(place) / name
             setting = f"robot.lidar.tracker={chosen.tracker}"
             common.run_fcslam("map", common.log_path(folder, name), "--output", run, "--config", setting)
-            errors = evaluate_relations(run, common.relations_path(folder, name), RelationsQuestion())
+            errors = evaluate_relations(run, common.relations_path(folder, name))
             counts = common.metrics(run)
             rows.append((name, used(errors), *six(errors), counts["intra_robot_closures_accepted"]))
     columns = {"log": "", "relations used": "", **ERRORS, "closures accepted": ".0f"}
@@ -129,8 +129,8 @@ def used(errors: RelationErrors) -> str:
 
 def across_robots(one: Path, several: Path, reference: Path) -> tuple:
     """Errors across robots of the run of several, and of one robot's run on the same relations."""
-    joint = evaluate_relations(several, reference, RelationsQuestion(across_robots=True))
-    single = evaluate_relations(one, reference, RelationsQuestion(across_robots=True, parts=several))
+    joint = evaluate_relations(several, reference, across_robots=True)
+    single = evaluate_relations(one, reference, across_robots=True, parts=several)
     figures = [x for e in (joint, single) for x in (e.translation.mean, e.translation.maximum, e.rotation.mean)]
     return used(joint), *figures, joint.translation.mean / single.translation.mean
 

@@ -7,8 +7,12 @@ ours to theirs. Both run with the interpreter that runs this script. CPU seconds
 on one core, with compiled code in the cache; two busy cores slow each other down. "Until the first scan": from the
 start of the process, with an empty cache, as after an installation without `fcslam tools warm-up`. With one repetition
 it takes four minutes.
+
+"Where the time goes" samples the stack every few milliseconds of CPU, on one core. A sample counts for the folder of
+the package whose code is innermost, with the libraries that it calls. Compiled functions count for their callers.
 """
 
+import json
 import math
 import os
 import subprocess
@@ -17,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import common
 
@@ -37,6 +42,37 @@ from fcslam.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 """Runs the command line and writes down when the first scan was mapped."""
+SAMPLED = """
+import collections, json, signal, sys, time
+path, spent, before = sys.argv.pop(1), collections.Counter(), 0.0
+def part_of(frame):
+    part = None
+    while frame:
+        name = frame.f_code.co_filename
+        if name.startswith("<frozen importlib"):
+            return "imports"
+        if name.endswith("numba/core/dispatcher.py"):
+            return "loading of compiled code"
+        if part is None and "/fcslam/" in name:
+            part = name.split("/fcslam/")[1].split("/")[0].removesuffix(".py")
+        frame = frame.f_back
+    return part or "start and end"
+def sample(_, frame):
+    global before
+    now = time.process_time()
+    spent[part_of(frame)] += now - before
+    before = now
+signal.signal(signal.SIGPROF, sample)
+signal.setitimer(signal.ITIMER_PROF, 0.003, 0.003)
+from fcslam.cli import main as run
+try:
+    run(sys.argv[1:])
+finally:
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
+    with open(path, "w") as file:
+        json.dump(spent, file)
+"""
+"""Runs the command line and writes down the seconds of each part of the package."""
 PATIENCE_S = 600.0
 
 
@@ -69,10 +105,13 @@ def main() -> None:
             (name, *repeated(lambda checkout, work, parts=parts: run(checkout, work, logs["intel"], *parts).wall_s))
             for name, parts in (("one robot", ()), ("three robots", ("--split", 3)))
         ]
+        parts = on_one_core(where_time_goes, logs["intel"], Path(place))
     columns = {"": "", "ours, s": ".2f", "theirs, s": ".2f", "ratio": ".2f"}
     report.table("CPU of one core, one robot", columns, cpu)
     report.table(f"Wall time of intel, {os.cpu_count()} cores", columns, wall)
     report.table("Until the first scan is mapped, nothing compiled", columns, [("intel", *first)])
+    shares = [(part, spent / sum(parts.values())) for part, spent in sorted(parts.items(), key=lambda item: -item[1])]
+    report.table("Where the time goes, intel", {"part": "", "share": ".1%"}, shares)
     report.write()
 
 
@@ -82,8 +121,19 @@ def run(checkout: Path, work: Path, log: Path, *options: object) -> common.Cost:
     return common.run_fcslam("map", log, *options, "--output", work / "run", "--force", environment=environment)
 
 
-def on_one_core(measured: Callable[..., common.Cost], *arguments: object) -> common.Cost:
-    """What a command costs that has one core."""
+def where_time_goes(log: Path, work: Path) -> dict[str, float]:
+    """Seconds of `fcslam map` by part of the package."""
+    noted = work / "parts.json"
+    command = [sys.executable, "-c", SAMPLED, noted, "map", log, "--output", work / "run", "--force"]
+    environment = {**os.environ, "PYTHONPATH": str(common.REPOSITORY / "src")}
+    silent = subprocess.DEVNULL
+    subprocess.run(list(map(str, command)), env=environment, stdout=silent, stderr=silent, check=True)
+    parts: dict[str, float] = json.loads(noted.read_text(encoding="ascii"))
+    return parts
+
+
+def on_one_core(measured: Callable[..., Any], *arguments: object) -> Any:
+    """What a command gives that has one core."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
     try:

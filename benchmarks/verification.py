@@ -75,7 +75,6 @@ def pool(count: int) -> Iterator[Sequence[Executor]]:
 def dask(count: int) -> Iterator[Sequence[Executor]]:
     """Workers of a cluster on this machine, each a process as the scheduler is."""
     from fcslam.cluster.dask_cluster import DaskCluster
-    from fcslam.cluster.workers import Workers
 
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         file = Path(folder) / "scheduler.json"
@@ -86,7 +85,7 @@ def dask(count: int) -> Iterator[Sequence[Executor]]:
         for _ in range(count):
             _start(stack, "worker", "--nthreads", "1", "--local-directory", folder, *where)
         time.sleep(5.0)
-        with DaskCluster(Workers(json.loads(file.read_text())["address"])) as cluster:
+        with DaskCluster(json.loads(file.read_text())["address"]) as cluster:
             while len(cluster.executors()) < count:
                 time.sleep(0.1)
             yield cluster.executors()

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from flwr.serverapp.strategy import FedAvg
 
-from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks
-from fcslam.learning.federated.local import federate_locally
+from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, federate_locally
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.trainer import ExecutionOptions
 

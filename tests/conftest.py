@@ -13,7 +13,7 @@ from fcslam.cloud import recognition
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.features import network_check
-from fcslam.lab.simulation.ground_truth import write_ground_truth
+from fcslam.lab.simulation.recording import write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
 from fcslam.storage import database

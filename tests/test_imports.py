@@ -1,4 +1,4 @@
-"""Rooms import only rooms below them, and `import fcslam` is light."""
+"""Rooms import only rooms above them in the table of the architecture, and `import fcslam` is light."""
 
 import ast
 import json
@@ -103,7 +103,7 @@ def test_every_room_is_known():
     assert rooms - {"__init__"} <= set(ROOMS)
 
 
-def test_rooms_import_only_rooms_below():
+def test_rooms_import_only_rooms_above():
     found = [
         violation
         for path in sorted(PACKAGE.rglob("*.py"))

@@ -8,7 +8,6 @@ from multiprocessing import synchronize
 import pytest
 
 from fcslam.cluster.verifying import verifying
-from fcslam.cluster.workers import Workers
 from fcslam.errors import InputError
 from fcslam.mission.driving import side_by_side
 from fcslam.robot.backend_runner import worker_process
@@ -29,7 +28,7 @@ def no_semaphores(monkeypatch):
 
 
 def verify():
-    with verifying(Workers("2")):
+    with verifying("2"):
         pass
 
 

@@ -84,8 +84,6 @@ def run(case: Case, checkout: Path, place: Path) -> None:
     place.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(checkout / "src"), "OMP_NUM_THREADS": "1"}
     arguments = [argument.format(output=output) for argument in case.arguments]
-    if arguments[0] == "federate" and not (checkout / "src/fcslam/cli/federate/__init__.py").exists():
-        arguments[1] = "--local"  # before the command had subcommands
     began = time.perf_counter()
     command = [sys.executable, "-c", RUN, str(place / f"{case.name}.packets"), *arguments]
     process = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=place, check=False)

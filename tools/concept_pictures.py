@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 import fcslam
-from fcslam.features.birdseye import BirdseyeConfig, describe, likelihood_picture
+from fcslam.features.birdseye import SIDE_M, describe, likelihood_picture
 from fcslam.geometry import se2
 from fcslam.maps import palette
 from fcslam.mission.mission_file import read_mission
@@ -78,14 +78,13 @@ def scan_points(robot: str, run: Run, stamp: float, within_s: float) -> FloatArr
 def draw_place(run: Run) -> Figure:
     """A submap, its bird's-eye picture, and its keypoints."""
     points = scan_points("anna", run, run.trajectories["anna"].stamps[120], 10.0)
-    config = BirdseyeConfig()
-    features = describe(points, config)
+    features = describe(points)
     figure, (walls, picture) = sheet(8.0, 3.9, 2)
     walls.scatter(*points.T, s=1.0, c=INK, linewidths=0)
     bare(walls, "1. the returns of some metres of path")
-    half = 0.5 * config.side_cells * config.cell_m
+    half = 0.5 * SIDE_M
     extent = (-half, half, -half, half)
-    picture.imshow(255 - likelihood_picture(points, config), cmap="gray", origin="lower", extent=extent)
+    picture.imshow(255 - likelihood_picture(points), cmap="gray", origin="lower", extent=extent)
     picture.scatter(*features.keypoints_m[:80].T, s=26, facecolors="none", edgecolors=OTHER, linewidths=0.9)
     bare(picture, "2. bird's-eye picture; circles: keypoints with 256 bits each")
     for axes in (walls, picture):

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.features.factory import make_detector
+from fcslam.features.classical import make_detector
 from fcslam.learning.images import find_images, read_image
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel, Codes, Place

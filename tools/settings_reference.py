@@ -20,8 +20,7 @@ from pydantic.fields import FieldInfo
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import Settings
-from fcslam.learning.federated.live_settings import FleetLearningSettings, RobotLearningSettings
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.settings import FederatedSettings, FleetLearningSettings, RobotLearningSettings
 from fcslam.learning.settings import TrainingSettings
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.mission.mission import MissionConfig

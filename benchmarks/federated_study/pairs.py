@@ -12,8 +12,14 @@ from fcslam.features.detector import FeatureDetector
 from fcslam.learning.images import ImageFile, is_usable, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import AugmentedView, TrainingExample, ViewPair, draw_pair
-from fcslam.metrics.homography import corner_error, estimate_homography, inverse, match_errors
-from fcslam.metrics.repeatability import in_common_view, repeatability
+from fcslam.metrics.homography import (
+    corner_error,
+    estimate_homography,
+    in_common_view,
+    inverse,
+    match_errors,
+    repeatability,
+)
 from fcslam.records import Codes, FloatArray
 
 MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former", "mma_3px_between")

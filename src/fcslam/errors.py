@@ -1,27 +1,9 @@
-"""The exception tree.
-
-FcslamError
-├── InputError            an input of the user is wrong; the message says what, where and what to do (exit code 2)
-│   ├── SourceError       a recording cannot be read
-│   ├── ConfigError       a settings file, one of its keys or a veto is wrong
-│   ├── OutputError       the output folder cannot be used
-│   ├── SimulationError   a fleet cannot be simulated
-│   ├── FeatureError      network weights, images or extracted features cannot be used
-│   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
-│   ├── EvaluationError   a reference file or a run folder cannot be evaluated
-│   ├── ServiceError      the service cannot run: tokens, certificates, address, folder or mission are unusable
-│   ├── StoreError        a mission cannot be stored or read: the disk is full, or the file is damaged
-│   ├── EditError         an edit of a mission cannot be undone or read
-│   ├── StateError        a robot's state folder cannot be used
-│   ├── NetworkError      a ROS network cannot be used: its middleware, its topics or its transforms are missing
-│   └── CloudError        the cloud rejects a robot: its token, its name or its packets
-│       └── OversizeError     a request is too large
-├── PacketError           received bytes are not a valid packet
-│   └── PacketConflictError   two different packets have the same number
-└── UnavailableError      the cloud is unreachable or busy; retry later
-"""
+"""The exceptions. An ``InputError`` gives exit code 2 and one line that says what is wrong, where, and what to do."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 _SYSTEM_ERROR = re.compile(r"\[Errno -?\d+\] ([^:()]+)(?:: '([^']*)')?")
@@ -41,6 +23,19 @@ class FcslamError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         """With all attributes, whatever the arguments of the class are: errors cross processes."""
         return _restored, (type(self), str(self)), vars(self)
+
+
+@contextmanager
+def writing(path: Path, advice: str = "free disk space and run the same command again") -> Iterator[None]:
+    """Report an error of the operating system in this block as one of writing ``path``; ``advice``: what to do then.
+
+    Raises:
+        OutputError: the block cannot write.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); {advice}") from error
 
 
 def printable(text: str) -> str:

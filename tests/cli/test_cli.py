@@ -86,7 +86,7 @@ def test_relations_across_robots_with_the_parts_of_another_run(run_and_relations
         (["{run}", "missing"], "missing: cannot read the relations"),
         (["{run}", "{run}"], "cannot read the relations"),
         (["{run}", "{relations}", "--parts", "missing"], "missing: not a run folder"),
-        (["{run}", "{relations}", "--csv", "missing/table.csv"], "cannot write the table"),
+        (["{run}", "{relations}", "--csv", "missing/table.csv"], "cannot be written"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(run_and_relations, capsys, arguments, message):

@@ -116,7 +116,7 @@ def test_the_same_command_with_more_rounds_goes_on(run, fleet, tmp_path):
         (["local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
         (
             ["local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"],
-            "cannot be used as the output folder",
+            "choose another output folder",
         ),
         (
             ["local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"],

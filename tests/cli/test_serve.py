@@ -29,6 +29,7 @@ from fcslam.errors import CloudError
 from fcslam.runs import open_run
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.http_transport import HttpTransport
+from fcslam.wire.keys import Credentials
 from fcslam.wire.packets import decode, encode
 from tests.small_fleet import in_order
 
@@ -139,7 +140,7 @@ def test_an_encrypted_key_is_told_and_no_passphrase_asked_for(credentials, tmp_p
     assert "cloud.key" in line
     assert "encrypted" in line
     with pytest.raises(CloudError, match="encrypted"):
-        HttpTransport("https://cloud.test", "robot_1", "agent", own=(credentials / "cloud.pem", sealed))
+        HttpTransport("https://cloud.test", "robot_1", "agent", Credentials(own=(credentials / "cloud.pem", sealed)))
 
 
 def test_a_port_that_is_taken_is_told(tmp_path, capsys):

@@ -6,7 +6,7 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import main
-from fcslam.cli.learning_options import learning_plan
+from fcslam.cli.training_options import learning_plan
 from fcslam.errors import InputError
 from fcslam.records import Channel
 from fcslam.robot.frontend import RobotConfig

@@ -10,7 +10,7 @@ from fcslam.cloud import submaps
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
-from fcslam.lab.simulation.ground_truth import true_map
+from fcslam.lab.simulation.recording import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.submap_bytes import submap_bytes
 from fcslam.maps.fusion import fuse
@@ -112,7 +112,7 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
 
 def test_submaps_that_are_dropped_and_built_again_change_nothing(forgetful, packets):
     cloud = feed(Cloud(ONE_A_SQUARE.model_copy(update={"submaps_kept": 2}), 0), packets)
-    assert len(cloud.fleet._recognition._submaps._entries) <= 2
+    assert len(cloud.fleet._recognition.submaps._entries) <= 2
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 
 
@@ -122,7 +122,7 @@ def test_a_cloud_that_goes_on_from_a_state_builds_no_submap_again(packets, monke
     known = {(number.session, number.sequence): packet for number, packet in cloud._packets.items()}
     state = parse_state(Path("state"), state_bytes("this", cloud.state()), "this")
     restored = Cloud.restored(ONE_A_SQUARE, 0, state, {number: p.time for number, p in known.items()}, known.get)
-    before, after = (each.fleet._recognition._submaps._entries for each in (cloud, restored))
+    before, after = (each.fleet._recognition.submaps._entries for each in (cloud, restored))
     compared = {key: entry for key, entry in before.items() if entry.submap is not None}
     assert compared
     assert after.keys() == compared.keys()
@@ -130,8 +130,8 @@ def test_a_cloud_that_goes_on_from_a_state_builds_no_submap_again(packets, monke
     monkeypatch.setattr(submaps, "build_submap", lambda _: pytest.fail("it is in the state"))
     (matcher,) = restored.fleet._recognition._matchers.values()
     for identifier, channel in compared:
-        again = restored.fleet._recognition._submaps.of(matcher._places[identifier])
-        expected = cloud.fleet._recognition._submaps.of(matcher._places[identifier])
+        again = restored.fleet._recognition.submaps.of(matcher._places[identifier])
+        expected = cloud.fleet._recognition.submaps.of(matcher._places[identifier])
         assert submap_bytes(again) == submap_bytes(expected), channel
     monkeypatch.undo()
     assert fingerprint(feed(restored, later).finalize()) == fingerprint(feed(cloud, later).finalize())

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud.placement import PlacedRegion
-from fcslam.cloud.regions import region_files, with_regions
+from fcslam.cloud.placement import PlacedRegion, region_files, with_regions
 from fcslam.records import RegionUse
 from fcslam.runs import OccupancyMap
 from fcslam.runs.map_files import Occupancy, parse_map

@@ -14,7 +14,6 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.cluster.verifying import verifying
-from fcslam.cluster.workers import Workers
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lidar import pair_verification
@@ -74,7 +73,7 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
     with Cluster(tmp_path) as cluster:
         one, two = cluster.start_worker("one"), cluster.start_worker("two")
         time.sleep(3.0)
-        with verifying(Workers(cluster.address)) as verify:
+        with verifying(cluster.address) as verify:
             wait_for(lambda: len(verify._processes()) == 2)
             done = []
             monkeypatch.setattr(
@@ -118,7 +117,7 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
     with Cluster(tmp_path) as cluster:
         with (
             pytest.raises(InputError, match=f"{cluster.address}: the cluster has no worker; start one: dask worker"),
-            verifying(Workers(cluster.address)),
+            verifying(cluster.address),
         ):
             pass
         old = cluster.start_worker("old", preload="import fcslam; fcslam.__version__ = '0.0.9'")
@@ -129,7 +128,7 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
 
         cluster.start_worker("good")
         wait_for(lambda: refusal(cluster) is None)
-        with verifying(Workers(cluster.address)) as verify:
+        with verifying(cluster.address) as verify:
             cluster.start_worker(
                 "changed", preload="import fcslam.storage.state_file as file; file.code_version = lambda: 'other'"
             )
@@ -151,7 +150,7 @@ def credentials(folder):
 def refusal(cluster):
     """Why the cluster cannot be used; None: it can."""
     try:
-        with verifying(Workers(cluster.address)):
+        with verifying(cluster.address):
             return None
     except InputError as error:
         return "" if "has no worker" in str(error) else str(error)
@@ -165,10 +164,10 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypat
         pytest.raises(
             InputError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers .*; start one: dask scheduler"
         ),
-        verifying(Workers("tcp://127.0.0.1:9")),
+        verifying("tcp://127.0.0.1:9"),
     ):
         pass
-    with verifying(Workers("tcp://127.0.0.1:9"), must_connect=False) as verify:
+    with verifying("tcp://127.0.0.1:9", must_connect=False) as verify:
         assert written(verify(pairs[:5], CONFIG)) == written(verify_here(pairs[:5], CONFIG))
         assert len(warnings_of()) == 1
 
@@ -191,17 +190,17 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
         with (
             configured(others),
             pytest.raises(InputError, match="no Dask scheduler answers"),
-            verifying(Workers(cluster.address)),
+            verifying(cluster.address),
         ):
             pass
         with (
             pytest.raises(InputError, match=r"the certificates cannot be used|no Dask scheduler answers"),
-            verifying(Workers(cluster.address)),
+            verifying(cluster.address),
         ):
             pass
         wait_for(lambda: "Starting established" in (tmp_path / "scheduler-0.log").read_text())
         time.sleep(1.0)
-        with configured(ours), verifying(Workers(cluster.address)) as verify:
+        with configured(ours), verifying(cluster.address) as verify:
             assert len(verify._processes()) == 1
             assert written(verify(pairs, CONFIG)) == expected
 
@@ -233,7 +232,7 @@ def test_the_worker_of_a_mission_uses_the_cluster_and_outlives_it(tmp_path):
     with Cluster(tmp_path) as cluster:
         cluster.start_worker("one")
         wait_for(lambda: refusal(cluster) is None)
-        options = Workers(cluster.address).options()
+        options = ["--workers", cluster.address]
         command = [sys.executable, "-m", "fcslam.service.worker", *options, str(folder.path)]
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -9,8 +9,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 
 from fcslam.cli import main
-from fcslam.cluster.verifying import verifying
-from fcslam.cluster.workers import Workers
+from fcslam.cluster.verifying import check_workers, verifying
 from fcslam.errors import InputError
 from fcslam.lidar.pair_verification import verify_here
 
@@ -32,16 +31,11 @@ from fcslam.lidar.pair_verification import verify_here
 )
 def test_a_choice_that_is_none_is_refused(where):
     with pytest.raises(InputError, match=r"--workers: '.*' is neither a number from 1 to 256 nor the address"):
-        Workers(where).check()
-
-
-def test_options_make_the_same_choice():
-    assert Workers().options() == []
-    assert Workers("3").options() == ["--workers", "3"]
+        check_workers(where)
 
 
 def test_by_default_this_process_verifies():
-    with verifying(Workers()) as verify:
+    with verifying("1") as verify:
         assert verify is verify_here
 
 
@@ -49,16 +43,16 @@ def test_without_dask_a_cluster_is_refused_and_the_rest_works(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(InputError, match=r"tcp://h:1: needs Dask; install it: pip install 'fcslam\[distributed\]'"),
-        verifying(Workers("tcp://h:1")),
+        verifying("tcp://h:1"),
     ):
         pass
 
 
 def test_processes_here_do_not_load_dask():
     code = (
-        "import sys; from fcslam.cluster.verifying import verifying; from fcslam.cluster.workers import Workers\n"
+        "import sys; from fcslam.cluster.verifying import verifying\n"
         "if __name__ == '__main__':\n"
-        "    with verifying(Workers('2')): pass\n"
+        "    with verifying('2'): pass\n"
         "    print(sorted({'dask', 'distributed'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout == "[]\n"

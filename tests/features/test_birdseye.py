@@ -3,16 +3,14 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fcslam.features.birdseye import BirdseyeConfig, describe, likelihood_picture, pixels_to_metres
+from fcslam.features.birdseye import describe, likelihood_picture, pixels_to_metres
 from fcslam.features.codes import mutual_matches
 from fcslam.geometry import se2
 from tests.rooms import asymmetric_room
 
-CONFIG = BirdseyeConfig()
 
-
-def test_the_picture_is_the_likelihood_of_the_nearest_point():
-    config = BirdseyeConfig(side_m=8.0)
+def test_the_picture_is_the_likelihood_of_the_nearest_point(monkeypatch):
+    monkeypatch.setattr("fcslam.features.birdseye._SIDE_CELLS", 80)
     rng = np.random.default_rng(0)
     points = (rng.integers(-200, 200, (60, 2)) + 0.5) * 0.025  # where a quarter of a cell has its middle
     inside = points[(np.abs(points) < 4.0).all(axis=1)]
@@ -20,20 +18,20 @@ def test_the_picture_is_the_likelihood_of_the_nearest_point():
     centres = (np.stack((columns, rows), axis=-1) + 0.5) * 0.1 - 4.0
     distances_m = cKDTree(inside).query(centres)[0]
     field = 255.0 * np.exp(-(distances_m**2) / (2.0 * 0.35**2))
-    np.testing.assert_allclose(likelihood_picture(points, config), field, atol=0.51)
+    np.testing.assert_allclose(likelihood_picture(points), field, atol=0.51)
 
 
 def test_a_point_lies_in_the_middle_of_its_likelihood():
     point = np.array([[1.05, -3.45]])
-    row, column = np.unravel_index(likelihood_picture(point, CONFIG).argmax(), (300, 300))
-    np.testing.assert_allclose(pixels_to_metres(np.array([[column, row]]), CONFIG), point, atol=1e-9)
+    row, column = np.unravel_index(likelihood_picture(point).argmax(), (300, 300))
+    np.testing.assert_allclose(pixels_to_metres(np.array([[column, row]])), point, atol=1e-9)
 
 
 def test_turning_by_a_right_angle_moves_the_keypoints_and_keeps_the_descriptors():
     points = asymmetric_room(np.random.default_rng(1))
     centred = (np.floor(points / 0.025) + 0.5) * 0.025
     turned = se2.transform((0.0, 0.0, np.pi / 2), centred)
-    before, after = describe(centred, CONFIG), describe(turned, CONFIG)
+    before, after = describe(centred), describe(turned)
     nearest, index = cKDTree(after.keypoints_m).query(se2.transform((0.0, 0.0, np.pi / 2), before.keypoints_m))
     seen = nearest < 1e-3
     assert seen.mean() > 0.95
@@ -46,8 +44,8 @@ def test_matched_keypoints_lie_where_the_motion_puts_them(angle):
     rng = np.random.default_rng(2)
     points = asymmetric_room(rng)
     T_a_b = (0.63, -0.41, angle)
-    a = describe(se2.transform(T_a_b, points), CONFIG)
-    b = describe(points, CONFIG)
+    a = describe(se2.transform(T_a_b, points))
+    b = describe(points)
     matches = mutual_matches(a.descriptors, b.descriptors, max_distance=40)
     moved = se2.transform(T_a_b, b.keypoints_m[matches.pairs[:, 1]])
     errors = np.linalg.norm(a.keypoints_m[matches.pairs[:, 0]] - moved, axis=1)
@@ -55,11 +53,12 @@ def test_matched_keypoints_lie_where_the_motion_puts_them(angle):
     assert np.median(errors[errors < 0.3]) < 0.1
 
 
-def test_the_strongest_are_kept_and_the_order_of_points_does_not_matter():
+def test_the_strongest_are_kept_and_the_order_of_points_does_not_matter(monkeypatch):
+    monkeypatch.setattr("fcslam.features.birdseye._MOST_FEATURES", 50)
     rng = np.random.default_rng(3)
     points = asymmetric_room(rng)
-    features = describe(points, BirdseyeConfig(most_features=50))
-    shuffled = describe(rng.permutation(points), BirdseyeConfig(most_features=50))
+    features = describe(points)
+    shuffled = describe(rng.permutation(points))
     assert len(features.keypoints_m) == 50
     assert features.keypoints_m.dtype == np.float32
     assert features.descriptors.shape == (50, 32)
@@ -72,10 +71,10 @@ def test_the_thread_count_is_neither_set_nor_needed():
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(2)
-        first = describe(points, CONFIG)
+        first = describe(points)
         assert cv2.getNumThreads() == 2
         cv2.setNumThreads(1)
-        alone = describe(points, CONFIG)
+        alone = describe(points)
     finally:
         cv2.setNumThreads(threads)
     np.testing.assert_array_equal(first.descriptors, alone.descriptors)
@@ -91,12 +90,12 @@ def test_the_thread_count_is_neither_set_nor_needed():
     ],
 )
 def test_nothing_to_see_gives_no_features(points):
-    features = describe(points, CONFIG)
+    features = describe(points)
     assert features.keypoints_m.shape == (0, 2)
     assert features.descriptors.shape == (0, 32)
 
 
 def test_features_are_read_only():
-    features = describe(asymmetric_room(np.random.default_rng(4)), CONFIG)
+    features = describe(asymmetric_room(np.random.default_rng(4)))
     assert not features.keypoints_m.flags.writeable
     assert not features.descriptors.flags.writeable

@@ -8,8 +8,7 @@ from fcslam.cli import main
 from fcslam.errors import FeatureError
 from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift
 from fcslam.features.detector import NO_FEATURES, FloatFeatures
-from fcslam.features.extraction import extract
-from fcslam.features.files import read_features, read_grey, write_features
+from fcslam.features.files import extract, read_features, read_grey, write_features
 from tests.features.networks import tiny_network
 from tests.features.pictures import picture
 from tests.lidar.worlds import room

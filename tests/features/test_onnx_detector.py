@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Orb, OrbConfig
+from fcslam.features.classical import Orb, OrbConfig, make_detector
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
-from fcslam.features.factory import make_detector
 from tests.features.networks import tiny_network
 
 pytest.importorskip("onnxruntime")

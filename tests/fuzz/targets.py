@@ -249,7 +249,6 @@ def maps(folder: Path) -> Iterator[Target]:
 @contextmanager
 def federated(_: Path) -> Iterator[Target]:
     """Replies of robots to the server, as bytes, and the server's requests to a robot."""
-    from fcslam.learning.federated.codec import GlobalModel, weights_to_record
     from fcslam.learning.federated.flower import (
         Message,
         RecordDict,
@@ -258,8 +257,16 @@ def federated(_: Path) -> Iterator[Target]:
         request_from_bytes,
         use_own_identity,
     )
-    from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, client_reply, read_request, request_config
-    from fcslam.learning.federated.replies import read_replies
+    from fcslam.learning.federated.messages import (
+        ARRAYS_KEY,
+        CONFIG_KEY,
+        GlobalModel,
+        client_reply,
+        read_replies,
+        read_request,
+        request_config,
+        weights_to_record,
+    )
     from fcslam.learning.federated.screening import screen
     from fcslam.learning.federated.settings import FederatedSettings
 

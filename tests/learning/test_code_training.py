@@ -9,12 +9,12 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
 from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork, sample_codes  # noqa: E402
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -54,10 +54,10 @@ def codes(state, image, points):
 
 def test_only_the_layers_of_the_codes_change(encoder, start):
     settings = SMALL.model_copy(update={"encoder": encoder})
-    network = train_codes(start, OWN, CodeInputs(), settings, LocalTrainingPlan(0, 3), CPU).network
+    network = train_codes(start, OWN, CodeInputs(), LocalTrainingPlan(settings, 0, 3)).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
     assert changed
-    assert changed <= layer_names(network, network.code_layers)
+    assert changed <= layer_names(network, network.body.code_layers)
     assert not any("running" in name for name in changed)
     before = network_from_state(encoder, start)
     image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(1))
@@ -71,7 +71,7 @@ def test_whole_images_give_what_their_inputs_give(encoder, start):
     network = network_from_state(encoder, start)
     image = torch.rand(2, 1, 64, 48, generator=torch.Generator().manual_seed(1))
     with torch.inference_mode():
-        described = network.describe(network.code_inputs(image))
+        described = network.body.describe(network.body.code_inputs(image))
         assert torch.equal(described.code_logits, network(image).code_logits)
 
 
@@ -80,16 +80,15 @@ def test_training_brings_the_codes_of_a_point_together(light):
         first, second = (codes(state, image, points) for image, points in zip(OWN.images, PAIR.points, strict=True))
         return float(np.mean(first != second))
 
-    plan = LocalTrainingPlan(0, 20)
-    done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
+    done = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(SMALL, 0, 20))
     assert {"contrastive", "balance", "keypoints"} == done.losses.keys()
     assert distance(done.network.state_dict()) < 0.8 * distance(light)
 
 
 def test_earlier_codes_and_keypoints_hold_as_hard_as_asked(light):
     loose = SMALL.model_copy(update={"loss": SMALL.loss.model_copy(update={"keypoints": 0.0})})
-    free = train_codes(light, OWN, CodeInputs(), loose, LocalTrainingPlan(0, 20), CPU)
-    held = train_codes(light, OWN, CodeInputs(), SMALL, LocalTrainingPlan(0, 20, compatible=100.0), CPU)
+    free = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(loose, 0, 20))
+    held = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(SMALL, 0, 20, compatible=100.0))
     assert held.losses["keypoints"] < 0.5 * free.losses["keypoints"]
     same = [
         np.mean(codes(each.network.state_dict(), OWN.images[0], POINTS) == codes(light, OWN.images[0], POINTS))
@@ -102,8 +101,7 @@ def test_rehearsal_keeps_the_codes_of_pictures_that_the_robot_does_not_see(light
     elsewhere = textured(9)[:SIZE, :SIZE]
 
     def kept(compatible):
-        plan = LocalTrainingPlan(0, 20, compatible=compatible)
-        done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
+        done = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(SMALL, 0, 20, compatible=compatible))
         assert ("compatible" in done.losses) is (compatible > 0.0)
         return np.mean(codes(done.network.state_dict(), elsewhere, POINTS) == codes(light, elsewhere, POINTS))
 
@@ -112,13 +110,11 @@ def test_rehearsal_keeps_the_codes_of_pictures_that_the_robot_does_not_see(light
 
 def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light):
     inputs = CodeInputs()
-    plan = LocalTrainingPlan(0, RAMP_STEPS + 1, compatible=1.0)
-    whole = train_codes(light, OWN, inputs, SMALL, plan, CPU, legacy=light)
-    first = train_codes(light, OWN, inputs, SMALL, LocalTrainingPlan(0, RAMP_STEPS, compatible=1.0), CPU)
-    second = train_codes(
-        first.network.state_dict(), OWN, inputs, SMALL, LocalTrainingPlan(RAMP_STEPS, 1, compatible=1.0), CPU,
-        legacy=light, optimizer_state=first.optimizer_state,
-    )  # fmt: skip
+    plan = LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 1, compatible=1.0, legacy=light)
+    whole = train_codes(light, OWN, inputs, plan)
+    first = train_codes(light, OWN, inputs, LocalTrainingPlan(SMALL, 0, RAMP_STEPS, compatible=1.0))
+    after = LocalTrainingPlan(SMALL, RAMP_STEPS, 1, compatible=1.0, legacy=light, optimizer_state=first.optimizer_state)
+    second = train_codes(first.network.state_dict(), OWN, inputs, after)
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
 
@@ -137,4 +133,4 @@ def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):
 
 def test_a_robot_that_saw_nothing_again_is_told_so(light):
     with pytest.raises(TrainingError, match="no place was; set trained to all"):
-        train_codes(light, RevisitExamples(OWN.images), CodeInputs(), SMALL, LocalTrainingPlan(0, 1), CPU)
+        train_codes(light, RevisitExamples(OWN.images), CodeInputs(), LocalTrainingPlan(SMALL, 0, 1))

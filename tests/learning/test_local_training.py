@@ -41,7 +41,7 @@ def test_a_leg_does_its_steps_and_says_so(examples, start):
     done = []
     before = {name: tensor.clone() for name, tensor in start.items()}
     network, losses, _ = local_training(
-        start, examples, SMALL, LocalTrainingPlan(first_step=5, steps=3), CPU, done.append
+        start, examples, LocalTrainingPlan(SMALL, first_step=5, steps=3, on_step=done.append)
     )
     assert done == [1, 2, 3]
     assert not network.training
@@ -53,21 +53,21 @@ def test_a_leg_does_its_steps_and_says_so(examples, start):
 @pytest.mark.slow
 def test_a_leg_learns(examples, start):
     longer = SMALL.model_copy(update={"pairs": 2})
-    first = local_training(start, examples, longer, LocalTrainingPlan(first_step=0, steps=5), CPU).losses
-    network = local_training(start, examples, longer, LocalTrainingPlan(first_step=0, steps=30), CPU).network
-    last = local_training(network.state_dict(), examples, longer, LocalTrainingPlan(first_step=30, steps=5), CPU).losses
+    first = local_training(start, examples, LocalTrainingPlan(longer, first_step=0, steps=5)).losses
+    network = local_training(start, examples, LocalTrainingPlan(longer, first_step=0, steps=30)).network
+    last = local_training(network.state_dict(), examples, LocalTrainingPlan(longer, first_step=30, steps=5)).losses
     assert last["detector"] < 0.9 * first["detector"]
 
 
 @pytest.mark.slow
 def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, start):
-    whole = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS + 3), CPU)
-    first = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS), CPU)
+    whole = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 3))
+    first = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS))
     halfway = first.network.state_dict()
     second = local_training(
-        halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU, optimizer_state=first.optimizer_state
+        halfway, examples, LocalTrainingPlan(SMALL, RAMP_STEPS, 3, optimizer_state=first.optimizer_state)
     )
-    forgetful = local_training(halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU)
+    forgetful = local_training(halfway, examples, LocalTrainingPlan(SMALL, RAMP_STEPS, 3))
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
     assert all(torch.equal(tensor, whole.optimizer_state[name]) for name, tensor in second.optimizer_state.items())
@@ -80,15 +80,14 @@ def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, 
             value.grad = torch.full_like(value, torch.inf)
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
-        return {}
 
-    monkeypatch.setattr("fcslam.learning.local_training.training_step", overflow)
+    monkeypatch.setattr("fcslam.learning.local_training.descend", overflow)
     with pytest.raises(TrainingError, match="diverged in the last step"):
-        local_training(start, examples, SMALL, LocalTrainingPlan(0, 1), CPU)
+        local_training(start, examples, LocalTrainingPlan(SMALL, 0, 1))
 
 
 def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(examples, start):
-    network = local_training(start, examples, SMALL, LocalTrainingPlan(0, 2, frozen_statistics=True), CPU).network
+    network = local_training(start, examples, LocalTrainingPlan(SMALL, 0, 2, frozen_statistics=True)).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(tensor, start[name])}
     assert not [name for name in changed if "running" in name]
     norms = {name.removesuffix("running_var") for name in start if name.endswith("running_var")}
@@ -122,22 +121,22 @@ def test_codes_are_kept_to_those_of_a_former_network(examples, start):
     former = KeypointNetwork("light").state_dict()
     wanted = bits(network_from_state("light", former))
 
-    def agreement(leg, state):
-        network, losses, _ = local_training(start, examples, SMALL, leg, CPU, legacy=state)
-        assert ("former" in losses) is (state is not None and leg.compatible > 0.0)
+    def agreement(leg):
+        network, losses, _ = local_training(start, examples, leg)
+        assert ("former" in losses) is (leg.legacy is not None and leg.compatible > 0.0)
         return float((bits(network) == wanted).float().mean())
 
-    free = agreement(LocalTrainingPlan(0, 15), None)
-    assert agreement(LocalTrainingPlan(0, 15), former) == free
-    assert agreement(LocalTrainingPlan(0, 15, compatible=100.0), former) > free + 0.1
+    free = agreement(LocalTrainingPlan(SMALL, 0, 15))
+    assert agreement(LocalTrainingPlan(SMALL, 0, 15, legacy=former)) == free
+    assert agreement(LocalTrainingPlan(SMALL, 0, 15, compatible=100.0, legacy=former)) > free + 0.1
 
 
 def test_a_former_network_of_another_kind_is_refused(examples, start):
     with pytest.raises(TrainingError, match="not those of a light network"):
-        local_training(start, examples, SMALL, LocalTrainingPlan(0, 1, compatible=1.0), CPU, legacy={})
+        local_training(start, examples, LocalTrainingPlan(SMALL, 0, 1, compatible=1.0, legacy={}))
 
 
 def test_weights_that_make_training_diverge_are_said(examples, start):
     broken = start | {"body.code_head.1.bias": torch.full_like(start["body.code_head.1.bias"], torch.nan)}
     with pytest.raises(TrainingError, match="diverged at step 7"):
-        local_training(broken, examples, SMALL, LocalTrainingPlan(7, 1), CPU)
+        local_training(broken, examples, LocalTrainingPlan(SMALL, 7, 1))

@@ -7,7 +7,7 @@ from tests.learning.textures import textured
 
 pytest.importorskip("torch", reason="needs fcslam[train]")
 
-from fcslam.learning.rehearsal import POINTS, VIEWS, VIEWS_A_STEP, draw_rehearsal, draw_views
+from fcslam.learning.code_batches import POINTS, VIEWS, VIEWS_A_STEP, draw_rehearsal, draw_views
 
 IMAGES = [textured(1)[:64, :96], textured(2)[:64, :96]]
 

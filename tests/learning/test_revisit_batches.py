@@ -9,6 +9,13 @@ from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
+from fcslam.learning.code_batches import (  # noqa: E402
+    MOST_POINTS,
+    REVISIT_IMAGES,
+    RevisitExamples,
+    RevisitPair,
+    draw_revisits,
+)
 from fcslam.learning.network import Description  # noqa: E402
 from fcslam.learning.objective import (  # noqa: E402
     MIN_NEGATIVE_DISTANCE_M,
@@ -16,13 +23,6 @@ from fcslam.learning.objective import (  # noqa: E402
     rehearsal_loss,
     revisit_negatives,
     revisit_objective,
-)
-from fcslam.learning.revisit_batches import (  # noqa: E402
-    MOST_POINTS,
-    VIEWS,
-    RevisitExamples,
-    RevisitPair,
-    draw_revisits,
 )
 from fcslam.learning.settings import LossSettings  # noqa: E402
 
@@ -37,10 +37,10 @@ PAIR = RevisitPair((0, 1), (POINTS, POINTS[::-1].copy()), POSITIONS)
 def test_a_batch_holds_pairs_of_views():
     batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
     assert batch.images.tolist() == [0, 0, 1, 1]
-    assert batch.points.shape == (VIEWS, MOST_POINTS, 2)
+    assert batch.points.shape == (REVISIT_IMAGES, MOST_POINTS, 2)
     assert batch.valid.sum(1).tolist() == [40, 40]
     firsts, seconds = batch.points.chunk(2)
-    for k in range(VIEWS // 2):  # the points of a pair stay together, and with their positions
+    for k in range(REVISIT_IMAGES // 2):  # the points of a pair stay together, and with their positions
         rows = (firsts[k, :40], seconds[k, :40], batch.positions[k, :40])
         both = {(*a, *b, *c) for a, b, c in zip(*(each.tolist() for each in rows), strict=True)}
         wanted = (*PAIR.points, PAIR.positions.astype(np.float32))

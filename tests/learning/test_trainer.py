@@ -11,8 +11,7 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
-from fcslam.learning.checkpoint import Checkpoint, write_checkpoint  # noqa: E402
-from fcslam.learning.curve import read_curves  # noqa: E402
+from fcslam.learning.artifacts import read_curves  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse_keypoints  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
@@ -24,7 +23,6 @@ from fcslam.learning.trainer import (  # noqa: E402
     PROGRESS_FILE,
     ExecutionOptions,
     TrainingRun,
-    trained_network,
     validation_pairs,
 )
 from fcslam.learning.training_step import learning_rate, reduced_precision  # noqa: E402
@@ -62,24 +60,6 @@ def test_a_run_learns(examples, tmp_path):
     first, last = ([np.mean([row[name] for row in part]) for name in ("detector", "contrastive")]
                    for part in (figures[:3], figures[-3:]))  # fmt: skip
     assert (np.array(last) < 0.85 * np.array(first)).all()
-
-
-@pytest.mark.slow
-def test_a_checkpoint_gives_the_network_that_the_run_handed_over(examples, tmp_path):
-    run = TrainingRun(SMALL, "joint", tmp_path, PACE)
-    delivered = run.train(examples, examples[:1])
-    read = trained_network(tmp_path / CHECKPOINT_FILE)
-    assert not read.training
-    assert torch.equal(weights(read), weights(delivered))
-    assert not torch.equal(weights(read), weights(run.network))
-
-
-def test_a_checkpoint_of_another_network_is_refused(tmp_path):
-    tensors = {f"average/{name}": value for name, value in KeypointNetwork("vgg").state_dict().items()}
-    for settings in ({"encoder": "light"}, {}):
-        write_checkpoint(tmp_path / "c.npz", Checkpoint("joint", 1, settings, tensors))
-        with pytest.raises(TrainingError, match="does not fit this network"):
-            trained_network(tmp_path / "c.npz")
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from fcslam.errors import CloudError, UnavailableError
 from fcslam.live.fleet_view import FleetView
 from fcslam.service.joint_maps import JointMaps, JointSession, LivePose, ServedJointMaps
 from fcslam.wire.fleet_client import FleetClient
+from fcslam.wire.keys import Credentials
 from tests.service.http.desk import SCRIPT, A, B, Desk
 
 
@@ -22,7 +23,7 @@ def desk(tmp_path, scripted):
 
 
 def client(desk, robot):
-    return FleetClient(str(desk.client.base_url), f"token of {robot}")
+    return FleetClient(str(desk.client.base_url), Credentials(f"token of {robot}"))
 
 
 def view(desk, robot, pose=None, limit_kBps=None):

@@ -18,8 +18,8 @@ from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
+from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.http_transport import Server
-from fcslam.wire.map_client import MapClient
 
 NOBODY = "http://127.0.0.1:9"
 

@@ -12,8 +12,18 @@ from fcslam.errors import EvaluationError, OutputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.charts import fleet_charts
 from fcslam.maps import palette
-from fcslam.maps.charts import RAY_M, Chart, FleetCharts, MatchedPlaces, Outline, spread
-from fcslam.maps.fleet_figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
+from fcslam.maps.fleet_figure import (
+    MATCHES_DRAWN,
+    RAY_M,
+    WIDTH_PX,
+    Chart,
+    FleetCharts,
+    MatchedPlaces,
+    Outline,
+    draw_figure,
+    spread,
+    write_figure,
+)
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_tum
@@ -194,7 +204,7 @@ def test_the_same_charts_make_the_same_file(charts, tmp_path):
     for name in ("one.png", "two.png"):
         write_figure(charts, tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    with pytest.raises(OutputError, match="cannot write the figure"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_figure(charts, tmp_path / "missing" / "figure.png")
 
 

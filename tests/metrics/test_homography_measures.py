@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.metrics.framing import Framing, HomographyGroundTruth, framed_homography
 from fcslam.metrics.homography import (
+    Framing,
+    HomographyGroundTruth,
     corner_error,
     estimate_homography,
+    framed_homography,
     inside,
     inverse,
     match_errors,

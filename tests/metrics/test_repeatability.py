@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from fcslam.metrics.bootstrap import mean_interval
-from fcslam.metrics.homography import inverse, warp
-from fcslam.metrics.repeatability import in_common_view, repeatability
+from fcslam.metrics.homography import in_common_view, inverse, repeatability, warp
 
 H = np.array([[0.9, 0.2, 20.0], [-0.2, 0.9, 40.0], [1e-4, 2e-4, 1.0]])
 SIZE = (320, 240)

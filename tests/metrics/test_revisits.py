@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from fcslam.metrics.closures import WITHIN_GAP_S
+from fcslam.metrics.closures import WITHIN_GAP_S, find_revisits
 from fcslam.metrics.relations import PoseTable
-from fcslam.metrics.revisits import find_revisits
 
 STEP_M, STEP_S = 0.1, 0.2
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from fcslam.features.birdseye import BIRDSEYE, describe
+from fcslam.features.birdseye import describe
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.geometry import se2
-from fcslam.places.hypotheses import rigid_hypotheses
+from fcslam.places.motions import rigid_hypotheses
 from tests.rooms import asymmetric_room
 
 
@@ -104,7 +104,7 @@ def test_a_room_moved_by_T_is_found_moved_by_T(angle):
     rng = np.random.default_rng(16)
     T_a_b = np.array([0.8, -0.6, angle])
     here = asymmetric_room(rng)
-    a, b = describe(se2.transform(T_a_b, here), BIRDSEYE), describe(here, BIRDSEYE)
+    a, b = describe(se2.transform(T_a_b, here)), describe(here)
     matches = mutual_matches(a.descriptors, b.descriptors, max_distance=60)
     best = rigid_hypotheses(a.keypoints_m, b.keypoints_m, matches)[0]
     assert_close(best.T_a_b, T_a_b, metres=0.06, radians=0.01)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.features.birdseye import BIRDSEYE, describe
+from fcslam.features.birdseye import describe
 from fcslam.geometry import se2
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.verification import Gate, LooseGate, VerificationConfig
@@ -30,7 +30,7 @@ class Visits:
         poses = se2.compose(np.array(pose), steps)
         scans = [(scan_at(p, world, noise_m=0.01, rng=rng), s) for p, s in zip(poses, steps, strict=True)]
         submap = build_submap(scans)
-        features = describe(submap.surface.points, BIRDSEYE)
+        features = describe(submap.surface.points)
         place = Place(
             KeyscanId(robot, number), Channel.LIDAR, "v", number, number, features.keypoints_m, features.descriptors
         )

@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.records import frozen
 from fcslam.ros import outputs
-from fcslam.ros.outputs import Grid, OutputNames, Outputs, Region, changed_region
+from fcslam.ros.outputs import Grid, Outputs, Region, changed_region
 from fcslam.ros.transform_stream import TransformStream
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 from tests.ros.memory_network import MemoryNetwork
@@ -25,7 +25,7 @@ def network():
 
 @pytest.fixture
 def published(network):
-    return Outputs(network, "/robot1", OutputNames())
+    return Outputs(network, "/robot1", "map", "/tf")
 
 
 def test_a_map_that_stays_the_same_is_sent_once(network, published):

@@ -101,10 +101,10 @@ def test_addresses():
         parse_address("ros2:robot1")
 
 
-@pytest.mark.parametrize("domain", [233, -1])
+@pytest.mark.parametrize("domain", ["233", "-1"])
 def test_a_domain_out_of_range(domain):
     with pytest.raises(NetworkError, match="is not a ROS 2 domain"):
-        open_network(RosAddress("ros2", ""), domain, {})
+        open_network(RosAddress("ros2", ""), {"ROS_DOMAIN_ID": domain})
 
 
 def test_a_topic_of_one_echo_a_beam_goes_before_one_of_several():

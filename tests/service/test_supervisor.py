@@ -29,7 +29,7 @@ def supervised(tmp_path, monkeypatch):
     def start(code, command=None):
         told = []
         chosen = command or (sys.executable, "-c", code)
-        supervisor = Supervisor(tmp_path, time.monotonic, lambda *event: told.append(event), chosen)
+        supervisor = Supervisor(tmp_path, lambda *event: told.append(event), chosen)
         started.append(supervisor)
         return supervisor, told
 

@@ -424,6 +424,8 @@ def test_a_place_that_is_taken_or_not_there(tmp_path):
         RecordingWriter.create(folder, (LASER,))
     with pytest.raises(OutputError, match="cannot be written"):
         RecordingWriter.create(tmp_path / "missing" / "run.fcslam", (LASER,))
+    with pytest.raises(OutputError, match=r"cannot hold these sensors \(.*a recording has 1 to 8 lasers\)"):
+        RecordingWriter.create(tmp_path / "blind.fcslam", ())
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.sampled_from([".jpg", ".png"]), st.booleans())

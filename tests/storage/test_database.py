@@ -33,7 +33,7 @@ def written_while_another_writes(database, numbers):
             insert(0)(connection)
             futures = [pool.submit(database.share, insert(number)) for number in numbers]
             until = time.monotonic() + 120.0
-            while len(database._group._waiting) < len(numbers):
+            while len(database._waiting) < len(numbers):
                 assert time.monotonic() < until
                 time.sleep(0.001)
         outcomes = [future.exception() or future.result() for future in futures]

@@ -10,6 +10,7 @@ from fcslam.records import Channel
 from fcslam.service.credentials import make_credentials
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
 from fcslam.wire.http_transport import HttpResponse, HttpTransport, InstancesTransport, Refusal, addresses
+from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
 from tests.robot.fake_cloud import said
@@ -27,7 +28,7 @@ def cloud():
 
 @pytest.fixture
 def transport(cloud):
-    transport = HttpTransport(cloud.url + "/", "r 1+2", "ab" * 16, "secret")
+    transport = HttpTransport(cloud.url + "/", "r 1+2", "ab" * 16, Credentials("secret"))
     yield transport
     transport.close()
 
@@ -172,9 +173,9 @@ def test_an_address_must_be_one(url):
 
 def test_a_token_is_not_shown_to_the_network():
     with pytest.raises(CloudError, match="use https"):
-        HttpTransport("http://cloud.example", "r", "ab" * 16, "secret")
+        HttpTransport("http://cloud.example", "r", "ab" * 16, Credentials("secret"))
     for url in ("http://localhost:80", "http://[::1]:80", "https://cloud.example"):
-        HttpTransport(url, "r", "ab" * 16, "secret").close()
+        HttpTransport(url, "r", "ab" * 16, Credentials("secret")).close()
     HttpTransport("http://cloud.example", "r", "ab" * 16).close()
 
 
@@ -184,11 +185,11 @@ def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_pa
     for folder in (ours, others):
         make_credentials(folder, ["127.0.0.1"], {}, datetime.now(UTC))
     with serving(tls=ours) as cloud:
-        trusting = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ours / "ca.pem")
+        trusting = HttpTransport(cloud.url, "r", "ab" * 16, Credentials("secret", ours / "ca.pem"))
         assert len(trusting.send(PACKETS, -1).packets) == 1
         trusting.close()
         for ca in (None, others / "ca.pem"):
-            wary = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ca)
+            wary = HttpTransport(cloud.url, "r", "ab" * 16, Credentials("secret", ca))
             with pytest.raises(CloudError, match="its certificate is not trusted"):
                 wary.send(PACKETS, -1)
             wary.close()
@@ -211,4 +212,4 @@ def test_an_authority_must_be_readable(tmp_path, content):
     if content is not None:
         (tmp_path / "ca.pem").write_bytes(content)
     with pytest.raises(CloudError, match="give a PEM file"):
-        HttpTransport("https://cloud.example", "r", "ab" * 16, ca=tmp_path / "ca.pem")
+        HttpTransport("https://cloud.example", "r", "ab" * 16, Credentials(ca=tmp_path / "ca.pem"))

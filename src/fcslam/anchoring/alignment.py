@@ -70,15 +70,10 @@ class PlanAlignment:
 
 
 def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAlignment | None:
-    """Align a map with a plan: from all positions, and by the directions of walls or all headings.
+    """The best alignment of a whole map with a plan, conclusive or not; None if the map has no walls.
 
-    Args:
-        plan: the floor plan.
-        building: the whole map.
-        placed: the map lies in the plan already, about; no other place is looked for.
-
-    Returns:
-        The best alignment, conclusive or not; None if the map has no walls.
+    It is looked for from all positions, and by the directions of walls or all headings. A map that is ``placed`` lies
+    about there in the plan already, and no other place is looked for.
     """
     target = plan.submap
     if not len(building.surface):

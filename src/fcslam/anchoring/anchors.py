@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from fcslam.anchoring.alignment import PlanAlignment, align_to_plan
 from fcslam.anchoring.deviations import Comparison, compare_with_plan
 from fcslam.anchoring.gnss import Georeference, georeferenced
+from fcslam.anchoring.part import part_of, with_part
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
@@ -19,12 +20,11 @@ from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
-from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
 from fcslam.maps.exports import outlines
-from fcslam.records import FloatArray, StrPath, frozen
+from fcslam.records import StrPath
 from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
@@ -79,28 +79,10 @@ class Anchored:
     """Files of the run folder about it, by name."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """The robots of one map, and the graph of these alone."""
-
-    robots: tuple[MappedRobot, ...]
-    """With the variables of this graph."""
-    graph: PoseGraph
-
-
-def anchored(
-    result: FleetResult,
-    anchors: Anchors,
-    placed: Collection[int],
-    fuse: FuseMembers,
-) -> Anchored:
+def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers) -> Anchored:
     """Place each map by the floor plan, else by surveyed tags, else by fixes, else by its walls.
 
-    Args:
-        result: the maps, each in a frame of its own.
-        anchors: what is known.
-        placed: maps that a user placed; they stay about there.
-        fuse: draws a map.
+    Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
     files: dict[str, bytes] = {}
     reports, pictures = [], []
@@ -108,7 +90,7 @@ def anchored(
     distances: dict[str, float] = {}
     surveyed: list[dict[str, Any]] = []
     for k in sorted({robot.map_index for robot in result.robots}):
-        part, is_placed = _part(result, k), k in placed
+        part, is_placed = part_of(result, k), k in placed
         alignment = None
         if anchors.plan is not None:
             building = map_submap(part.robots) if any(robot.keyscans for robot in part.robots) else None
@@ -116,15 +98,13 @@ def anchored(
             if building is not None and not is_full:
                 alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
-                fit = fit_to_plan(alignment.plan, part.robots, part.graph, alignment.T_plan_map)
-                part = _Part(fit.robots, fit.graph)
+                part, scales = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
                 compared = compare_with_plan(alignment.plan.submap, map_submap(part.robots))
-                reports.append(_plan_report(k, alignment, compared, fit.scales))
+                reports.append(_plan_report(k, alignment, compared, scales))
                 pictures.append(fuse(part.robots))
             else:
-                reports.append(
-                    {"map": k, "aligned": False, "reason": f"it {TOO_MANY_WALLS}" if is_full else _why(alignment)}
-                )
+                reason = "the map has no walls" if alignment is None else alignment.refusal
+                reports.append({"map": k, "aligned": False, "reason": f"it {TOO_MANY_WALLS}" if is_full else reason})
         in_plan = alignment is not None and not alignment.refusal
         by_tags = False
         if anchors.survey is not None:
@@ -132,17 +112,17 @@ def anchored(
                 reason = "it keeps the frame of its plan" if in_plan else "it was placed by hand"
                 surveyed.append({"map": k, "reason": reason, "used": [], "ignored": {}})
             else:
-                found_tags = placed_by_tags(part.robots, part.graph, result.sightings, anchors.survey)
-                part, by_tags = _Part(found_tags.robots, found_tags.graph), not found_tags.refusal
+                found_tags = placed_by_tags(part, result.sightings, anchors.survey)
+                part, by_tags = found_tags.part, not found_tags.refusal
                 surveyed.append({"map": k, **found_tags.report()})
-        found = georeferenced(part.robots, part.graph, is_fixed=in_plan or is_placed or by_tags)
+        found = georeferenced(part, is_fixed=in_plan or is_placed or by_tags)
         if found is not None:
-            part = _Part(found.robots, found.graph)
+            part = found.part
             files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))
         if anchors.to_walls and not in_plan and not is_placed and not by_tags and (found is None or found.refusal):
             turn = np.array((0.0, 0.0, -wall_direction(fuse(part.robots))))
-            part = _moved(part, turn)
-        result = _with_part(result, k, part)
+            part = part.at(se2.compose(turn, part.graph.poses()))
+        result = with_part(result, k, part)
         seen = MapTags(part.robots, result.sightings)
         tags += seen.report(k)
         distances |= {robot: round(scale, 3) for robot, scale in seen.scales().items()}
@@ -153,65 +133,6 @@ def anchored(
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
         files[PLAN_PNG] = _picture(drawing, pictures)
     return Anchored(result, files)
-
-
-def _why(alignment: PlanAlignment | None) -> str:
-    return "the map has no walls" if alignment is None else alignment.refusal
-
-
-def _part(result: FleetResult, k: int) -> _Part:
-    members = [robot for robot in result.robots if robot.map_index == k]
-    rows = _variables(members)
-    number = {variable: row for row, variable in enumerate(rows.tolist())}
-    edges = [
-        Edge(number[e.i], number[e.j], e.T_i_j, e.information, e.robust)
-        for e in result.graph.edges
-        if e.i in number and e.j in number
-    ]
-    robots = tuple(
-        replace(robot, variables=frozen(np.searchsorted(rows, robot.variables), np.int64)) for robot in members
-    )
-    return _Part(robots, PoseGraph(result.graph.poses()[rows], edges))
-
-
-def _variables(robots: Sequence[MappedRobot]) -> FloatArray:
-    return np.sort(np.concatenate([robot.variables for robot in robots]))
-
-
-def _moved(part: _Part, T: FloatArray) -> _Part:
-    robots = tuple(replace(robot, T_map_base=frozen(se2.compose(T, robot.T_map_base))) for robot in part.robots)
-    return _Part(robots, PoseGraph(se2.compose(T, part.graph.poses()), list(part.graph.edges)))
-
-
-def _with_part(result: FleetResult, k: int, part: _Part) -> FleetResult:
-    """The result with one map as it is in ``part``."""
-    before = {robot.robot: robot for robot in result.robots}
-    after = {robot.robot: replace(robot, variables=before[robot.robot].variables) for robot in part.robots}
-    rows = _variables(list(after.values()))
-    poses = result.graph.poses()
-    poses[rows] = part.graph.poses()
-    inside = set(rows.tolist())
-    own = iter(part.graph.edges)
-    edges = [
-        Edge(e.i, e.j, (same := next(own)).T_i_j, same.information, e.robust) if {e.i, e.j} <= inside else e
-        for e in result.graph.edges
-    ]
-    T_after_before = {
-        name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1]))
-        for name, robot in after.items()
-    }
-    corrections = tuple(
-        replace(c, T_map_odom=frozen(se2.compose(T_after_before[c.robot], c.T_map_odom))) if c.robot in after else c
-        for c in result.corrections
-    )
-    first = part.robots[0]
-    T = se2.compose(first.T_map_base[0], se2.inverse(before[first.robot].T_map_base[0]))
-    regions = tuple(
-        replace(region, polygon=frozen(se2.transform(T, region.polygon))) if region.map_index == k else region
-        for region in result.regions
-    )
-    robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
-    return replace(result, robots=robots, corrections=corrections, graph=PoseGraph(poses, edges), regions=regions)
 
 
 def _plan_report(
@@ -259,9 +180,12 @@ def _json(content: object) -> bytes:
 def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
     """The plan and the maps that lie in it, laid on each other."""
     side = maps[0].resolution_m if maps else max(plan.resolution_m, 0.05)
-    corners = [_corners(one) for one in (plan, *maps)]
-    low = np.floor(np.min([corner[0] for corner in corners], axis=0) / side) * side
-    size = np.ceil((np.max([corner[1] for corner in corners], axis=0) - low) / side).astype(int) + 1
+    lows = [np.array(one.origin_xy) for one in (plan, *maps)]
+    highs = [
+        low + one.resolution_m * np.array(one.cells.shape[::-1]) for low, one in zip(lows, (plan, *maps), strict=True)
+    ]
+    low = np.floor(np.min(lows, axis=0) / side) * side
+    size = np.ceil((np.max(highs, axis=0) - low) / side).astype(int) + 1
     lines, walls, free = (np.zeros(size[::-1], bool) for _ in range(3))
     for one, state, mask in (
         (plan, Occupancy.OCCUPIED, lines),
@@ -277,11 +201,6 @@ def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
     near = max(1, round(0.1 / side))
     union = OccupancyMap(cells, side, (float(low[0]), float(low[1])))
     return highlighted_png(union, walls & ~grown(lines, near), lines & ~grown(walls, near), (ONLY_SCANS, ONLY_PLAN))
-
-
-def _corners(one: OccupancyMap) -> tuple[FloatArray, FloatArray]:
-    low = np.array(one.origin_xy)
-    return low, low + one.resolution_m * np.array(one.cells.shape[::-1])
 
 
 def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:

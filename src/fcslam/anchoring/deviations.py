@@ -114,12 +114,7 @@ class _Wall:
 
 
 def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
-    """Find the walls of a building that differ from its plan.
-
-    Args:
-        plan: the plan.
-        building: the map, in the coordinates of the plan.
-    """
+    """Find the walls of a building, a map in the coordinates of the plan, that differ from the plan."""
     points, normals = plan.surface.points, plan.surface.normals
     across = _across(points, normals, building.field)
     confirmed, unseen = np.abs(across) <= OFF_M, np.isnan(across)

@@ -5,18 +5,18 @@ others are weak factors of the pose graph. Coordinates are metres east and north
 are known, on the plane that touches the ellipsoid there (azimuthal equidistant projection of PROJ).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.result import MappedRobot
+from fcslam.anchoring.part import MapPart
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.anchored import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray
 
 OUTLIER: Final = 3.0
 """A fix that is farther off than this many standard deviations does not count."""
@@ -41,8 +41,7 @@ _HEADING_INFORMATION: Final = 1e-6
 class Georeference:
     """Where one map lies on the earth."""
 
-    robots: tuple[MappedRobot, ...]
-    graph: PoseGraph
+    part: MapPart
     fixes: int
     """Fixes at a scan of the map."""
     ignored: int
@@ -85,17 +84,12 @@ class _Measured:
         return off
 
 
-def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: bool) -> Georeference | None:
-    """Place a map on the earth, conclusively or not at all.
+def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
+    """Place a map on the earth, conclusively or not at all; None if it has no fix.
 
-    Args:
-        robots: the robots of the map.
-        graph: the graph of these alone.
-        is_fixed: the map keeps its frame and its poses; else it is turned so that x is east and y is north.
-
-    Returns:
-        The map and where it lies; None if it has no fix.
+    A map that ``is_fixed`` keeps its frame and its poses; another one is turned so that x is east and y is north.
     """
+    robots = part.robots
     kept = [fix for robot in robots for fix in robot.fixes]
     if not kept:
         return None
@@ -103,7 +97,7 @@ def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: b
     try:
         from pyproj import Proj
     except ImportError:
-        return Georeference(robots, graph, len(kept), 0, "fixes need pyproj; install it: pip install 'fcslam[gnss]'")
+        return Georeference(part, len(kept), 0, "fixes need pyproj; install it: pip install 'fcslam[gnss]'")
     middle = np.median([(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in kept], axis=0)
     projection: Any = Proj(proj="aeqd", lat_0=middle[0], lon_0=middle[1], ellps="WGS84")
     east, north = projection([fix.longitude_deg for fix in kept], [fix.latitude_deg for fix in kept])
@@ -116,19 +110,17 @@ def georeferenced(robots: tuple[MappedRobot, ...], graph: PoseGraph, is_fixed: b
         np.maximum(LEAST_SIGMA_M, [fix.sigma_m for fix in kept]),
         max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
     )
-    poses = graph.poses()
+    poses = part.graph.poses()
     T, agreeing = _vote(measured, measured.antennas(poses))
     refusal = _refusal(measured, agreeing)
     if refusal:
-        return Georeference(robots, graph, len(kept), int((~agreeing).sum()), refusal)
+        return Georeference(part, len(kept), int((~agreeing).sum()), refusal)
     if not is_fixed:
-        poses, agreeing = _solve(graph, se2.compose(T, poses), measured, agreeing)
-        robots = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in robots)
-        graph, T = PoseGraph(poses, list(graph.edges)), np.zeros(3)
+        poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing)
+        part, T = part.at(poses), np.zeros(3)
     longitude, latitude = projection(*T[:2].tolist(), inverse=True)
-    return Georeference(
-        robots, graph, len(kept), int((~agreeing).sum()), "", latitude, longitude, float(middle[2]), float(T[2])
-    )
+    ignored = int((~agreeing).sum())
+    return Georeference(part, len(kept), ignored, "", latitude, longitude, float(middle[2]), float(T[2]))
 
 
 def _vote(measured: _Measured, antennas: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

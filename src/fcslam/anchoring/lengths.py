@@ -34,12 +34,7 @@ def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> L
     """Compare the lengths of a map with those of a plan, by the walls of both.
 
     Motion, scale and thickness of the walls are found together: a plan that shows the middle lines of walls makes no
-    building larger.
-
-    Args:
-        plan: the plan.
-        building: the map, or one robot's part of it.
-        T_plan_map: about where it lies in the plan, shape (3,), metres and radians.
+    building larger. The map, or one robot's part of it, lies about at ``T_plan_map``, shape (3,), metres and radians.
     """
     points, normals = se2.transform(T_plan_map, building.surface.points), building.surface.normals
     if not len(points):

@@ -1,12 +1,13 @@
 """A map fitted to a floor plan: the scale of each robot's ranges, and poses that the walls of the plan correct."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from fcslam.anchoring.lengths import lengths_in_plan
+from fcslam.anchoring.part import MapPart
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
@@ -17,7 +18,7 @@ from fcslam.lidar.field import CELL_M
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.records import FloatArray, Keyscan, frozen
+from fcslam.records import FloatArray, frozen
 
 WEAK_M, WEAK_RAD = 0.05, 0.02
 """Least standard deviations of a pose by the plan, which is no more precise, however many points agree."""
@@ -31,20 +32,6 @@ ROUNDS: Final = 4
 """Matching and solving alternate this often."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlanFit:
-    """The robots of one map in the plan."""
-
-    robots: tuple[MappedRobot, ...]
-    """With poses in the plan and ranges in its scale."""
-    poses: FloatArray
-    """Poses of the variables of their graph, shape (N, 3)."""
-    graph: PoseGraph
-    """The graph in their scale, at these poses."""
-    scales: Mapping[str, float]
-    """Scale of each robot's lengths."""
-
-
 def map_submap(robots: Sequence[MappedRobot]) -> Submap:
     """The whole map of robots that share one; one of them has a keyscan."""
     scans = [
@@ -55,22 +42,20 @@ def map_submap(robots: Sequence[MappedRobot]) -> Submap:
     return build_submap(scans, np.inf)
 
 
-def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGraph, T_plan_map: FloatArray) -> PlanFit:
-    """Fit a map to the plan, from an alignment.
+def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tuple[MapPart, dict[str, float]]:
+    """Fit a map to the plan, from its alignment ``T_plan_map``, shape (3,), metres and radians.
 
-    Args:
-        plan: the floor plan.
-        robots: the robots of one map; their variables are those of ``graph``.
-        graph: the constraints of these robots alone.
-        T_plan_map: where the map lies in the plan, shape (3,), metres and radians.
+    Returns:
+        The map in the plan, with ranges in its scale, and the scale of each robot's lengths.
     """
+    robots, graph = part.robots, part.graph
     found = {
         robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map).scale if robot.keyscans else 1.0
         for robot in robots
     }
     middle = np.append(plan.submap.surface.points.mean(axis=0), 0.0)
     # A robot's poses grow about the middle of the plan; solving puts them right.
-    scaled = [scaled_robot(robot, found[robot.robot]) for robot in robots]
+    scaled = [_scaled(robot, found[robot.robot]) for robot in robots]
     owner = np.zeros(len(graph), np.int64)
     for number, robot in enumerate(robots):
         owner[robot.variables] = number
@@ -81,7 +66,7 @@ def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGr
     ]
     poses = se2.compose(T_plan_map, graph.poses())
     poses[:, :2] = middle[:2] + (poses[:, :2] - middle[:2]) * lengths[:, None]
-    graph = PoseGraph(poses, edges)
+    fitted = MapPart(tuple(scaled), PoseGraph(poses, edges))
     scans = [
         (int(robot.variables[row]), keyscan_points(keyscan, robot.lasers).thinned(CELL_M))
         for robot in scaled
@@ -93,26 +78,24 @@ def fit_to_plan(plan: BuildingPlan, robots: Sequence[MappedRobot], graph: PoseGr
             priors = [prior for prior in priors if prior.chi2(poses) < FARTHEST_CHI2]
         if not priors:
             break
-        poses = optimize_anchored(graph, poses, priors)
-    scaled = [replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in scaled]
-    return PlanFit(tuple(scaled), poses, PoseGraph(poses, list(graph.edges)), found)
+        poses = optimize_anchored(fitted.graph, poses, priors)
+    return fitted.at(poses), found
 
 
-def scaled_robot(robot: MappedRobot, scale: float) -> MappedRobot:
+def _scaled(robot: MappedRobot, scale: float) -> MappedRobot:
     """The robot with its ranges and its own map in another scale."""
     if scale == 1.0:
         return robot
     lengths = np.array((scale, scale, 1.0))
     return replace(
         robot,
-        keyscans=tuple(_scaled_keyscan(keyscan, scale) for keyscan in robot.keyscans),
+        keyscans=tuple(
+            replace(keyscan, ranges_m=frozen(keyscan.ranges_m * np.float32(scale), np.float32))
+            for keyscan in robot.keyscans
+        ),
         lasers=tuple(replace(laser, max_range_m=laser.max_range_m * scale) for laser in robot.lasers),
         T_local_base=frozen(robot.T_local_base * lengths),
     )
-
-
-def _scaled_keyscan(keyscan: Keyscan, scale: float) -> Keyscan:
-    return replace(keyscan, ranges_m=frozen(keyscan.ranges_m * np.float32(scale), np.float32))
 
 
 def _priors(

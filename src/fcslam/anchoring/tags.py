@@ -5,22 +5,23 @@ twice. A robot that sees all tags too near or too far has a wrong calibration, o
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
-from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic import Field, NonNegativeInt, ValidationError
 
+from fcslam.anchoring.part import MapPart
 from fcslam.cloud.result import MappedRobot
-from fcslam.config import parse_yaml
+from fcslam.config import StrictModel, one_line, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.anchored import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.records import FloatArray, Tag, TagFamily, TagSighting, frozen
+from fcslam.records import FloatArray, Tag, TagFamily, TagSighting
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text
 
 ONE_VISIT: Final = 40
@@ -49,6 +50,19 @@ Survey = Mapping[Tag, tuple[float, float, float | None]]
 """Position of each surveyed tag and the direction that it faces, metres and radians; None: it is not known."""
 
 
+class _Surveyed(StrictModel):
+    """Where a tag is, metres, and the direction that it faces, radians."""
+
+    x: float
+    y: float
+    yaw: float | None = None
+
+
+class _SurveyFile(StrictModel):
+    family: TagFamily = TagFamily.APRILTAG_36H11
+    tags: dict[NonNegativeInt, _Surveyed] = Field(min_length=1)
+
+
 def read_survey(path: Path) -> Survey:
     """Read the positions of surveyed tags.
 
@@ -56,35 +70,16 @@ def read_survey(path: Path) -> Survey:
         SourceError: the file cannot be read or has another form.
     """
     try:
-        content = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
+        content = _SurveyFile.model_validate(parse_yaml(read_text(path, most=MOST_TEXT_BYTES)))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = "".join(f"{one_line(str(part))}: " for part in first["loc"])
+        raise SourceError(
+            f"{path}: {where}{one_line(first['msg'])}; write tags: {{7: {{x: 1.5, y: 0.2, yaw: 1.571}}}}"
+        ) from error
     except ValueError as error:
         raise SourceError(f"{path}: not YAML: {error}") from error
-    if not isinstance(content, dict) or not isinstance(content.get("tags"), dict) or not content["tags"]:
-        raise SourceError(f"{path}: needs 'tags' with a line for each tag, as 7: {{x: 1.5, y: 0.2, yaw: 1.571}}")
-    unknown = sorted(str(key) for key in content.keys() - {"family", "tags"})
-    if unknown:
-        raise SourceError(f"{path}: '{unknown[0]}' is unknown; it has 'family' and 'tags'")
-    family = content.get("family", TagFamily.APRILTAG_36H11)
-    if family not in tuple(TagFamily):
-        raise SourceError(f"{path}: the family '{family}' is unknown; one of {', '.join(TagFamily)}")
-    return {Tag(TagFamily(family), _number(path, key)): _place(path, key, at) for key, at in content["tags"].items()}
-
-
-def _number(path: Path, key: object) -> int:
-    if not isinstance(key, int) or isinstance(key, bool) or key < 0:
-        raise SourceError(f"{path}: '{key}' is not the number of a tag")
-    return key
-
-
-def _place(path: Path, key: object, at: object) -> tuple[float, float, float | None]:
-    known = {"x", "y", "yaw"}
-    if not isinstance(at, dict) or not {"x", "y"} <= at.keys() <= known:
-        raise SourceError(f"{path}: tag {key} needs x and y in metres, and perhaps yaw in radians; it has {at!r:.60}")
-    for name, value in at.items():
-        if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):
-            raise SourceError(f"{path}: {name} of tag {key} is not a number: {value!r:.60}")
-    yaw = at.get("yaw")
-    return float(at["x"]), float(at["y"]), None if yaw is None else float(yaw)
+    return {Tag(content.family, number): (at.x, at.y, at.yaw) for number, at in content.tags.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,10 +97,10 @@ class MapTags:
     def __init__(self, robots: Sequence[MappedRobot], sightings: Sequence[TagSighting]) -> None:
         """``robots`` of the map; sightings by others do not count."""
         self._robots = {robot.robot: robot for robot in robots}
-        self._sightings = [one for one in sightings if one.id.robot in self._robots]
         by_tag: dict[Tag, list[TagSighting]] = {}
-        for one in self._sightings:
-            by_tag.setdefault(one.tag, []).append(one)
+        for one in sightings:
+            if one.id.robot in self._robots:
+                by_tag.setdefault(one.tag, []).append(one)
         self.places = {tag: self._places(seen) for tag, seen in sorted(by_tag.items())}
         """Of each tag, the place with most sightings first."""
 
@@ -216,8 +211,7 @@ def _gap_m(a: _Place, b: _Place) -> float:
 class Surveyed:
     """A map in the coordinates of surveyed tags."""
 
-    robots: tuple[MappedRobot, ...]
-    graph: PoseGraph
+    part: MapPart
     used: tuple[Tag, ...]
     off_m: Mapping[Tag, float]
     """How far each surveyed tag that was seen is from where it should be."""
@@ -230,37 +224,27 @@ class Surveyed:
         return {"reason": self.refusal, "used": [tag.number for tag in self.used], "ignored": ignored}
 
 
-def placed_by_tags(
-    robots: tuple[MappedRobot, ...], graph: PoseGraph, sightings: Sequence[TagSighting], survey: Survey
-) -> Surveyed:
-    """Place a map by surveyed tags, and straighten it. Tags that are not where they should be do not count.
-
-    Args:
-        robots: the robots of the map.
-        graph: the graph of these alone.
-        sightings: of all tags.
-        survey: where tags are.
-    """
-    tags = MapTags(robots, sightings)
+def placed_by_tags(part: MapPart, sightings: Sequence[TagSighting], survey: Survey) -> Surveyed:
+    """Place a map by surveyed tags, and straighten it. Tags that are not where they should be do not count."""
+    tags = MapTags(part.robots, sightings)
     known = [tag for tag in tags.places if tag in survey]
     if not known:
-        return Surveyed(robots, graph, (), {}, "no robot in it saw a surveyed tag")
+        return Surveyed(part, (), {}, "no robot in it saw a surveyed tag")
     seen = {tag: tags.places[tag][0].pose for tag in known}
     T, used = _aligned(seen, survey)
     if T is None:
-        return Surveyed(robots, graph, (), {}, _why_not_aligned(seen, survey))
-    start = se2.compose(T, graph.poses())
+        return Surveyed(part, (), {}, _why_not_aligned(seen, survey))
+    start = se2.compose(T, part.graph.poses())
     while True:
         # Of two tags, no third one shows which is wrong, and the solution would bend the map between them.
         if len(used) == 2 and abs(np.subtract(*_distances_m(seen, survey, *used))) > 2.0 * LARGEST_OFF_M:
-            return Surveyed(robots, graph, (), {}, _contradiction(seen, survey, *used))
-        poses = _solve(graph, start, tags, used, survey)
-        moved = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in robots)
-        places = MapTags(moved, sightings).places
+            return Surveyed(part, (), {}, _contradiction(seen, survey, *used))
+        moved = part.at(_solve(part.graph, start, tags, used, survey))
+        places = MapTags(moved.robots, sightings).places
         off_m = {tag: float(np.hypot(*(places[tag][0].pose[:2] - np.array(survey[tag][:2])))) for tag in known}
         worst = max(used, key=lambda tag: off_m[tag])
         if off_m[worst] <= LARGEST_OFF_M or len(used) <= 2:
-            return Surveyed(moved, PoseGraph(poses, list(graph.edges)), tuple(used), off_m)
+            return Surveyed(moved, tuple(used), off_m)
         used = [tag for tag in used if tag != worst]
 
 

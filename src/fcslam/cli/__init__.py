@@ -35,7 +35,7 @@ from fcslam.cli import map as mapping
 from fcslam.cli import play as playback
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
-from fcslam.cli.examples import examples
+from fcslam.cli.options import examples
 from fcslam.cli.recordings import SENSOR_KEYS
 from fcslam.errors import FcslamError, InputError, printable
 
@@ -142,17 +142,13 @@ fcslam tools vocabulary runs/building -o building.words
 """Examples for the help of each command: the lines that begin with it."""
 
 
-def _register() -> None:
-    for path, (panel, command) in COMMANDS.items():
-        group, name = (tools if path.startswith("tools ") else app), path.removeprefix("tools ")
-        if isinstance(command, typer.Typer):
-            group.add_typer(command, name=name, rich_help_panel=panel)
-            continue
-        shown = [line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"fcslam {path} ")]
-        group.command(name, rich_help_panel=panel, epilog=examples(*shown))(command)
-
-
-_register()
+for _path, (_panel, _command) in COMMANDS.items():
+    _group, _name = (tools if _path.startswith("tools ") else app), _path.removeprefix("tools ")
+    if isinstance(_command, typer.Typer):
+        _group.add_typer(_command, name=_name, rich_help_panel=_panel)
+    else:
+        _shown = [line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"fcslam {_path} ")]
+        _group.command(_name, rich_help_panel=_panel, epilog=examples(*_shown))(_command)
 
 
 def _finite(text: str) -> float:
@@ -177,7 +173,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     An error that the user can correct is one line on stderr, never a traceback.
     """
     if COMPLETION_VARIABLE in os.environ:
-        _leave_paths_to_the_shell()
+        # A path completes to nothing, so that shells complete files. Typer would end the completion.
+        click.Path.shell_complete = lambda *_: []  # type: ignore[method-assign]
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a robot's name
@@ -193,7 +190,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
             raise
-        _drop_stdout()
+        # What is left goes nowhere: Python writes it at its end, and would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if error.errno == errno.EPIPE:
             return READER_GONE
         return _fail(f"standard output cannot be written ({error.strerror}); make room", BAD_INPUT)
@@ -206,19 +204,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = INTERRUPTED
     # typer itself turns Ctrl-C into this code
     return _fail("interrupted", code) if code == INTERRUPTED else int(code)
-
-
-def _leave_paths_to_the_shell() -> None:
-    """Make a path complete to nothing, in this process, which only completes.
-
-    Shells then complete files. Typer would answer with the word as it stands, which ends the completion.
-    """
-    click.Path.shell_complete = lambda *_: []  # type: ignore[method-assign]
-
-
-def _drop_stdout() -> None:
-    """Let what is still to be written go nowhere: Python writes it at its end, and would complain."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> int:

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from fcslam.errors import InputError, PacketError
+
 
 def certificates(
     *,
@@ -34,7 +36,6 @@ def certificates(
     import datetime
 
     from fcslam.cloud.sessions import check_robot
-    from fcslam.errors import InputError, PacketError
     from fcslam.service.credentials import folder_of, make_cluster_credentials, make_credentials
     from fcslam.service.http.authentication import Role
     from fcslam.wire.checks import check_name

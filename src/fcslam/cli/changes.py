@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.options import Force, output_option
-from fcslam.cli.output import CHANGES, answers, new_folder, print_line
+from fcslam.cli.output import CHANGES, new_folder
 
 _WHEN = "a session, a date (2026-11-23: its end), a time of ISO 8601, or a stamp in seconds"
 
@@ -32,10 +32,9 @@ def changes(
     check_output(output, force)
     found = find_changes(run, since, until, map_index)
     save_changes(found, output, force)
-    console = answers()
     for kind in ("appeared", "disappeared"):
         regions = [region for region in found.regions if region.kind == kind]
         area_m2 = sum(region.area_m2 for region in regions)
-        print_line(console, f"{kind}: {len(regions)} region{'s' * (len(regions) != 1)}, {area_m2:.2f} m2 of surface")
-    print_line(console, f"picture: {output / PICTURE}")
-    print_line(console, f"regions: {output / TABLE}")
+        typer.echo(f"{kind}: {len(regions)} region{'s' * (len(regions) != 1)}, {area_m2:.2f} m2 of surface")
+    typer.echo(f"picture: {output / PICTURE}")
+    typer.echo(f"regions: {output / TABLE}")

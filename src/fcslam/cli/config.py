@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.mission_options import mission_config
+from fcslam.cli.options import mission_config
 from fcslam.lab.presets import Preset
 
 

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.show import Live, live_page
+from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Scanner
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
+    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
 
 RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
-STAGES = 4
 ABOUT = "about"
 """The file that marks a folder as the output of a demo, which the next demo may replace."""
 
@@ -37,8 +37,10 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
+    from fcslam.cli.evaluate.fleet_tables import report_fleet
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
+    from fcslam.lab.simulation.engine import gl_context, mujoco
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
@@ -53,35 +55,32 @@ def demo(
         lidar=SCANNERS[Scanner.LD19],
         camera=camera,
     )
-    _check_libraries(settings)
+    if camera is None:  # before an earlier demo is removed: everything can run
+        mujoco()
+    else:
+        gl_context(16, 16).free()
     fleet = simulate_fleet(settings, seed)
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed)
     console = notices(quiet)
-    stages = _Stages(console)
-    stages.begin(f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
+
+    def begin(stage: int, text: str) -> None:
+        print_line(console, f"{stage} of 4 {text}")
+
+    begin(1, f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, console)
     sources = [open_source(place) for place in recordings]
-    stages.begin("map each robot, recognise places, fuse the maps")
+    begin(2, "map each robot, recognise places, fuse the maps")
     with live_page(output / RUN) if live else nullcontext() as page:
         map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
-        stages.begin("evaluate: compare with the truth")
-        _evaluate(output, console)
-        stages.begin("draw")
+        begin(3, "evaluate: compare with the truth")
+        report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console, explained=False)
+        typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
+        begin(4, "draw")
         _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
         for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
             typer.echo(f"{content}: {output / name}")
-
-
-def _check_libraries(settings: "SimulationSettings") -> None:
-    """Check before the work, and before an earlier demo is removed, that everything can run."""
-    from fcslam.lab.simulation.engine import gl_context, mujoco
-
-    if settings.camera:
-        gl_context(16, 16).free()
-    else:
-        mujoco()
 
 
 def _prepare(output: Path) -> None:
@@ -90,8 +89,6 @@ def _prepare(output: Path) -> None:
     Raises:
         OutputError: the folder holds other files, or it cannot be written.
     """
-    from fcslam.errors import OutputError
-
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():
@@ -111,41 +108,14 @@ def _prepare(output: Path) -> None:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
 
 
-def _evaluate(output: Path, console: "Console") -> None:
-    from fcslam.cli.evaluate.fleet import show_fleet
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
-    from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
-
-    with ProgressDisplay(console) as display:
-        display.start("evaluating")
-        report = evaluate_fleet(output / RUN, output / RECORDINGS)
-        write_metrics(fleet_metrics(report), output / TABLE)
-    show_fleet(report, answers(), explained=False)
-    typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
-
-
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.fleet.charts import fleet_charts
     from fcslam.lab.simulation.floorplan import PieceKind
-    from fcslam.maps.charts import Outline
-    from fcslam.maps.fleet_figure import write_figure
+    from fcslam.maps.fleet_figure import Outline, write_figure
 
     with ProgressDisplay(console) as display:
         display.start("drawing")
         solid = [piece for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
         outlines = [Outline(piece.outline, piece.kind is not PieceKind.WALL) for piece in solid]
         write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)
-
-
-class _Stages:
-    """Announces the stages of the demo."""
-
-    def __init__(self, console: "Console") -> None:
-        self._console, self._begun = console, 0
-
-    def begin(self, text: str) -> None:
-        self._begun += 1
-        print_line(self._console, f"{self._begun} of {STAGES} {text}")

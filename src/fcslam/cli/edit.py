@@ -3,16 +3,19 @@
 import getpass
 import math
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.examples import examples
+from fcslam.cli.options import examples
+from fcslam.cli.recordings import pose as read_pose
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from fcslam.mission.mission_file import SavedMission
-    from fcslam.records import Change, FloatArray, Pin, RegionUse, Undo, Veto
+    from fcslam.records import Change, FloatArray, Pin, Undo, Veto
     from fcslam.runs import Run
 
 app = typer.Typer(
@@ -29,6 +32,8 @@ app = typer.Typer(
 
 _NEGATIVE = {"ignore_unknown_options": True}
 """A corner may begin with a minus."""
+_EVER_S = 1e12
+"""Begins and ends a stretch without a stamp: no file of edits holds infinities."""
 
 Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, in whose map you read the coordinates.")]
@@ -46,21 +51,18 @@ StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="Seconds, of th
 @app.command("list", epilog=examples("fcslam edit list runs/building"))
 def list_edits(mission: Mission) -> None:
     """Print all edits of a mission: number, time, author, content, and what undid them."""
-    from datetime import UTC, datetime
-
-    from fcslam.cli.output import answers, print_line
     from fcslam.cloud.edits import edit_json, kind_of, undone
     from fcslam.mission.mission_file import read_mission
 
-    edits, console = read_mission(mission).edits, answers()
+    edits = read_mission(mission).edits
     gone = undone(edits)
     for edit in edits:
         when = datetime.fromtimestamp(edit.time_s, UTC)
         end = f"  undone by {gone[edit.number]}" if edit.number in gone else ""
         content = f"{kind_of(edit.content)} {edit_json(edit.content)}"
-        print_line(console, f"{edit.number}  {when:%Y-%m-%d %H:%M:%S} UTC  {edit.author}  {content}{end}")
+        typer.echo(f"{edit.number}  {when:%Y-%m-%d %H:%M:%S} UTC  {edit.author}  {content}{end}")
     if not edits:
-        print_line(console, "no edits")
+        typer.echo("no edits")
 
 
 @app.command(epilog=examples("fcslam edit undo runs/building 2"))
@@ -87,7 +89,6 @@ def veto(
     ],
 ) -> None:
     """Exclude a closure, or all closures between two sessions."""
-    from fcslam.errors import InputError
     from fcslam.records import Veto
 
     match ends:
@@ -121,8 +122,6 @@ def close(
     ] = "0.2,0.1",
 ) -> None:
     """Add a closure: the pose of session J at one time, as seen from session I at another time. It joins maps."""
-    from fcslam.cli.recordings import pose as read_pose
-    from fcslam.errors import InputError
     from fcslam.records import ManualClosure
 
     deviations = tolerance.split(",")
@@ -154,8 +153,8 @@ def remove(
     if first_s is None and last_s is None:
         _append(mission, Removal(robot, None if session == robot else epoch))
     else:
-        stretch = (-math.inf if first_s is None else first_s, math.inf if last_s is None else last_s)
-        _append(mission, Cut(session, *_bounded(stretch)))
+        first, last = (-_EVER_S if first_s is None else first_s), (_EVER_S if last_s is None else last_s)
+        _append(mission, Cut(session, max(first, -_EVER_S), min(last, _EVER_S)))
 
 
 @app.command(context_settings=_NEGATIVE, epilog=examples("fcslam edit floor runs/building anna+1 2"))
@@ -178,25 +177,19 @@ def floor(
 )
 def erase(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
     """Make a part of the map unknown."""
-    from fcslam.records import RegionUse
-
-    _draw(run, RegionUse.ERASE, "", corners, map_index)
+    _draw(run, "erase", "", corners, map_index)
 
 
 @app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit free runs/building "1,2 3,4"'))
 def free(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
     """Mark a part of the map as free, where something stood only for a while."""
-    from fcslam.records import RegionUse
-
-    _draw(run, RegionUse.FREE, "", corners, map_index)
+    _draw(run, "free", "", corners, map_index)
 
 
 @app.command("keep-out", context_settings=_NEGATIVE, epilog=examples('fcslam edit keep-out runs/building "1,2 3,4"'))
 def keep_out(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
     """Forbid a part of the map: map_keepout.pgm and map_keepout.yaml, the mask of Nav2's keepout filter."""
-    from fcslam.records import RegionUse
-
-    _draw(run, RegionUse.KEEP_OUT, "", corners, map_index)
+    _draw(run, "keep-out", "", corners, map_index)
 
 
 @app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit area runs/building "Room 12" "1,2 3,4"'))
@@ -208,9 +201,7 @@ def area(
     map_index: MapIndex = 0,
 ) -> None:
     """Name a part of the map: map_areas.geojson."""
-    from fcslam.records import RegionUse
-
-    _draw(run, RegionUse.AREA, name, corners, map_index)
+    _draw(run, "area", name, corners, map_index)
 
 
 @app.command(
@@ -243,8 +234,6 @@ def place(
     import numpy as np
 
     from fcslam.anchoring.walls import wall_direction
-    from fcslam.cli.recordings import pose as read_pose
-    from fcslam.errors import InputError
     from fcslam.mission.map_edits import moved_map
     from fcslam.records import Placement
 
@@ -290,20 +279,21 @@ def _decide(mission: Path, decision: "Veto | Pin") -> None:
     _append(mission, decision)
 
 
-def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: int) -> None:
+def _draw(folder: Path, use: str, name: str, corners: str, map_index: int) -> None:
+    """Append a region; two corners are those of a rectangle."""
     from fcslam.mission.map_edits import region_in_map
+    from fcslam.records import RegionUse
 
     points = [_point("a corner", corner) for corner in corners.split()]
     if len(points) == 2:
         (left, low), (right, high) = points
         points = [(left, low), (right, low), (right, high), (left, high)]
     run, mission = _opened(folder)
-    _append(folder, region_in_map(run, mission, map_index, use, name, points))
+    _append(folder, region_in_map(run, mission, map_index, RegionUse(use), name, points))
 
 
 def _opened(folder: Path) -> "tuple[Run, SavedMission]":
     """A run and its mission."""
-    from fcslam.errors import InputError
     from fcslam.mission.mission_file import read_mission
     from fcslam.runs import open_run
 
@@ -327,14 +317,7 @@ def _user() -> str:
         return "unknown"
 
 
-def _bounded(stretch: tuple[float, float]) -> tuple[float, float]:
-    """Without infinities, which no file of edits holds."""
-    return max(stretch[0], -1e12), min(stretch[1], 1e12)
-
-
 def _point(option: str, text: str) -> tuple[float, float]:
-    from fcslam.errors import InputError
-
     numbers = text.split(",")
     if len(numbers) != 2:
         raise InputError(f"{option} {text!r} is not a point; give metres, as in 1.5,-2")
@@ -342,8 +325,6 @@ def _point(option: str, text: str) -> tuple[float, float]:
 
 
 def _number(text: str) -> float:
-    from fcslam.errors import InputError
-
     try:
         number = float(text)
     except ValueError:

@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.options import output_option
-from fcslam.cli.output import FEATURES, answers, new_folder, notices, print_line
+from fcslam.cli.output import FEATURES, new_folder, notices, print_line
+from fcslam.errors import FeatureError
 from fcslam.features.detector_kinds import DetectorKind
 
 LONGEST_SIDE_PX = 2048
@@ -33,11 +34,9 @@ def extract(
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import changed
-    from fcslam.errors import FeatureError
-    from fcslam.features.classical import OrbConfig
+    from fcslam.features.classical import OrbConfig, make_detector
     from fcslam.features.detector import OnnxConfig
-    from fcslam.features.extraction import extract_all, find_files
-    from fcslam.features.factory import make_detector
+    from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX
@@ -61,4 +60,4 @@ def extract(
         raise FeatureError(f"{images}: no usable image there, {len(files)} files skipped; give JPEG, PNG, PPM or TIFF")
     without = f", {empty} of them without a keypoint" if empty else ""
     skipped = f", {len(files) - done} files skipped" if done < len(files) else ""
-    print_line(answers(), f"{finder.version}: features of {done} images{without}{skipped}: {output}")
+    typer.echo(f"{finder.version}: features of {done} images{without}{skipped}: {output}")

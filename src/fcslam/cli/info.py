@@ -8,17 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.output import answers, notices, print_line
-from fcslam.cli.recordings import (
-    Sensors,
-    bag_options,
-)
+from fcslam.cli.output import notices
+from fcslam.cli.recordings import Sensors, bag_options
 from fcslam.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from fcslam.records import LaserModel
     from fcslam.sources import BagOptions
     from fcslam.sources.inspection import Inspection, LaserContents
 
@@ -44,15 +40,14 @@ def info(
 
     options = bag_options(sensors)
     found = _with_contradictions(inspect(recording, options), options)
-    console = answers()
     if as_json:
-        print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
+        typer.echo(json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
     else:
         for line in _lines(found):
-            print_line(console, printable(line))
+            typer.echo(printable(line))
         for each in found.robots or [found]:
             for line in _calibration(each.path, options) if calibrate and each.problem is None else ():
-                print_line(console, printable(line))
+                typer.echo(printable(line))
     if any(each.problem is not None for each in (found, *found.robots)):
         raise typer.Exit(1)
 
@@ -141,19 +136,14 @@ def _lines(found: "Inspection") -> "Iterator[str]":
 
 
 def _laser(laser: "LaserContents") -> str:
-    model, (x, y, theta) = laser.model, laser.model.T_base_laser
+    from fcslam.geometry.beams import beam_step
+
+    model, (x, y, theta), step = laser.model, laser.model.T_base_laser, beam_step(laser.model.beams)
     first_deg = math.degrees(model.angle_min_rad)
     last_deg = first_deg + math.degrees(model.beams.span_rad)
     rate = "" if laser.rate_hz is None else f" at {laser.rate_hz:.1f} Hz"
     return (
         f"{laser.scans} scans{rate}, {model.beam_count} beams from {first_deg:.1f} to {last_deg:.1f} degrees"
-        f"{_thinning(model)}, "
+        f"{'' if step == 1 else f' (1 of {step} is mapped)'}, "
         f"range up to {model.max_range_m:g} m, mounted at x {x:g} m, y {y:g} m, {math.degrees(theta):.1f} degrees"
     )
-
-
-def _thinning(model: "LaserModel") -> str:
-    from fcslam.geometry.beams import beam_step
-
-    step = beam_step(model.beams)
-    return "" if step == 1 else f" (1 of {step} is mapped)"

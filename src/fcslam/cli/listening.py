@@ -1,25 +1,21 @@
 """Ports on which commands listen, and their certificates."""
 
 import os
+import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    import socket
+from fcslam.errors import ServiceError
 
 
-def listen(host: str, port: int) -> "socket.socket":
+def listen(host: str, port: int) -> socket.socket:
     """Listen on an address; port 0 is a free one.
 
     Raises:
         ServiceError: the port is in use, or the address is not of this machine.
     """
-    import socket
-
-    from fcslam.errors import ServiceError
-
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=512)
@@ -38,29 +34,19 @@ Credentials = Annotated[
 ]
 
 
-class ServiceFiles(NamedTuple):
-    """The files of a service in its folder of credentials."""
-
-    tokens: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-
-
-def find_files(folder: Path | None) -> ServiceFiles:
-    """The files that are there.
+def find_files(folder: Path | None) -> tuple[Path | None, Path | None, Path | None]:
+    """Tokens, certificate and key in a service's folder of credentials, as far as they are there.
 
     Raises:
         ServiceError: no file is there.
     """
-    from fcslam.errors import ServiceError
-
     if folder is None:
-        return ServiceFiles()
+        return None, None, None
     names = "tokens.yaml", "cloud.pem", "cloud.key"
-    found = [folder / name if os.path.exists(folder / name) else None for name in names]
-    if not any(found):
+    tokens, certificate, key = (folder / name if os.path.exists(folder / name) else None for name in names)
+    if not (tokens or certificate or key):
         raise ServiceError(f"{folder}: holds neither tokens.yaml nor cloud.pem; `fcslam tools certificates` makes them")
-    return ServiceFiles(*found)
+    return tokens, certificate, key
 
 
 def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None = None) -> None:
@@ -71,7 +57,6 @@ def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None
     """
     import ssl
 
-    from fcslam.errors import ServiceError
     from fcslam.wire.keys import no_passphrase
 
     if (certificate is None) != (key is None):

@@ -1,21 +1,24 @@
 """A live robot on a ROS network, for `fcslam robot` and `fcslam localize`."""
 
 import logging
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from fcslam.cli.output import RUNS, answers, new_folder, print_line
+import typer
+
+from fcslam.cli.output import RUNS, new_folder, print_line
 from fcslam.cli.recordings import bag_options, print_faults
-from fcslam.cli.ros_options import node_parameters, stopping
 from fcslam.cli.warm_up import compiled
+from fcslam.errors import CloudError, FcslamError, StateError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.errors import FcslamError
     from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
@@ -30,6 +33,19 @@ SERVER_PATIENCE_S = 60.0
 """Longest wait for the server at the end of a drive."""
 SWITCH_INTERVAL_S = 0.001
 """Time after which a thread that publishes yields to the one that maps; Python's own is 5 ms."""
+
+_ROS = "ROS networks"
+RosParameters = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        rich_help_panel=_ROS,
+        help="Parameters (YAML) of a ROS 2 node, with the names of slam_toolbox where they mean the same.",
+    ),
+]
+UseSimTime = Annotated[
+    bool, typer.Option("--use-sim-time", help="Take the time from /clock, as with a simulator.", rich_help_panel=_ROS)
+]
 
 
 def is_live(source: str) -> bool:
@@ -69,12 +85,35 @@ def live_source(
     Raises:
         InputError: an option cannot be used.
     """
+    from fcslam.ros.parameters import load_parameters
     from fcslam.sources import BagOptions
 
     name, address = named_address(argument)
-    return LiveSource(
-        name, address, bag_options(sensors) or BagOptions(), node_parameters(ros_parameters, use_sim_time)
-    )
+    parameters = load_parameters(ros_parameters)
+    if use_sim_time:
+        parameters = parameters.model_copy(update={"use_sim_time": True})
+    return LiveSource(name, address, bag_options(sensors) or BagOptions(), parameters)
+
+
+@contextmanager
+def stopping(stop: Callable[[], None]) -> Iterator[None]:
+    """Call ``stop`` at Ctrl-C and SIGTERM, so that what was mapped or recorded is kept; a second Ctrl-C interrupts."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stopped = threading.Event()
+
+    def end(*_: object) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+        stopped.set()
+        stop()
+
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def drive_live(
@@ -138,15 +177,13 @@ def drive_live(
             node.publish_map()
             run = robot.save(output)
         print_faults(console, {robot.name: node.sensors.audit.faults()})
-    print_line(answers(), f"{node.scans} scans, {len(run.trajectories)} sessions: {output}")
+    typer.echo(f"{node.scans} scans, {len(run.trajectories)} sessions: {output}")
     if failure is not None:
         raise failure
 
 
-def _finish(robot: "Robot", notify: Callable[[str], None]) -> "FcslamError | None":
+def _finish(robot: "Robot", notify: Callable[[str], None]) -> FcslamError | None:
     """End the recording; returns why the server or the state folder cannot be used. The run is written all the same."""
-    from fcslam.errors import CloudError, StateError
-
     try:
         if not robot.finish(SERVER_PATIENCE_S):
             notify("the server does not have everything; the rest is sent at the next start with the same --state")
@@ -165,7 +202,6 @@ def _learning(
     if plan is None or isinstance(robot, LocalizedRobot):
         yield lambda _pose: None
         return
-    from fcslam.errors import CloudError, StateError
     from fcslam.learning.federated.learning_process import LearningProcess
     from fcslam.live.standstill import Standstill
 

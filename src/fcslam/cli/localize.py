@@ -1,6 +1,5 @@
 """`fcslam localize`: a robot and a finished map in, the poses of the robot in the map out."""
 
-import gc
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -8,22 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Force, Quiet, output_option
-from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
+from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
+from fcslam.cli.options import ConfigFiles, Credentials, Force, Quiet, ServerUrl, access, mission_config, output_option
+from fcslam.cli.output import RUNS, new_folder, notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
-from fcslam.cli.ros_options import RosParameters, UseSimTime
-from fcslam.cli.server_options import Credentials, ServerUrl, access
-from fcslam.cli.warm_up import compiled
+from fcslam.cli.warm_up import compiled, copied_process
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission.localization import LocalizationProgress
     from fcslam.runs import Run
-    from fcslam.wire.http_transport import Server
 
 
 def localize(
@@ -80,7 +74,6 @@ def localize(
     """
     from fcslam.api import localize as localize_recording
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.errors import InputError
     from fcslam.runs import prepare_output
     from fcslam.storage.files import keep_private
 
@@ -90,17 +83,18 @@ def localize(
     if live and update:
         raise InputError("--update draws what a recording saw; record the drive, and localize the recording")
     if cloud is not None:
+        from fcslam.live.served_map import fetch_maps
+
         keep_private()
-        _fetch(map_path, cloud, console)
+        trouble = fetch_maps(map_path, cloud)
+        copied = f"copied the maps of {cloud.url} to {map_path}"
+        print_line(console, f"{trouble}; the robot uses the earlier copy in {map_path}" if trouble else copied)
     if live:
-        from fcslam.cli.live import drive_live, live_source
         from fcslam.live.localized_robot import LocalizedRobot
         from fcslam.live.records import Wiring
-        from fcslam.robot.backend_runner import copied_worker
 
         robot = live_source(source, sensors, ros_parameters, use_sim_time)
-        gc.freeze()
-        with copied_worker() as worker:
+        with copied_process(settings.robot) as worker:
             start = partial(
                 LocalizedRobot,
                 map=map_path,
@@ -131,15 +125,6 @@ def localize(
     _report(run, recording.name, output)
 
 
-def _fetch(folder: Path, server: "Server", console: "Console") -> None:
-    """Copy the maps of the cloud to ``folder``, or say why an earlier copy is used."""
-    from fcslam.live.served_map import fetch_maps
-
-    trouble = fetch_maps(folder, server)
-    copied = f"copied the maps of {server.url} to {folder}"
-    print_line(console, f"{trouble}; the robot uses the earlier copy in {folder}" if trouble else copied)
-
-
 def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationProgress], None]":
     def watch(now: "LocalizationProgress") -> None:
         state = f"localized, quality {now.quality:.2f}" if now.is_localized else "not localized"
@@ -149,18 +134,16 @@ def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationPro
 
 
 def _report(run: "Run", robot: str, output: Path) -> None:
-    console, values = answers(), {name: metric.value for name, metric in run.metrics.items()}
+    values = {name: metric.value for name, metric in run.metrics.items()}
     share, scans = values["localized_share"], int(values["scans"])
     if not values["fixes"]:
-        print_line(
-            console,
+        typer.echo(
             f"{robot}: not localized in {scans} scans; is this the right map, and did the robot drive far enough?",
         )
     else:
         times = "" if values["losses"] == 0 else f", lost {values['losses']:.0f} x"
-        print_line(
-            console,
+        typer.echo(
             f"{robot}: localized after {values['first_fix_after']:.1f} m, at {share:.0%} of {scans} scans{times}",
         )
-    print_line(console, f"poses: {output / 'localization' / f'{robot}.csv'}")
-    print_line(console, f"map: {output / 'map.png'}")
+    typer.echo(f"poses: {output / 'localization' / f'{robot}.csv'}")
+    typer.echo(f"map: {output / 'map.png'}")

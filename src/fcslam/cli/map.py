@@ -11,23 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFiles, mission_config, with_starts
-from fcslam.cli.options import (
-    Force,
-    Quiet,
-    WorkersOption,
-    output_option,
-)
-from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
-from fcslam.cli.recordings import (
-    Sensors,
-    bag_options,
-    open_recordings,
-    print_faults,
-    print_notes,
-)
+from fcslam.cli.options import ConfigFiles, Force, Quiet, WorkersOption, mission_config, output_option, with_starts
+from fcslam.cli.output import RUNS, answers, new_folder, notices
+from fcslam.cli.recordings import Sensors, bag_options, open_recordings, print_faults, print_notes
 from fcslam.cli.show import Live, live_page
 from fcslam.cli.warm_up import compiled, cores
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -115,8 +104,6 @@ def map_recordings(
         from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import split_recordings
         from fcslam.cluster.verifying import verifying
-        from fcslam.cluster.workers import Workers
-        from fcslam.errors import InputError
         from fcslam.mission.mission import Beginning, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
@@ -134,8 +121,7 @@ def map_recordings(
             opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
-    chosen = Workers(workers)
-    with verifying(chosen) as verify, live_page(output) if live else nullcontext() as page:
+    with verifying(workers) as verify, live_page(output) if live else nullcontext() as page:
         beginning = Beginning(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
         map_sources(sources, settings, beginning, output, notices(quiet), force, page)
 
@@ -146,8 +132,6 @@ def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, st
     Raises:
         InputError: a robot or all of them are given two floors.
     """
-    from fcslam.errors import InputError
-
     common = [option for option in options if "=" not in option]
     named = [(name, floor) for name, _, floor in (option.partition("=") for option in options if "=" in option)]
     twice = next((name for name, count in Counter(name for name, _ in named).items() if count > 1), None)
@@ -189,7 +173,7 @@ def map_sources(
     if page is not None:
         page.finish(output)
     print_faults(console, faults)
-    _report(answers(), run, time.perf_counter() - began, output, settings, beginning.onto)
+    _report(run, time.perf_counter() - began, output, settings, beginning.onto)
     return run
 
 
@@ -230,7 +214,6 @@ def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
 
 
 def _report(
-    console: "Console",
     run: "Run",
     elapsed_s: float,
     output: Path,
@@ -241,6 +224,7 @@ def _report(
 
     from fcslam.anchoring.anchors import anchoring_lines
     from fcslam.cloud.sessions import robot_and_epoch
+    from fcslam.metrics.jumps import find_jumps
 
     values = {name: metric.value for name, metric in run.metrics.items()}
     has_floors = any(trajectory.floor for trajectory in run.trajectories.values())
@@ -253,10 +237,9 @@ def _report(
             f"{trajectory.path_length_m:.1f}",
             str(len(trajectory.stamps)),
         )
-    console.print(table)
+    answers().print(table)
     speed = "".join(f" ({text})" for text in _speed(values["recorded_time"], elapsed_s))
-    print_line(
-        console,
+    typer.echo(
         f"{values['scans']:.0f} scans in {elapsed_s:.1f} s{speed}, "
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
@@ -269,37 +252,30 @@ def _report(
             why = f"{robot} was lost; this session begins at {begin_s:.3f} s"
             if begin_s < ends.get(robot, begin_s):
                 why = f"the clock stepped back; this session begins at {begin_s:.3f} s"
-            print_line(console, f"{session.robot}: {why}")
+            typer.echo(f"{session.robot}: {why}")
         ends[robot] = session.stamps[-1]
-    _print_jumps(console, run, settings)
-    maps, joined = int(values["maps"]), settings.fleet.join_maps
-    if maps > 1:
-        print_line(console, f"{maps} maps" if joined else f"{maps} maps: one for each robot")
-    if joined:
-        _print_separations(console, run)
-    for line in anchoring_lines(run.map_files):
-        print_line(console, line)
-    for name in sorted(name for name in run.map_files if name.endswith(".png")):
-        print_line(console, f"map: {output / name}")
-
-
-def _print_jumps(console: "Console", run: "Run", settings: "MissionConfig") -> None:
-    """Warn of every trajectory with steps that no robot can make."""
-    from fcslam.metrics.jumps import find_jumps
-
     for trajectory in run.trajectories.values():
         jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
         if jumps is not None:
-            print_line(console, f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
+            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
+    maps, joined = int(values["maps"]), settings.fleet.join_maps
+    if maps > 1:
+        typer.echo(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
+    if joined:
+        _print_separations(run)
+    for line in anchoring_lines(run.map_files):
+        typer.echo(line)
+    for name in sorted(name for name in run.map_files if name.endswith(".png")):
+        typer.echo(f"map: {output / name}")
 
 
-def _print_separations(console: "Console", run: "Run") -> None:
+def _print_separations(run: "Run") -> None:
     """Say for every two maps what keeps them apart; maps without similar places share one line."""
     from fcslam.runs import separations
 
     apart = separations(run)
     unlike = [separation for separation in apart if separation.reason is None]
     for separation in apart if len(unlike) == 1 else (one for one in apart if one not in unlike):
-        print_line(console, str(separation))
+        typer.echo(str(separation))
     if len(unlike) > 1:
-        print_line(console, f"{len(unlike)} pairs of maps: no two of their places look alike")
+        typer.echo(f"{len(unlike)} pairs of maps: no two of their places look alike")

@@ -1,9 +1,24 @@
-"""Options that several commands share, each declared once."""
+"""Options that several commands share, each declared once, what they choose, and the examples in help."""
 
+import os
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from fcslam.cli.recordings import pose
+from fcslam.errors import ConfigError
+from fcslam.lab.presets import Preset
+
+if TYPE_CHECKING:
+    from fcslam.config import SettingsType
+    from fcslam.mission.mission import MissionConfig
+    from fcslam.wire.http_transport import Server
+
+_ONE_KEY = re.compile(r"([a-z][a-z0-9_.]*)=(.*)", re.DOTALL)
 
 Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print neither progress nor notices on stderr, only errors.")
@@ -19,7 +34,55 @@ PathLength = Annotated[
 ]
 NoCamera = Annotated[bool, typer.Option("--no-camera", help="Simulate LiDARs only. This needs no GL library.")]
 
-_WORKERS = "Workers"
+ConfigFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--config",
+        "-c",
+        metavar="FILE|KEY=VALUE",
+        help="Configuration file (YAML; `fcslam tools config` prints the default one), one key of it, such as "
+        "fleet.join_maps=false, or the preset `paper`: FC-SLAM to the letter. Can be repeated; a later one overrides "
+        "keys of an earlier one.",
+    ),
+]
+SettingsFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--config", "-c", metavar="FILE|KEY=VALUE", help="Settings file (YAML), or one of its keys. Can be repeated."
+    ),
+]
+
+Floor = Annotated[str, typer.Option(help="Floor of the building. Places of different floors are never compared.")]
+ServerUrl = Annotated[
+    str | None,
+    typer.Option(
+        "--server",
+        metavar="URL",
+        rich_help_panel="Network",
+        help="Address of the cloud, as in https://cloud.example:8443. Separate the addresses of several instances by "
+        "commas.",
+    ),
+]
+Credentials = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        rich_help_panel="Network",
+        help="Folder with the robot's credentials: token, ca.pem (authority that signed the cloud's certificate, "
+        "if it is not one of this system), client.pem and client.key (the robot's certificate).",
+    ),
+]
+STATE = typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it.")
+Budget = Annotated[
+    float | None,
+    typer.Option(
+        "--budget-kBps",
+        min=0.1,
+        rich_help_panel="Network",
+        help="Limit of the uplink, in kB per second of the recording. Keyscans, constraints, tags and fixes are always "
+        "sent; places are sent with fewer descriptors or left out.",
+    ),
+]
 WorkersOption = Annotated[
     str,
     typer.Option(
@@ -27,7 +90,7 @@ WorkersOption = Annotated[
         metavar="N|ADDRESS",
         help="Processes that verify closures, this one included, or the Dask scheduler of a cluster: "
         "tls://HOST:PORT or tcp://HOST:PORT, with the certificates of Dask's configuration. The result is the same.",
-        rich_help_panel=_WORKERS,
+        rich_help_panel="Workers",
     ),
 ]
 
@@ -35,3 +98,84 @@ WorkersOption = Annotated[
 def output_option(description: str, parent: str) -> Any:
     """The option ``--output``, whose default is a new folder ``parent/<time>``; see ``output.new_folder``."""
     return typer.Option("--output", "-o", help=description, show_default=f"{parent}/<time>")
+
+
+def access(server: str | None, credentials: Path | None, budget_kBps: float | None = None) -> "Server | None":
+    """The service that a robot sends to; None if none is named.
+
+    Raises:
+        InputError: the credentials cannot be read.
+    """
+    from fcslam.wire.http_transport import Server
+    from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
+
+    found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
+    if server is None:
+        return None
+    own = found.own if server.startswith("https:") else None  # a certificate is shown in TLS only
+    return Server(server, found.token, found.ca, own, budget_kBps)
+
+
+def chosen_settings(
+    settings: "SettingsType", chosen: Sequence[str] | None, presets: Mapping[str, Path] = MappingProxyType({})
+) -> "SettingsType":
+    """The settings with the changes of files, presets and single keys, in this order.
+
+    Raises:
+        ConfigError: a file cannot be read, or a key or a value is invalid.
+    """
+    from fcslam.config import changed, load, parse_yaml
+
+    for one in chosen or ():
+        single = _single_key(one)
+        if single is None:
+            settings = load(type(settings), presets.get(one, Path(one)), over=settings)
+            continue
+        key, text = single.groups()
+        try:
+            content: Any = parse_yaml(text)
+        except ValueError as error:
+            raise ConfigError(f"--config {key}: {error}") from error
+        for part in reversed(key.split(".")):
+            content = {part: content}
+        settings = changed(settings, content, "--config")
+    return settings
+
+
+def _single_key(text: str) -> "re.Match[str] | None":
+    return None if os.path.exists(text) else _ONE_KEY.fullmatch(text)
+
+
+def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None" = None) -> "MissionConfig":
+    """The configuration of a mission that the command line chooses.
+
+    Files and presets change the defaults. Without any, single keys change ``default``.
+
+    Raises:
+        ConfigError: a file cannot be read or is invalid.
+    """
+    from fcslam.mission.mission import MissionConfig
+
+    base = default if default is not None and all(map(_single_key, chosen or ())) else MissionConfig()
+    return chosen_settings(base, chosen, {preset.value: preset.file for preset in Preset})
+
+
+def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "MissionConfig":
+    """The configuration with the starts of ``--start NAME=X,Y,THETA``.
+
+    Raises:
+        ConfigError: a robot is given two starts, or a name or a number cannot be used.
+        InputError: a start is not a pose.
+    """
+    from fcslam.config import changed
+
+    named = [start.partition("=")[::2] for start in starts or ()]
+    if len(dict(named)) < len(named):
+        raise ConfigError("--start: a robot is given two starts; give one for each")
+    poses = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
+    return changed(config, {"fleet": {"starts": poses}}, "the command line") if poses else config
+
+
+def examples(*commands: str) -> str:
+    """The epilog of a command's help: one example on each line of at most 78 characters, to be copied as it stands."""
+    return "\n\n".join(("Examples:", *commands))  # typer removes single line breaks

@@ -1,5 +1,7 @@
 """Where commands write: messages on stderr, answers on stdout, and new folders named by the time."""
 
+import math
+from collections.abc import Callable
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -40,3 +42,15 @@ def answers() -> "Console":
 def print_line(console: "Console", text: str) -> None:
     """Print ``text`` as it stands: no markup, no colours, no line breaks at the console's width."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def once_printer(console: "Console", most: float = math.inf) -> Callable[[str], None]:
+    """A function that prints each different line once, and ``most`` of them at most."""
+    printed = set[str]()
+
+    def print_once(line: str) -> None:
+        if line not in printed and len(printed) < most:
+            printed.add(line)
+            print_line(console, line)
+
+    return print_once

@@ -1,6 +1,5 @@
 """`fcslam play`: a recording played to a cloud service, as if its robot drove now."""
 
-import gc
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -11,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.learning_options import Learn, learning_plan
 from fcslam.cli.live import is_live
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.options import STATE, Budget, ConfigFiles, Credentials, Floor, Quiet, ServerUrl, access, mission_config
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
-from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
-from fcslam.cli.warm_up import compiled
+from fcslam.cli.training_options import Learn, learning_plan
+from fcslam.cli.warm_up import compiled, copied_process
+from fcslam.errors import InputError, PacketError, SourceError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
     from fcslam.live.records import RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.robot.frontend import RobotConfig
-    from fcslam.sources import Source, Survey
+    from fcslam.sources import Survey
 
 
 def play(
@@ -42,10 +40,7 @@ def play(
     server: ServerUrl = None,
     credentials: Credentials = None,
     budget_kBps: Budget = None,
-    state: Annotated[
-        Path,
-        typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
-    ],
+    state: Annotated[Path, STATE],
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,
@@ -62,10 +57,11 @@ def play(
     quiet: Quiet = False,
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
-    from fcslam.errors import InputError
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.live.playback import PlaybackPace
+    from fcslam.live.playback import play as play_records
     from fcslam.live.records import Playback, Wiring
     from fcslam.live.robot import Robot
-    from fcslam.robot.backend_runner import copied_worker
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
@@ -75,7 +71,7 @@ def play(
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
-    pace = _speed(speed)
+    pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     opened = open_recording(recording, bag_options(sensors))
     _check_name(opened.name)
     survey = opened.survey()
@@ -83,51 +79,24 @@ def play(
     print_notes(console, survey.notes)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
-    gc.freeze()
-    with (
-        copied_worker() as worker,
-        closing(
-            Robot(
-                opened.name,
-                server=cloud,
-                state=state,
-                config=settings,
-                own_map=False,
-                floor=floor,
-                wiring=Wiring(worker, playback=Playback(fingerprint, resume), keeps_keyframes=learn),
-            )
-        ) as live,
-    ):
-        _play(live, opened, survey.scan_count, pace, plan, state, console)
-        print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
-        _report(live, state, cloud.url)
-
-
-def _play(
-    live: "Robot",
-    recording: "Source",
-    scans: int,
-    speed: float | None,
-    plan: "RobotLearningPlan | None",
-    state: Path,
-    console: "Console",
-) -> None:
-    """Play a recording of ``scans`` scans to its robot, which learns afterwards if there is a plan for it."""
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.live.playback import PlaybackPace, play
-
-    pace = PlaybackPace(speed, time.monotonic, time.sleep)
-    try:
-        with compiled(console), _interruptible(), ProgressDisplay(console) as display:
-            watch = _watch(display, console, scans)
-            stay = None if plan is None else partial(_learn, plan, console, display, watch)
-            play(live, recording.records(), pace, watch, stay)
-    except KeyboardInterrupt:
-        left = live.status().waiting
-        print_line(
-            console, f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume"
+    with copied_process(settings.robot) as worker:
+        wiring = Wiring(worker, playback=Playback(fingerprint, resume), keeps_keyframes=learn)
+        robot = Robot(
+            opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor, wiring=wiring
         )
-        raise
+        with closing(robot):
+            try:
+                with compiled(console), _interruptible(), ProgressDisplay(console) as display:
+                    watch = _watch(display, console, survey.scan_count)
+                    stay = None if plan is None else partial(_learn, plan, console, display, watch)
+                    play_records(robot, opened.records(), pace, watch, stay)
+            except KeyboardInterrupt:
+                left = robot.status().waiting
+                size = f"{left.packets} packets ({left.bytes / 1e3:.0f} kB)"
+                print_line(console, f"{size} wait in {state}; to continue, give --resume")
+                raise
+            print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry_jumps)})
+            _report(robot, state, cloud.url)
 
 
 def _learn(
@@ -161,8 +130,6 @@ def _learn(
 
 def _speed(text: str) -> float | None:
     """Playback speed as a multiple of real time; None: as fast as possible."""
-    from fcslam.errors import InputError
-
     if text == "max":
         return None
     try:
@@ -176,7 +143,6 @@ def _speed(text: str) -> float | None:
 
 def _check_name(name: str) -> None:
     from fcslam.cloud.sessions import check_robot
-    from fcslam.errors import PacketError, SourceError
 
     try:
         check_robot(name)
@@ -271,20 +237,18 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
     from fcslam.runs import write_tum
 
     now = robot.status()
-    console = answers()
-    print_line(
-        console,
+    typer.echo(
         f"{now.scans} scans, {now.keyscans} keyscans; {server} has confirmed all packets "
         f"({now.sent_bytes / 1e3:.0f} kB sent)",
     )
     if now.left_out:
-        print_line(console, f"{now.left_out} places were left out: the outbox was full or the budget was spent")
+        typer.echo(f"{now.left_out} places were left out: the outbox was full or the budget was spent")
     if now.refused:
-        print_line(console, f"{now.refused} packets were refused: {state / 'refused'}")
+        typer.echo(f"{now.refused} packets were refused: {state / 'refused'}")
     if now.times_lost:
         lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
-        print_line(console, f"{lost}; {_localization(now, now.times_lost)}")
+        typer.echo(f"{lost}; {_localization(now, now.times_lost)}")
     if now.map_index is not None:
         trajectory = robot.trajectory()
         write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)
-        print_line(console, f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
+        typer.echo(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")

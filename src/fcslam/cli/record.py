@@ -2,10 +2,8 @@
 
 import re
 import shutil
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event, Timer
@@ -13,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live, named_address
+from fcslam.cli.live import is_live, named_address, stopping
 from fcslam.cli.options import Force, Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.output import notices, print_line
 from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
-from fcslam.cli.ros_options import stopping
+from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.records import LaserScan, SensorRecord
+    from fcslam.records import SensorRecord
     from fcslam.sources import BagOptions, Source, Survey
 
 _CARMEN = re.compile(r"\.(clf|log)(\.(gz|xz|bz2))?$")
@@ -66,8 +64,6 @@ def record(
         _record(source, output, duration, options, force, console)
     else:
         if duration is not None:
-            from fcslam.errors import InputError
-
             raise InputError(f"--duration is the time to record a live robot; {source} is a recording")
         _convert(source, output, options, force, console)
 
@@ -75,7 +71,6 @@ def record(
 def _record(
     address: str, output: Path, duration: float | None, options: "BagOptions | None", force: bool, console: "Console"
 ) -> None:
-    from fcslam.errors import OutputError
     from fcslam.ros.addresses import open_network
     from fcslam.ros.node import await_sensors
     from fcslam.ros.parameters import NodeParameters
@@ -98,38 +93,33 @@ def _record(
                 timer.start()
             counts = record_messages(network, found, output, stop, lambda line: print_line(console, line))
         timer.cancel()
-    print_line(answers(), f"{_listed(counts)}: {output}")
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"
+    listed = ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"
+    typer.echo(f"{listed}: {output}")
 
 
 def _convert(log: str, output: Path, options: "BagOptions | None", force: bool, console: "Console") -> None:
+    from fcslam.records import LaserScan
+
     source = open_recording(log, options)
     _prepare(output, force)
     survey = source.survey()
     print_notes(console, survey.notes)
-    if survey.camera is not None and _CARMEN.search(output.name):
-        print_line(console, f"{output}: a CARMEN log has no place for images, they are left out")
-    if len(survey.lasers) > 1 and _CARMEN.search(output.name):
-        print_line(console, f"{output}: a CARMEN log has a place for one laser, the scans of the others are left out")
-    if _CARMEN.search(output.name) and any(scan.sweep is not None for scan in islice(_scans(source), 1)):
-        print_line(console, f"{output}: a CARMEN log has no place for the times of beams, they are lost")
+    if _CARMEN.search(output.name):
+        first = next((record for record in source.records() if isinstance(record, LaserScan)), None)
+        for is_lost, what in (
+            (survey.camera is not None, "no place for images, they are left out"),
+            (len(survey.lasers) > 1, "a place for one laser, the scans of the others are left out"),
+            (first is not None and first.sweep is not None, "no place for the times of beams, they are lost"),
+        ):
+            if is_lost:
+                print_line(console, f"{output}: a CARMEN log has {what}")
     _write(output, survey, _with_progress(source, survey.scan_count, console))
     print_faults(console, {source.name: source.faults})
-    print_line(answers(), f"{survey.scan_count} scans: {output}")
-
-
-def _scans(source: "Source") -> "Iterator[LaserScan]":
-    from fcslam.records import LaserScan
-
-    return (record for record in source.records() if isinstance(record, LaserScan))
+    typer.echo(f"{survey.scan_count} scans: {output}")
 
 
 def _prepare(output: Path, force: bool) -> None:
     """Check before the work that ``output`` can be written, and create its parents."""
-    from fcslam.errors import OutputError
     from fcslam.sources import BAG_SUFFIXES
 
     if not (_CARMEN.search(output.name) or output.suffix in (*BAG_SUFFIXES, _RECORDING)):
@@ -149,7 +139,6 @@ def _prepare(output: Path, force: bool) -> None:
 
 def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") -> None:
     """Write into a temporary folder beside ``output`` and move the complete recording to its place."""
-    from fcslam.errors import OutputError
     from fcslam.sources import write_bag, write_carmen, write_recording
 
     try:

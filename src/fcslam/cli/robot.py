@@ -1,19 +1,29 @@
 """`fcslam robot`: a live robot, which maps and sends to a cloud service."""
 
-import gc
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fcslam.cli.learning_options import Learn, learning_plan
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
+from fcslam.cli.options import (
+    STATE,
+    Budget,
+    ConfigFiles,
+    Credentials,
+    Floor,
+    Quiet,
+    ServerUrl,
+    access,
+    mission_config,
+    output_option,
+)
 from fcslam.cli.output import RUNS, notices
 from fcslam.cli.recordings import Sensors
-from fcslam.cli.ros_options import RosParameters, UseSimTime
-from fcslam.cli.server_options import Budget, Credentials, Floor, ServerUrl, access
+from fcslam.cli.training_options import Learn, learning_plan
+from fcslam.cli.warm_up import copied_process
+from fcslam.errors import InputError
 
 
 def robot(
@@ -29,10 +39,7 @@ def robot(
     server: ServerUrl = None,
     credentials: Credentials = None,
     budget_kBps: Budget = None,
-    state: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
-    ] = None,
+    state: Annotated[Path | None, STATE] = None,
     output: Annotated[Path | None, output_option("Run folder, with the robot's own map.", RUNS)] = None,
     floor: Floor = "",
     config: ConfigFiles = None,
@@ -43,25 +50,20 @@ def robot(
     quiet: Quiet = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
-    from fcslam.cli.live import drive_live, is_live, live_source
-    from fcslam.errors import InputError
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
-    from fcslam.robot.backend_runner import copied_worker
     from fcslam.storage.files import keep_private
 
     keep_private()
     if not is_live(address):
         raise InputError(
-            f"{address}: is not the address of a live robot, such as ros2:/robot1; `fcslam play` plays a "
-            "recording to a "
-            "service"
+            f"{address}: is not the address of a live robot, such as ros2:/robot1; `fcslam play` plays a recording to "
+            "a service"
         )
     live = live_source(address, sensors, ros_parameters, use_sim_time)
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
-    gc.freeze()
-    with copied_worker() as worker:
+    with copied_process(settings.robot) as worker:
         wiring = Wiring(worker, keeps_keyframes=learn)
         start = partial(Robot, server=cloud, state=state, config=settings, floor=floor, wiring=wiring)
         drive_live(live, start, output, notices(quiet), plan)

@@ -2,30 +2,14 @@
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
-from fcslam.cli.mission_options import ConfigFiles, mission_config
-from fcslam.cli.options import Quiet, WorkersOption
+from fcslam.cli.options import ConfigFiles, Quiet, WorkersOption, mission_config
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import uvicorn
-    from fastapi import FastAPI
-
-    from fcslam.cloud.settings import CloudConfig
-    from fcslam.cluster.workers import Workers
-    from fcslam.service.http.authentication import Authenticator
-    from fcslam.service.http.state import ServiceState
-
-_CREDENTIALS = "Credentials"
-_INSTANCES = "Several instances"
-_LEARNING = "Learning"
 
 
 def serve(
@@ -39,7 +23,7 @@ def serve(
         typer.Option(
             "--insecure",
             help="Accept requests from other machines without authentication.",
-            rich_help_panel=_CREDENTIALS,
+            rich_help_panel="Credentials",
         ),
     ] = False,
     client_ca: Annotated[
@@ -47,7 +31,7 @@ def serve(
         typer.Option(
             help="Certificate of the authority that signs robots' certificates (PEM). Robots with such a certificate "
             "need no token.",
-            rich_help_panel=_CREDENTIALS,
+            rich_help_panel="Credentials",
         ),
     ] = None,
     config: ConfigFiles = None,
@@ -55,7 +39,7 @@ def serve(
         bool,
         typer.Option(
             "--learn",
-            rich_help_panel=_LEARNING,
+            rich_help_panel="Learning",
             help="Let the robots train the detector together while they map, on what they see again. Settings: "
             "learning.yaml in --data.",
         ),
@@ -68,7 +52,7 @@ def serve(
             help="PostgreSQL database for all missions, postgresql://USER@HOST:PORT/DATABASE; several instances may "
             "share it (FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit this one). The default is a file for "
             "each mission in --data.",
-            rich_help_panel=_INSTANCES,
+            rich_help_panel="Several instances",
         ),
     ] = None,
     workers: WorkersOption = "1",
@@ -77,13 +61,12 @@ def serve(
     import gc
     import logging
 
-    from fcslam.cli.serve_learning import learning_plan, learning_process
-    from fcslam.cli.shared_service import shared_state
-    from fcslam.cluster.verifying import verifying
-    from fcslam.cluster.workers import Workers
+    from fcslam.cli import serving
+    from fcslam.cluster.verifying import check_workers, is_cluster, verifying
     from fcslam.page.routes import page_router, report_router
     from fcslam.processes import keep_memory_trimmed
     from fcslam.service.http.app import create_app
+    from fcslam.service.http.authentication import Authenticator, read_tokens
     from fcslam.service.shared.missions import NAMED
     from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
@@ -91,143 +74,39 @@ def serve(
     tokens, certificate, key = find_files(credentials)
     check_tls(certificate, key, client_ca)
     if tokens is None and client_ca is None and not insecure:
-        _check_open(host, credentials)
-    chosen = Workers(workers)
-    chosen.check()
-    if chosen.is_cluster:
-        with verifying(chosen):  # refused here, not by the worker of each mission
+        serving.check_open(host, credentials)
+    check_workers(workers)
+    if is_cluster(workers):
+        with verifying(workers):  # refused here, not by the worker of each mission
             pass
-    plan = learning_plan(learn, data, store)
+    learning = serving.learning_settings(data, store) if learn else None
     keep_private()
     keep_memory_trimmed()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
-        authenticator, given = _authenticator(tokens, client_ca), mission_config(config).cloud
+        known = read_tokens(tokens) if tokens is not None else None if client_ca is None else ()
+        authenticator, given = Authenticator(known), mission_config(config).cloud
         if store is None:
-            state = _state(data, authenticator, given, chosen)
+            state = serving.own_state(data, authenticator, given, workers)
         else:
-            state = shared_state(store, listening.getsockname()[1], data, authenticator, given, chosen)
-        _reload_on_hangup(state, tokens)
+            state = serving.shared_state(store, listening.getsockname()[1], data, authenticator, given, workers)
+        serving.reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
         routers = [page_router(), report_router(state)]
-        if plan is not None:
+        if learning is not None:
             from fcslam.learning.federated.relay import learning_router
 
-            routers.append(learning_router(state, stack.enter_context(learning_process(plan, state))))
+            process = serving.learning_process(learning, state, data / "learning")
+            routers.append(learning_router(state, stack.enter_context(process)))
         app = create_app(
             state, routers, local_names=tokens is None and client_ca is None, named=None if store is None else NAMED
         )
-        server = _server(app, certificate, key, client_ca, state.close)
+        server = serving.make_server(app, certificate, key, client_ca, state.close)
         scheme, (address, number) = "https" if certificate else "http", listening.getsockname()[:2]
         shown = f"[{address}]" if ":" in address else address
         typer.echo(
             f"fcslam serves mission '{state.mission.folder.name}' at {scheme}://{shown}:{number}; Ctrl-C stops it"
         )
         server.run(sockets=[listening])
-
-
-def _check_open(host: str, credentials: Path | None) -> None:
-    """Check that a service may go without authentication.
-
-    Raises:
-        ServiceError: others reach it, or credentials are given in vain.
-    """
-    from fcslam.errors import ServiceError
-    from fcslam.wire.http_transport import is_loopback
-
-    if not is_loopback(host):
-        raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
-    if credentials is not None:
-        raise ServiceError(
-            f"{credentials}: holds no tokens.yaml, so everybody could send and read; `fcslam tools certificates` adds "
-            "it; or give --client-ca or --insecure"
-        )
-
-
-def _server(
-    app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None, on_exit: "Callable[[], None]"
-) -> "uvicorn.Server":
-    import os
-    import ssl
-
-    import uvicorn
-
-    from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
-
-    allow_many_connections()
-    return GuardedServer(
-        uvicorn.Config(
-            app,
-            http=GuardedProtocol,
-            ssl_certfile=certificate,
-            ssl_keyfile=key,
-            ssl_ca_certs=None if client_ca is None else str(client_ca),
-            ssl_cert_reqs=ssl.CERT_NONE if client_ca is None else ssl.CERT_OPTIONAL,
-            backlog=512,
-            log_level="error",  # a line for each request that is no HTTP would fill the disk
-            proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,  # else any program of this machine names the client
-            ws="none",
-            server_header=False,
-            timeout_graceful_shutdown=10,
-            h11_max_incomplete_event_size=64 * 1024,
-        ),
-        on_exit,
-    )
-
-
-def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticator":
-    from fcslam.service.http.authentication import Authenticator, read_tokens
-
-    if tokens is None:
-        return Authenticator(None if client_ca is None else ())
-    return Authenticator(read_tokens(tokens))
-
-
-def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
-    """Read the tokens again at SIGHUP; keep the previous ones if the file is bad."""
-    import logging
-    import signal
-
-    from fcslam.errors import FcslamError
-    from fcslam.service.http.authentication import read_tokens
-
-    log = logging.getLogger("fcslam.service")
-
-    def reload(*_: object) -> None:
-        if tokens is None:
-            return
-        try:
-            changed = state.authenticator.replace(read_tokens(tokens))
-        except FcslamError as error:
-            log.error("%s; keeping the previous tokens", error)
-        else:
-            log.warning("read the tokens of %s again", tokens)
-            state.audit.record("", "", "tokens read again", 200, {"changed": changed})
-
-    signal.signal(signal.SIGHUP, reload)
-
-
-def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", workers: "Workers") -> "ServiceState":
-    import sys
-    import time
-
-    from fcslam.service.audit_log import AuditFile, AuditLog
-    from fcslam.service.http.events import EventStream
-    from fcslam.service.http.limits import RateLimit
-    from fcslam.service.http.state import ServiceState
-    from fcslam.service.missions import Missions
-    from fcslam.service.supervisor import Supervisor
-
-    events = EventStream()
-    command = (sys.executable, "-m", "fcslam.service.worker", *workers.options())
-    missions = Missions(
-        data,
-        config,
-        time.monotonic,
-        time.time,
-        lambda folder: Supervisor(folder.path, time.monotonic, events.publish, command),
-    )
-    audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
-    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, data / "learning")

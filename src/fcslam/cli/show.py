@@ -7,6 +7,8 @@ import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from socket import socket
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,14 +16,13 @@ import typer
 from fcslam.cli.listening import listen
 from fcslam.cli.options import Force
 from fcslam.cli.output import notices
+from fcslam.cli.warm_up import compiled
+from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from socket import socket
-
     from rich.console import Console
 
     from fcslam.page.live_map import LiveMap
-    from fcslam.page.shown_run import ShownRun
 
 LARGEST_BYTES = 2 * 2**30
 """Largest total size of the files of a run folder: the page's server holds most of them in memory."""
@@ -50,15 +51,21 @@ def show(
     force: Force = False,
 ) -> None:
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
-    from fcslam.errors import OutputError
+    from fcslam.page.report import report_html
     from fcslam.page.shown_run import ShownRun
+    from fcslam.storage.files import write_file
 
     if html is not None and html.exists() and not (force and html.is_file()):
         raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
     console = notices()
     with _run_folder(run, console) as folder, ShownRun(folder, folder.resolve().name) as shown:
         if html is not None:
-            _write_report(shown, html, run)
+            content = report_html(shown).encode()
+            try:
+                write_file(html, content)
+            except OSError as error:
+                raise OutputError(f"{html}: cannot be written ({error})") from error
+            typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
             return
         from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
 
@@ -75,43 +82,26 @@ def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
     Raises:
         InputError: there is no run, it is too large, or it is damaged.
     """
+    from fcslam import api
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.runs import open_run
     from fcslam.runs.folder import is_run_folder
 
     if run.is_file():
-        with _mapped(run, console) as folder:
+        with TemporaryDirectory() as place:
+            folder = Path(place) / run.stem
+            with compiled(console), ProgressDisplay(console) as display:
+                display.start("mapping")
+                api.map_recordings([], onto=run).save(folder)
             yield folder
         return
-    if is_run_folder(run):
-        _check_size(run)
-    _ = open_run(run).maps  # refuses a damaged run, and what is none
-    yield run
-
-
-@contextmanager
-def _mapped(mission: Path, console: "Console") -> Iterator[Path]:
-    from tempfile import TemporaryDirectory
-
-    from fcslam import api
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.cli.warm_up import compiled
-
-    with TemporaryDirectory() as place:
-        folder = Path(place) / mission.stem
-        with compiled(console), ProgressDisplay(console) as display:
-            display.start("mapping")
-            api.map_recordings([], onto=mission).save(folder)
-        yield folder
-
-
-def _check_size(run: Path) -> None:
-    from fcslam.errors import InputError
-
-    size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
+    size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file()) if is_run_folder(run) else 0
     if size > LARGEST_BYTES:
         raise InputError(
             f"{run}: the files have {size / 2**30:.1f} GiB; fcslam show reads at most {LARGEST_BYTES / 2**30:.0f} GiB"
         )
+    _ = open_run(run).maps  # refuses a damaged run, and what is none
+    yield run
 
 
 @contextmanager
@@ -128,26 +118,11 @@ def live_page(run: Path) -> "Iterator[LiveMap]":
                 signal.pause()
 
 
-def _announce(what: str, listening: "socket", open_browser: bool | None) -> None:
+def _announce(what: str, listening: socket, open_browser: bool | None) -> None:
     address = f"http://{HOST}:{listening.getsockname()[1]}/"
     typer.echo(f"{what} at {address}")
-    if _has_display() if open_browser is None else open_browser:
+    if open_browser is None:
+        has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        open_browser = sys.platform == "darwin" or bool(has_display)
+    if open_browser:
         webbrowser.open(address)
-
-
-def _write_report(shown: "ShownRun", html: Path, run: Path) -> None:
-    from fcslam.errors import OutputError
-    from fcslam.page.report import report_html
-    from fcslam.storage.files import write_file
-
-    content = report_html(shown).encode()
-    try:
-        write_file(html, content)
-    except OSError as error:
-        raise OutputError(f"{html}: cannot be written ({error})") from error
-    typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
-
-
-def _has_display() -> bool:
-    """Whether a browser has somewhere to open a window."""
-    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

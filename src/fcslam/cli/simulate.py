@@ -2,16 +2,17 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import chosen_settings
-from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, output_option
+from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, chosen_settings, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
+from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
 if TYPE_CHECKING:
@@ -103,16 +104,25 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
     import numpy as np
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.errors import OutputError
-    from fcslam.lab.simulation.ground_truth import write_ground_truth
-    from fcslam.lab.simulation.recording import record_robot
+    from fcslam.lab.simulation.recording import record_robot, write_ground_truth
+    from fcslam.records import GroundTruth
 
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]
     total = sum(len(robot.stamps) + len(robot.image_stamps) for robot in fleet.robots)
     with ProgressDisplay(console) as display:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            watch = _Watch(display.start("simulating", total))
+            advance, stopped = display.start("simulating", total), Event()
+
+            def watch(items: "Iterator[RecordedItem]") -> "Iterator[RecordedItem]":
+                """Count the records, until all robots are stopped. Each comes with its true pose."""
+                for item in items:
+                    if stopped.is_set():
+                        return
+                    yield item
+                    if isinstance(item, GroundTruth):
+                        advance()
+
             jobs = [
                 pool.submit(record_robot, robot, place, watch)
                 for robot, place in zip(fleet.robots, recordings, strict=True)
@@ -121,7 +131,7 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
                 for job in jobs:
                     job.result()
             finally:
-                watch.stop()
+                stopped.set()
         display.start("writing")
         try:
             write_ground_truth(fleet, output, np.random.default_rng(seed))
@@ -129,28 +139,6 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
             raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)
     return recordings
-
-
-class _Watch:
-    """Passes the records of robots on and counts them, until it is stopped. Each record comes with its true pose."""
-
-    def __init__(self, advance: Callable[[], None]) -> None:
-        self._advance = advance
-        self._stopped = False
-
-    def stop(self) -> None:
-        """End every robot's recording at its next record."""
-        self._stopped = True
-
-    def __call__(self, items: "Iterator[RecordedItem]") -> "Iterator[RecordedItem]":
-        from fcslam.records import GroundTruth
-
-        for item in items:
-            if self._stopped:
-                return
-            yield item
-            if isinstance(item, GroundTruth):
-                self._advance()
 
 
 def _report(fleet: "SimulatedFleet", recordings: list[Path], elapsed_s: float, console: "Console") -> None:

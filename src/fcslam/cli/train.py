@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import SettingsFiles, chosen_settings
-from fcslam.cli.options import output_option
-from fcslam.cli.output import TRAINING, new_folder, notices, print_line
+from fcslam.cli.options import SettingsFiles, chosen_settings, output_option
+from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,
     TRAINING_OUTPUT,
@@ -45,8 +44,9 @@ def train(
 ) -> None:
     """Train a detector of keypoints with 256-bit descriptors on images without labels."""
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.learning.settings import TrainingSettings
 
-    settings = _settings(config, quick)
+    settings = chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), config)
     require_training_libraries()
     from fcslam.learning.artifacts import write_training_artifacts
     from fcslam.learning.stages import train_detector
@@ -74,12 +74,6 @@ def train(
     print_line(console, f"{seconds:.0f} s; {images_read} images, {held_out} held out, {found.skipped} left out")
 
 
-def _settings(chosen: list[str] | None, quick: bool) -> "TrainingSettings":
-    from fcslam.learning.settings import TrainingSettings
-
-    return chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), chosen)
-
-
 def _start_network(
     start: Path, output: Path, settings: "TrainingSettings", options: "ExecutionOptions", images: list[Path]
 ) -> "KeypointNetwork":
@@ -95,12 +89,7 @@ def _start_network(
 
 def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":
     """Show each stage, and print its last figures and every alarm once."""
-    printed: set[str] = set()
-
-    def print_once(text: str) -> None:
-        if text not in printed:
-            printed.add(text)
-            print_line(console, text)
+    print_once = once_printer(console)
 
     def watch(stage: str, status: "TrainingProgress") -> None:
         figures = "  ".join(f"{name} {status.metrics[name]:.3f}" for name in FIGURES if name in status.metrics)

@@ -1,4 +1,4 @@
-"""Options and checks of all commands that train detectors."""
+"""Options and checks of all commands that train detectors, and of robots that learn with their fleet."""
 
 import os
 from importlib.util import find_spec
@@ -7,8 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.errors import InputError, TrainingError
+
 if TYPE_CHECKING:
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.learning.trainer import ExecutionOptions
+    from fcslam.robot.frontend import RobotConfig
+    from fcslam.wire.http_transport import Server
 
 TRAINING_OUTPUT = "Folder for everything that training writes. If it holds an unfinished run, training continues it."
 
@@ -21,6 +26,19 @@ Start = Annotated[
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to check that everything works.")]
 
+LEARNING_FILE = "learning.yaml"
+"""Settings of learning, in a robot's state folder or a service's data folder; each key has a default."""
+
+Learn = Annotated[
+    bool,
+    typer.Option(
+        "--learn",
+        rich_help_panel="Learning",
+        help="Train the detector with the fleet on what the camera saw again: after a recording, and while a live "
+        "robot stands still. No image leaves. Settings: learning.yaml in --state.",
+    ),
+]
+
 QUICK_IMAGES = 4
 """Images of a robot: labelling one takes vgg some seconds."""
 QUICK_VALIDATION_PAIRS = 2
@@ -29,8 +47,6 @@ QUICK_VALIDATION_PAIRS = 2
 
 def require_training_libraries(*others: str, extra: str = "train") -> None:
     """Raise TrainingError if a library that training needs, or one of ``others``, is missing."""
-    from fcslam.errors import TrainingError
-
     missing = [name for name in ("torch", "onnx", "onnxruntime", *others) if find_spec(name) is None]
     if missing:
         raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
@@ -40,7 +56,6 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
     """How to train here: on a GPU if CUDA shows one, the threads, and how often to validate and log."""
     import torch
 
-    from fcslam.errors import TrainingError
     from fcslam.learning.trainer import ExecutionOptions
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -56,3 +71,32 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
             device=device, threads=threads, validate_every=20, validation_pairs=QUICK_VALIDATION_PAIRS, log_every=20
         )
     return ExecutionOptions(device=device, threads=threads)
+
+
+def learning_plan(
+    settings: "RobotConfig", server: "Server | None", credentials: Path | None, state: Path | None
+) -> "RobotLearningPlan":
+    """Where and how a robot learns with this service; ``state`` is its state folder.
+
+    Raises:
+        ConfigError: the settings cannot be used.
+        InputError: something is missing, or does not fit.
+        TrainingError: a library is missing.
+    """
+    from fcslam.config import load
+    from fcslam.features.detector_kinds import DetectorKind
+    from fcslam.learning.federated.learning_process import RobotLearningPlan
+    from fcslam.learning.federated.settings import RobotLearningSettings
+    from fcslam.records import Channel
+    from fcslam.wire.http_transport import addresses
+
+    if server is None or state is None:
+        raise InputError(
+            "a robot learns with the fleet of a service, from keyframes on its disk: give --server and --state"
+        )
+    if Channel.CAMERA not in settings.channels or settings.views.detector is not DetectorKind.ONNX:
+        raise InputError("--learn trains the camera's network; robot.channels or robot.views.detector leave it out")
+    file = state / LEARNING_FILE
+    chosen = load(RobotLearningSettings, file) if file.exists() else RobotLearningSettings()
+    require_training_libraries("flwr", extra="federated")
+    return RobotLearningPlan(addresses(server.url)[0], chosen, state, credentials)

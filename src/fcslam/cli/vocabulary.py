@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.output import answers, print_line
+from fcslam.errors import SourceError
 
 MOST_WORDS = 4096
 SEED = 0
@@ -23,7 +23,6 @@ def vocabulary(
     """Train the words that robots send in place of descriptors (robot.sends: words)."""
     import numpy as np
 
-    from fcslam.errors import SourceError
     from fcslam.mission.mission_file import read_mission
     from fcslam.places.words import short, train_words, write_vocabularies
     from fcslam.records import Channel, Place
@@ -46,6 +45,6 @@ def vocabulary(
         trained = train_words(channel, version, np.concatenate(descriptors), words, SEED)
         vocabularies.append(trained)
         count, where = len(trained.centres), f"{len(descriptors)} places of {version}"
-        print_line(answers(), f"{channel}: {count} words from {where}, version {short(trained.digest)}")
+        typer.echo(f"{channel}: {count} words from {where}, version {short(trained.digest)}")
     write_vocabularies(vocabularies, output)
-    print_line(answers(), f"{output}")
+    typer.echo(str(output))

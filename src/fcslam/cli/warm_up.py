@@ -1,5 +1,6 @@
 """`fcslam tools warm-up`, and how other commands wait for code that is not compiled yet."""
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +9,11 @@ from typing import TYPE_CHECKING
 from fcslam.cli.output import notices, print_line
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from rich.console import Console
+
+    from fcslam.robot.frontend import RobotConfig
 
 FIRST_SCANS_S, EVERYTHING_S = 10, 45
 """About what compiling takes on a laptop: what first scans need, in two processes; everything, in one."""
@@ -62,3 +67,20 @@ def compiled(console: "Console") -> Iterator[None]:
     print_line(console, f"compiling, first run only: {first}about {EVERYTHING_S} s until full speed")
     with compiling(processes, (warm_up_matching,)):
         yield
+
+
+@contextmanager
+def copied_process(config: "RobotConfig") -> "Iterator[Executor]":
+    """One worker, a copy of this process, until the end of this block; begin it before threads start.
+
+    Both share the memory of the tracker's code, unless that is not compiled yet: nobody waits for a compiler here.
+    """
+    from fcslam.robot.backend_runner import copied_worker
+    from fcslam.robot.warmup import warm_up_tracking
+    from fcslam.service.warmup import is_cold
+
+    if not is_cold():
+        warm_up_tracking(config)
+    gc.freeze()
+    with copied_worker() as worker:
+        yield worker

@@ -1,7 +1,7 @@
 """The log of all closures that were considered, with their status and its reason."""
 
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 
@@ -90,19 +90,8 @@ class ClosureLog:
 
     def add(self, match: PlaceMatch) -> ClosureEntry:
         """Add a match, as verified or, if its verification failed, as a candidate."""
-        status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
-        closure = LoopClosure(
-            match.i,
-            match.j,
-            match.channel,
-            match.similarity,
-            frozen(match.T_i_j),
-            frozen(match.information),
-            status,
-            match.reason.under(MATCHER),
-            match.informative,
-            match.tag,
-        )
+        closure = LoopClosure(*(getattr(match, each.name) for each in fields(LoopClosure)))
+        closure = replace(closure, reason=match.reason.under(MATCHER))
         return self._add(ClosureEntry(closure, independent=not match.predicted))
 
     def add_local(self, constraint: Constraint, edge: int, tag: Tag | None = None) -> ClosureEntry:
@@ -110,16 +99,9 @@ class ClosureLog:
         joint graph contradicts it."""
         found = Reason(ReasonCode.FOUND_BY_ROBOT) if tag is None else Reason(ReasonCode.SAME_TAG, tag.number)
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
+        channel = Channel.LIDAR if tag is None else Channel.TAG
         closure = LoopClosure(
-            i,
-            j,
-            Channel.LIDAR if tag is None else Channel.TAG,
-            0.0,
-            constraint.T_i_j,
-            constraint.information,
-            ClosureStatus.ACCEPTED,
-            found,
-            tag=tag,
+            i, j, channel, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED, found, tag=tag
         )
         return self._add(ClosureEntry(closure, independent=False, edge=edge))
 
@@ -127,15 +109,9 @@ class ClosureLog:
         self, made: ManualClosure, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray
     ) -> ClosureEntry:
         """Add a user's own closure between two keyscans, with its pose (3,) and information (3, 3)."""
+        reason = Reason(ReasonCode.MADE_BY_HAND)
         closure = LoopClosure(
-            i,
-            j,
-            Channel.LIDAR,
-            0.0,
-            frozen(T_i_j),
-            frozen(information),
-            ClosureStatus.VERIFIED,
-            Reason(ReasonCode.MADE_BY_HAND),
+            i, j, Channel.LIDAR, 0.0, frozen(T_i_j), frozen(information), ClosureStatus.VERIFIED, reason
         )
         return self._add(ClosureEntry(closure, independent=False, pinned=True, made_by_hand=made))
 

@@ -67,12 +67,8 @@ class Cloud:
     ) -> Self:
         """The cloud of a ``state``.
 
-        Args:
-            config, seed: configuration and seed of the state's own cloud.
-            state: from ``state``.
-            times: of the packets that its cloud applied.
-            read: gives these packets when the cloud needs them.
-            verify_pairs: as in ``Fleet``.
+        ``times`` are those of the packets that its cloud applied; ``read`` gives these packets when the cloud needs
+        them.
         """
         cloud = cls(config, seed, verify_pairs)
         cloud._times, cloud._read = dict(times), read

@@ -203,10 +203,7 @@ def _check_closure(closure: ManualClosure) -> None:
 
 
 def check_polygon(corners: Sequence[tuple[float, float]]) -> None:
-    """Check that a polygon has an inside.
-
-    Args:
-        corners: (x, y) in metres.
+    """Check that a polygon of corners (x, y), metres, has an inside.
 
     Raises:
         EditError: it has not, or a coordinate is out of range.

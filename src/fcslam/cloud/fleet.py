@@ -182,11 +182,11 @@ class Fleet:
 
     def submaps(self) -> State:
         """The submaps that were compared. ``state`` does without, as the fleet can build them again from keyscans."""
-        return self._recognition.submaps()
+        return self._recognition.submaps.state()
 
     def restore_submaps(self, state: State) -> None:
         """After ``restored``: take over the submaps of ``submaps``, which saves the time to build them again."""
-        self._recognition.restore_submaps(state)
+        self._recognition.submaps.restore(state)
 
     def edit(self, changes: Sequence[Change]) -> None:
         """Replace the changes by hand that are in force; maps that only excluded closures joined are separated.
@@ -239,12 +239,8 @@ class Fleet:
         """The result of all packets in canonical order, without those of removed sessions.
 
         Unless they came in this order, another fleet applies them: all, or those after an earlier result, if all of
-        these come later in the order.
-
-        Args:
-            log: the order in which this fleet applied its packets.
-            arrived: time and number of every packet in ``log``, in any order.
-            read: gives a packet by its number.
+        these come later in the order. ``log`` is the order in which this fleet applied its packets; ``arrived`` has
+        time and number of each, in any order.
         """
         if log.is_canonical and not self._needs_replay:
             return self.conclude()

@@ -1,4 +1,4 @@
-"""Whether the closures between two robots join their maps: the cloud's entries in the terms of the graph."""
+"""The cloud's closures in the terms of ``graph/cluster.py``, which decides whether they join two maps."""
 
 from collections.abc import Callable, Sequence
 

@@ -127,11 +127,8 @@ class MapComparison:
         """Compare the maps of two sessions at separate places where their paths are close together.
 
         The maps agree at a place if they have no more surface in free space than a predicted closure may have. They
-        contradict each other if they have more than even a partially supported closure may have.
-
-        Args:
-            sessions: names of a and b.
-            poses_a, poses_b: their keyscans in the frame of one map, shape (N, 3), metres and radians.
+        contradict each other if they have more than even a partially supported closure may have. Poses (N, 3) of their
+        keyscans in the frame of one map, in metres and radians.
         """
         from scipy.spatial import cKDTree
 

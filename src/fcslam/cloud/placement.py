@@ -1,16 +1,26 @@
-"""Where users put a map: its coordinate frame, and the regions that they drew in it."""
+"""Where users put a map, and the regions that they drew in it: changed cells, Nav2's keep-out mask, named areas."""
 
+import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.records import Change, FloatArray, KeyscanId, MapRegion, Placement, RegionUse, frozen
+from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
 PoseOf = Callable[[KeyscanId], FloatArray]
 """Pose of a keyscan in its map, shape (3,)."""
+_FRACTION_BITS = 6
+"""Fractional bits of the coordinates that OpenCV takes: polygons are exact to a 64th of a cell."""
+_MARGIN_CELLS = 1000
+"""Polygons are cut off this far outside the map: 100 km in cells of 2 mm would overflow OpenCV's 32 bits."""
+_CELLS = {RegionUse.ERASE: Occupancy.UNKNOWN, RegionUse.FREE: Occupancy.FREE}
+"""Regions that change the map, and what their cells become."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,11 +39,7 @@ def T_placed_map(
 ) -> FloatArray | None:
     """The motion that puts a map where users want it, shape (3,); None if no placement names one of its sessions.
 
-    Args:
-        members: the sessions of the map.
-        sessions: their keyscans.
-        pose_of: poses in the map as it is.
-        changes: edits in force; of several placements the last one counts.
+    ``pose_of`` gives poses in the map as it is; of several placements the last one counts.
     """
     placements = [change for change in changes if isinstance(change, Placement) and change.session in members]
     if not placements:
@@ -48,11 +54,7 @@ def placed_regions(
 ) -> tuple[PlacedRegion, ...]:
     """The regions whose sessions are in a map, at the present poses of the keyscans to which they are tied.
 
-    Args:
-        map_indices: number of each session's map.
-        sessions: their keyscans.
-        pose_of: poses in the maps.
-        changes: edits in force.
+    ``map_indices``: number of each session's map; ``pose_of``: poses in the maps; ``changes``: edits in force.
     """
     regions = [change for change in changes if isinstance(change, MapRegion) and change.session in map_indices]
     return tuple(
@@ -64,3 +66,68 @@ def placed_regions(
         )
         for region in regions
     )
+
+
+def with_regions(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> OccupancyMap:
+    """The map with the cells that users erased or freed; of regions that overlap, the later one counts."""
+    cells = occupancy.cells
+    for region in regions:
+        if region.use in _CELLS and (inside := _inside(occupancy, [region])).any():
+            cells = np.where(inside, _CELLS[region.use], cells)
+    return occupancy if cells is occupancy.cells else replace(occupancy, cells=frozen(cells, np.uint8))
+
+
+def region_files(occupancy: OccupancyMap, stem: str, regions: Sequence[PlacedRegion]) -> dict[str, bytes]:
+    """Files beside the map ``stem``: nothing where there is nothing to say.
+
+    ``<stem>_keepout.pgm`` and ``.yaml`` are the mask of Nav2's keep-out filter, with the map's cells: occupied where
+    robots must not enter, free elsewhere. ``<stem>_areas.geojson`` holds the named areas in metres of the map.
+    """
+    files: dict[str, bytes] = {}
+    forbidden = [region for region in regions if region.use is RegionUse.KEEP_OUT]
+    if forbidden:
+        cells = np.where(_inside(occupancy, forbidden), Occupancy.OCCUPIED, Occupancy.FREE)
+        mask = replace(occupancy, cells=frozen(cells, np.uint8))
+        files[f"{stem}_keepout.pgm"] = pgm_bytes(mask)
+        files[f"{stem}_keepout.yaml"] = map_yaml(mask, f"{stem}_keepout.pgm").encode()
+    if areas := [region for region in regions if region.use is RegionUse.AREA]:
+        collection = {"type": "FeatureCollection", "features": list(map(_feature, areas))}
+        files[f"{stem}_areas.geojson"] = (json.dumps(collection, indent=1) + "\n").encode()
+    return files
+
+
+def _inside(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> NDArray[np.bool_]:
+    """Cells that lie in one of the regions or that its edge touches, shape (H, W)."""
+    mask = np.zeros(occupancy.cells.shape, np.uint8)
+    for region in regions:
+        cells: FloatArray = (region.polygon - occupancy.origin_xy) / occupancy.resolution_m - 0.5
+        for axis in (0, 1):
+            cells = _below(cells, axis, mask.shape[1 - axis] + _MARGIN_CELLS)
+            cells = -_below(-cells, axis, _MARGIN_CELLS)
+        if len(cells):
+            corners = np.round(cells * (1 << _FRACTION_BITS)).astype(np.int32)
+            cv2.fillPoly(mask, [corners], 1, shift=_FRACTION_BITS)
+    return mask.astype(bool)
+
+
+def _below(corners: FloatArray, axis: int, limit: float) -> FloatArray:
+    """The part of a polygon (N, 2) whose coordinate ``axis`` is at most ``limit``, shape (M, 2).
+
+    Of a part in several pieces, sides along the limit connect the pieces.
+    """
+    excess = corners[:, axis] - limit
+    kept = excess <= 0.0
+    crosses = kept != np.roll(kept, -1)
+    share = np.where(crosses, excess, 0.0) / np.where(crosses, excess - np.roll(excess, -1), 1.0)
+    crossings = corners + share[:, None] * (np.roll(corners, -1, axis=0) - corners)
+    part: FloatArray = np.stack((corners, crossings), axis=1)[np.stack((kept, crosses), axis=1)]
+    return part
+
+
+def _feature(area: PlacedRegion) -> dict[str, object]:
+    ring = [[round(x, 4), round(y, 4)] for x, y in (*area.polygon.tolist(), area.polygon[0].tolist())]
+    return {
+        "type": "Feature",
+        "properties": {"name": area.name, "map": area.map_index},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }

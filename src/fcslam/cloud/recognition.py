@@ -61,7 +61,7 @@ class PlaceRecognition:
         self._graph = graph
         self._closures = closures
         self._verify_pairs = verify_pairs
-        self._submaps = SubmapCache(sessions, graph, config.submaps_kept)
+        self.submaps = SubmapCache(sessions, graph, config.submaps_kept)
         self._matchers: dict[_VocabularyKey, PlaceMatcher] = {}
         self._places: dict[tuple[_VocabularyKey, str], NDArray[np.int64]] = {}
         """Number of the keyscan and of the arrival of each stored place, shape (N, 2), by vocabulary and session."""
@@ -109,16 +109,8 @@ class PlaceRecognition:
         return tuple(VocabularyState(*key, matcher.word_count, len(matcher)) for key, matcher in self._matchers.items())
 
     def state(self) -> State:
-        """The state that ``restore`` needs; submaps are built again on demand, or restored from ``submaps``."""
+        """The state that ``restore`` needs; ``submaps`` are built again on demand, or restored."""
         return {" ".join(key): matcher.state() for key, matcher in self._matchers.items()}
-
-    def submaps(self) -> State:
-        """The submaps that were compared, for ``restore_submaps``."""
-        return self._submaps.state()
-
-    def restore_submaps(self, state: State) -> None:
-        """Take over the submaps of ``submaps``, after ``restore``."""
-        self._submaps.restore(state)
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
@@ -138,10 +130,10 @@ class PlaceRecognition:
             rng = np.random.default_rng(self._seed)
             self._matchers[key] = PlaceMatcher(
                 self._config.matcher,
-                self._submaps.of,
+                self.submaps.of,
                 rng,
                 self._forget,
-                self._submaps.noise_of,
+                self.submaps.noise_of,
                 self._verify_pairs,
             )
         return self._matchers[key]
@@ -156,7 +148,7 @@ class PlaceRecognition:
         vocabulary_session = self._key(place), place.id.robot
         stored = self._places[vocabulary_session]
         self._places[vocabulary_session] = stored[stored[:, 0] != place.id.number]
-        self._submaps.drop(place)
+        self.submaps.drop(place)
         self._sessions.release(place)
 
     def _predicted(self, place: Place, mates: Collection[str]) -> dict[KeyscanId, FloatArray]:

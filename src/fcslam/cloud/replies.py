@@ -45,11 +45,8 @@ def replies(
 ) -> list[Packet]:
     """The packets that go back to a robot, numbered from 0.
 
-    Args:
-        robot: who gets them.
-        state: what the cloud knows of the robot.
-        known_correction: version of the newest correction that the robot has; -1: none.
-        announced: detectors that robots are to use, by channel.
+    ``known_correction`` is the version of the newest correction that the robot has, -1: none. ``announced`` are the
+    detectors that robots are to use.
     """
     number = count()
     packets = [

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.regions import region_files, with_regions
+from fcslam.cloud.placement import region_files, with_regions
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2

@@ -58,9 +58,7 @@ class SharedWords:
     def place(self, place: WordPlace, announced: Mapping[Channel, bytes]) -> Place:
         """The place whose descriptors are the centres of its words.
 
-        Args:
-            place: as it was sent.
-            announced: digests of the vocabularies of the robot's hello.
+        ``announced``: digests of the vocabularies of the robot's hello.
 
         Raises:
             PacketError: the robot announced no vocabulary for it, or a word is not in it.

@@ -20,6 +20,7 @@ from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Channel,
+    ClosureStatus,
     Constraint,
     ConstraintKind,
     FloatArray,
@@ -143,17 +144,5 @@ def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:
     information = np.linalg.inv(0.5 * (covariance + covariance.T))
     robot, kind = j.id.robot, ConstraintKind.CLOSURE
     measured = Constraint(robot, 0, 1, kind, T_i_j, frozen(0.5 * (information + information.T)))
-    return PlaceMatch(
-        i.id,
-        j.id,
-        Channel.TAG,
-        1.0,
-        M=True,
-        reason=Reason(ReasonCode.SAME_TAG, j.tag.number),
-        T_i_j=T_i_j,
-        information=with_least_noise(measured).information,
-        informative=True,
-        explained=0.0,
-        predicted=False,
-        tag=j.tag,
-    )
+    information, reason = with_least_noise(measured).information, Reason(ReasonCode.SAME_TAG, j.tag.number)
+    return PlaceMatch(i.id, j.id, Channel.TAG, 1.0, T_i_j, information, ClosureStatus.VERIFIED, reason, tag=j.tag)

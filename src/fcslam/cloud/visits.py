@@ -55,12 +55,8 @@ def worth_comparing(visits: Mapping[str, Sequence[Visit]], closures: Counter[fro
 
     Robots that closures tie together here are a group. Closures to two robots of a group determine the pose relative to
     all of it, so the number of comparisons does not grow with the number of robots that were here. Within a group, the
-    nearest visits of different robots come first.
-
-    Args:
-        visits: of each robot, to the surroundings of the new place.
-        closures: number of accepted closures near the new place, by pair of robots.
-        most: visits of each robot.
+    nearest visits of different robots come first. ``closures`` counts the accepted ones near the new place, by pair of
+    robots; ``most`` visits of each robot are taken.
     """
     nearest = {robot: sorted(found, key=attrgetter("distance_m"))[:most] for robot, found in visits.items()}
     chosen: list[Visit] = []

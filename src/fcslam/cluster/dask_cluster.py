@@ -18,7 +18,6 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 import numpy as np
 
 import fcslam
-from fcslam.cluster.workers import Workers
 from fcslam.errors import InputError
 from fcslam.lidar.pair_verification import align_batch
 from fcslam.lidar.scan import point_scan
@@ -43,8 +42,8 @@ T = TypeVar("T")
 class DaskCluster:
     """A connection to a cluster; a context."""
 
-    def __init__(self, workers: Workers, must_connect: bool = True) -> None:
-        """Connect, and check all workers.
+    def __init__(self, address: str, must_connect: bool = True) -> None:
+        """Connect to a scheduler, and check all workers.
 
         Raises:
             InputError: there is no Dask. With ``must_connect`` also: there is no cluster, it has no worker, or one of
@@ -54,10 +53,10 @@ class DaskCluster:
             import distributed  # noqa: F401
         except ImportError as error:
             raise InputError(
-                f"{workers.where}: needs Dask; install it: pip install 'fcslam[distributed]' ({error})"
+                f"{address}: needs Dask; install it: pip install 'fcslam[distributed]' ({error})"
             ) from error
         _quiet()
-        self._workers = workers
+        self._address = address
         self._client: Any = None
         self._executors: dict[str, DaskWorker] = {}
         """By address, of the workers that passed the check."""
@@ -113,10 +112,10 @@ class DaskCluster:
             await self._disconnect()
             if must_connect:
                 raise InputError(
-                    f"{self._workers.where}: no Dask scheduler answers ({_text(error)}); start one: dask scheduler"
+                    f"{self._address}: no Dask scheduler answers ({_text(error)}); start one: dask scheduler"
                 ) from error
         if must_connect and not self._executors:
-            raise InputError(f"{self._workers.where}: the cluster has no worker; start one: dask worker ADDRESS")
+            raise InputError(f"{self._address}: the cluster has no worker; start one: dask worker ADDRESS")
         if not self._executors:
             self._warn("no worker of it answers")
 
@@ -136,7 +135,7 @@ class DaskCluster:
             else:
                 if self._executors and self._is_gone:
                     self._is_gone = False
-                    _log.info("the cluster %s is back", self._workers.where)
+                    _log.info("the cluster %s is back", self._address)
                 elif not self._executors:
                     self._warn("it has no worker")
 
@@ -145,33 +144,29 @@ class DaskCluster:
         if not self._is_gone:
             _log.warning(
                 "the cluster %s is gone (%s); this process verifies closures alone, which is slower",
-                self._workers.where,
+                self._address,
                 reason,
             )
         self._is_gone = True
 
     async def _connect(self) -> None:
         from distributed import Client
+        from distributed.security import Security
 
+        try:  # TLS as Dask is configured (``distributed.comm.tls``)
+            security = Security(require_encryption=self._address.startswith("tls://"))
+        except (OSError, ssl.SSLError, ValueError) as error:
+            raise InputError(f"{self._address}: the certificates cannot be used ({_text(error)})") from error
         client = Client(
-            self._workers.where,
+            self._address,
             asynchronous=True,
             timeout=CONNECT_S,
             set_as_default=False,
-            security=self._security(),
+            security=security,
             name="fcslam",
         )
         self._client = client
         await client
-
-    def _security(self) -> Any:
-        """TLS as Dask is configured (``distributed.comm.tls``)."""
-        from distributed.security import Security
-
-        try:
-            return Security(require_encryption=self._workers.where.startswith("tls://"))
-        except (OSError, ssl.SSLError, ValueError) as error:
-            raise InputError(f"{self._workers.where}: the certificates cannot be used ({_text(error)})") from error
 
     async def _look(self, must_fit: bool) -> None:
         """Follow which workers there are.
@@ -192,7 +187,7 @@ class DaskCluster:
             self._refused.add(address)
             named = address if names[address] == address else f"'{names[address]}' ({address})"
             if must_fit:
-                raise InputError(f"{self._workers.where}: worker {named} {refusal}")
+                raise InputError(f"{self._address}: worker {named} {refusal}")
             _log.warning("worker %s of the cluster gets no work: it %s", named, refusal)
 
     async def _refusal(self, address: str) -> str | None:

@@ -10,7 +10,7 @@ Column and row of the picture grow with x and y of the submap's coordinate frame
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import cv2
 import numpy as np
@@ -21,8 +21,22 @@ from fcslam.features.codes import CODE_BITS
 from fcslam.records import CODE_BYTES, Codes, FloatArray, frozen
 
 DETECTOR_VERSION = "birdseye-brief-1"
-"""Changes whenever the same points would give other descriptors."""
+"""Changes whenever the same points would give other descriptors, so with each of the numbers below."""
 
+SIDE_M = 30.0
+"""Side of the bird's-eye picture around the keyscan."""
+_CELL_M = 0.1
+_SIDE_CELLS = round(SIDE_M / _CELL_M)
+_FIELD_SIGMA_M = 0.35
+"""Standard deviation of the likelihood field around a wall."""
+_MOST_FEATURES = 400
+"""Most features of a submap, the strongest corners first."""
+_CORNER_QUALITY = 0.003
+"""Weakest corner response, as a share of the strongest one."""
+_PATCH_RADIUS_M = 1.5
+"""Radius of the patch that a descriptor describes."""
+_ORIENTATION_RADIUS_M = 0.8
+"""Radius of the disc whose centroid orients a descriptor."""
 _FIELD_REACH = 3.6
 """Standard deviations beyond which the field is zero, because it is below half a grey level there."""
 _SUBCELLS = 4
@@ -36,35 +50,6 @@ Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
-class BirdseyeConfig:
-    """Bird's-eye features of LiDAR submaps."""
-
-    side_m: float = 30.0
-    """Side of the bird's-eye picture around the keyscan, metres."""
-    cell_m: float = 0.1
-    """Side of a cell of the bird's-eye picture, metres."""
-    field_sigma_m: float = 0.35
-    """Standard deviation of the likelihood field around a wall, metres."""
-    most_features: int = 400
-    """Most features of a submap, the strongest corners first."""
-    corner_quality: float = 0.003
-    """Weakest corner response, as a share of the strongest one."""
-    patch_radius_m: float = 1.5
-    """Radius of the patch that a descriptor describes, metres."""
-    orientation_radius_m: float = 0.8
-    """Radius of the disc whose centroid orients a descriptor, metres."""
-
-    @property
-    def side_cells(self) -> int:
-        """Cells along one side of the picture."""
-        return round(self.side_m / self.cell_m)
-
-
-BIRDSEYE = BirdseyeConfig()
-"""Settings of all robots: places with other values cannot be compared."""
-
-
-@dataclass(frozen=True, slots=True)
 class BirdseyeFeatures:
     """Features of one submap, the strongest first."""
 
@@ -74,54 +59,50 @@ class BirdseyeFeatures:
     """Shape (K, 32)."""
 
 
-def describe(points: FloatArray, config: BirdseyeConfig) -> BirdseyeFeatures:
+def describe(points: FloatArray) -> BirdseyeFeatures:
     """Detect and describe the features of a submap; K = 0 if the picture has no corner.
 
-    OpenCV's thread count is not changed, because it belongs to the whole process. The features do not depend on it.
+    The points (N, 2), in metres in the submap's coordinate frame, are one per 5-10 cm of wall. Those that are not
+    finite or outside the picture are ignored.
 
-    Args:
-        points: shape (N, 2), metres in the submap's coordinate frame, one point per 5-10 cm of wall. Points that are
-            not finite or outside the picture are ignored.
-        config: the picture and the detector.
+    OpenCV's thread count is not changed, because it belongs to the whole process. The features do not depend on it.
     """
-    picture = likelihood_picture(points, config)
+    picture = likelihood_picture(points)
     corners = cv2.goodFeaturesToTrack(
-        picture, config.most_features, config.corner_quality, minDistance=0, blockSize=_CORNER_BLOCK_CELLS
+        picture, _MOST_FEATURES, _CORNER_QUALITY, minDistance=0, blockSize=_CORNER_BLOCK_CELLS
     )
     if corners is None:
         return BirdseyeFeatures(frozen(np.empty((0, 2)), np.float32), frozen(np.empty((0, CODE_BYTES)), np.uint8))
     pixels = corners.reshape(-1, 2).astype(np.int64)
-    directions = _directions(picture, pixels, round(config.orientation_radius_m / config.cell_m))
-    pattern = _comparison_pattern(config.patch_radius_m / config.cell_m)
-    codes = np.packbits(_compare(picture, pixels, directions, pattern), axis=1)
-    return BirdseyeFeatures(frozen(pixels_to_metres(pixels, config), np.float32), frozen(codes, np.uint8))
+    directions = _directions(picture, pixels, round(_ORIENTATION_RADIUS_M / _CELL_M))
+    codes = np.packbits(_compare(picture, pixels, directions, _comparison_pattern()), axis=1)
+    return BirdseyeFeatures(frozen(pixels_to_metres(pixels), np.float32), frozen(codes, np.uint8))
 
 
-def likelihood_picture(points: FloatArray, config: BirdseyeConfig) -> Picture:
-    """Draw the likelihood field of points (N, 2), metres in the submap's coordinate frame.
+def likelihood_picture(points: FloatArray) -> Picture:
+    """The likelihood field of points (N, 2), metres in the submap's coordinate frame, shape (rows, columns).
 
-    Returns:
-        ``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point, shape (rows, columns).
+    It is ``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point.
     """
-    side = config.side_cells
-    cells = points / config.cell_m + 0.5 * side
-    inside = cells[((cells >= 0.0) & (cells < side)).all(axis=1)]
-    picture: Picture = _stamp(inside, _likelihood_discs(config.field_sigma_m / config.cell_m), side)
+    cells = points / _CELL_M + 0.5 * _SIDE_CELLS
+    inside = cells[((cells >= 0.0) & (cells < _SIDE_CELLS)).all(axis=1)]
+    picture: Picture = _stamp(inside, _likelihood_discs(), _SIDE_CELLS)
     return picture
 
 
-def pixels_to_metres(pixels: FloatArray | NDArray[np.int64], config: BirdseyeConfig) -> FloatArray:
+def pixels_to_metres(pixels: FloatArray | NDArray[np.int64]) -> FloatArray:
     """Convert picture coordinates (K, 2) to metres in the submap's coordinate frame.
 
     Pixel (0, 0) is the centre of the first cell.
     """
-    metres: FloatArray = (pixels.astype(np.float64) + 0.5 - 0.5 * config.side_cells) * config.cell_m
+    metres: FloatArray = (pixels.astype(np.float64) + 0.5 - 0.5 * _SIDE_CELLS) * _CELL_M
     return metres
 
 
-@lru_cache(maxsize=8)
-def _likelihood_discs(sigma_cells: float) -> NDArray[np.uint8]:
+@cache
+def _likelihood_discs() -> NDArray[np.uint8]:
     """The field around a point for every subcell position of the point: shape (S, S, width, width), y before x."""
+    sigma_cells = _FIELD_SIGMA_M / _CELL_M
     reach = int(_FIELD_REACH * sigma_cells) + 1
     places = (np.arange(_SUBCELLS) + 0.5) / _SUBCELLS - 0.5
     squares = (np.arange(-reach, reach + 1) - places[:, None]) ** 2
@@ -129,8 +110,8 @@ def _likelihood_discs(sigma_cells: float) -> NDArray[np.uint8]:
     return frozen(np.rint(255.0 * fields), np.uint8)
 
 
-@lru_cache(maxsize=8)
-def _comparison_pattern(radius_cells: float) -> FloatArray:
+@cache
+def _comparison_pattern() -> FloatArray:
     """Pairs of points in the patch, shape (4, 256): x, y, x', y' in cells.
 
     They follow the R-sequence of the generalised golden ratio in four dimensions (a low-discrepancy sequence), which
@@ -145,7 +126,7 @@ def _comparison_pattern(radius_cells: float) -> FloatArray:
     start = np.sqrt(u[:, 0]) * np.exp(2j * np.pi * u[:, 1])
     end = start + (shortest + (longest - shortest) * u[:, 2]) * np.exp(2j * np.pi * u[:, 3])
     pairs = np.stack((start.real, start.imag, end.real, end.imag), axis=1)[np.abs(end) < 1.0]
-    return frozen(np.ascontiguousarray(radius_cells * pairs[:CODE_BITS].T))
+    return frozen(np.ascontiguousarray(_PATCH_RADIUS_M / _CELL_M * pairs[:CODE_BITS].T))
 
 
 @njit

@@ -1,4 +1,4 @@
-"""Classical detectors from OpenCV.
+"""Classical detectors from OpenCV, and the choice between ORB and the network.
 
 ORB has binary descriptors and can replace the network on a robot. The others are baselines of the evaluation: FAST,
 Harris and Shi-Tomasi only detect, SIFT has descriptors of 128 floats.
@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.detector import NO_FEATURES, FloatFeatures, GreyImage, ImageFeatures, Keypoints
+from fcslam.features.detector import (
+    NO_FEATURES,
+    FeatureDetector,
+    FloatFeatures,
+    GreyImage,
+    ImageFeatures,
+    Keypoints,
+    OnnxConfig,
+    OnnxDetector,
+)
+from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.nms import box_nms
 from fcslam.records import FloatArray, frozen
 
@@ -138,3 +148,12 @@ def _ranked(positions: FloatArray, responses: FloatArray) -> tuple[Keypoints, ND
 def _strongest(positions: FloatArray, responses: FloatArray) -> Keypoints:
     corners, _ = _ranked(positions, responses)
     return corners.take(box_nms(corners.keypoints_px, _NMS_PX)[:_CORNERS])
+
+
+def make_detector(kind: DetectorKind, orb: OrbConfig, onnx: OnnxConfig) -> FeatureDetector:
+    """Make a detector of the given kind; only its own settings are used.
+
+    Raises:
+        FeatureError: the weights of the network cannot be used.
+    """
+    return OnnxDetector(onnx) if kind is DetectorKind.ONNX else Orb(orb)

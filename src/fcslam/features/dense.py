@@ -25,16 +25,10 @@ Logits = NDArray[np.float32]
 def find_peaks(
     scores: Probabilities, least_score: float, nms_px: float, most: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Find local maxima of the keypoint probability with subpixel positions, the strongest first.
+    """Local maxima of keypoint probabilities (H, W) above ``least_score``, at most ``most``, the strongest first.
 
-    Args:
-        scores: keypoint probabilities, shape (H, W).
-        least_score: a keypoint's score is above this.
-        nms_px: side of the boxes of non-maximum suppression (``nms.box_nms``), pixels.
-        most: most keypoints.
-
-    Returns:
-        Positions (K, 2), x and y in pixels, and scores (K,).
+    ``nms_px`` is the side of the boxes of non-maximum suppression. Returns positions (K, 2) to a part of a pixel, x and
+    y, and scores (K,).
     """
     if not scores.size:
         return np.empty((0, 2), np.float32), np.empty(0, np.float32)

@@ -8,6 +8,7 @@ A network is an ONNX file, run by ONNX Runtime on the CPU. Its format, ``fcslam_
 - metadata ``fcslam_format`` and ``fcslam_version``: the version that all its descriptors carry.
 """
 
+import os
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +23,6 @@ from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_logits
-from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.records import CODE_BYTES, NAME, Codes, frozen
 from fcslam.untrusted import check_image, read_bytes
 
@@ -38,6 +38,20 @@ MATCHING_SCALES: Final = (1.0, 0.71, 0.5)
 
 GreyImage = NDArray[np.uint8]
 """Shape (height, width)."""
+
+
+def load_onnx_runtime() -> Any:
+    """Import ``onnxruntime`` without telemetry; call this before any other import of it.
+
+    On Linux, the official builds since 1.29 send telemetry and keep an identifier and a database in
+    ``~/.cache/Microsoft/DeveloperTools`` (https://github.com/microsoft/onnxruntime/pull/27379).
+    ``disable_telemetry_events`` stops the events, but only the environment variable prevents the files.
+    """
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime
+
+    onnxruntime.disable_telemetry_events()  # in case another module imported it before
+    return onnxruntime
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,11 +189,7 @@ class OnnxDetector:
         return FloatFeatures(found.keypoints_px, found.scores, frozen(sampled / lengths, np.float32))
 
     def infer(self, image: GreyImage) -> tuple[Probabilities, Logits]:
-        """Run the network on an image (H, W).
-
-        Returns:
-            Keypoint probabilities (H, W), and logits (256, rows, columns) of the cells that cover the image.
-        """
+        """Keypoint probabilities (H, W) of an image, and logits (256, rows, columns) of the cells that cover it."""
         height, width = image.shape
         if not image.size:
             return np.empty(image.shape, np.float32), np.zeros((CODE_BITS, 1, 1), np.float32)

@@ -1,19 +1,21 @@
-"""Reads image files, and writes and reads extracted features, one ``.npz`` for each image.
+"""Reads image files, extracts the features of images, and writes and reads them, one ``.npz`` for each image.
 
 Arrays: ``keypoints`` (N, 2) float32, x y in pixels of the image, (0, 0) the centre of its first pixel; ``scores`` (N,)
 float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), width and height.
 """
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import FeatureError, OutputError
-from fcslam.features.detector import GreyImage, ImageFeatures, decode_grey
+from fcslam.errors import FeatureError, writing
+from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures, decode_grey, in_original, shrink
 from fcslam.records import CODE_BYTES, frozen
 from fcslam.sources.images import MAX_SIDE_PX, image_size
 from fcslam.storage.files import replacing
-from fcslam.untrusted import read_arrays, read_bytes
+from fcslam.untrusted import Arrays, read_arrays, read_bytes
 
 _ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
 
@@ -40,22 +42,21 @@ def read_grey(path: Path) -> GreyImage:
 
 
 def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, int]) -> None:
-    """Write the features of an image of ``image_size`` (width, height), pixels.
+    """Write the features of an image of ``image_size`` (width, height), pixels; makes the folder of the file.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    try:
+    arrays: Arrays = {
+        "keypoints": features.keypoints_px,
+        "scores": features.scores,
+        "descriptors": features.descriptors,
+        "image_size": np.array(image_size, np.int32),
+    }
+    with writing(path, "make room or choose another folder"):
+        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as unfinished, unfinished.open("wb") as file:
-            np.savez(
-                file,
-                keypoints=features.keypoints_px,
-                scores=features.scores,
-                descriptors=features.descriptors,
-                image_size=np.array(image_size, np.int32),
-            )
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another folder") from error
+            np.savez(file, allow_pickle=False, **arrays)
 
 
 def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
@@ -91,3 +92,62 @@ def _longer_side(encoded: bytes) -> int:
         return max(image_size(encoded))
     except ValueError:
         return 0
+
+
+@dataclass(frozen=True, slots=True)
+class Extraction:
+    """Result of one file."""
+
+    path: Path
+    keypoints: int
+    skipped: str = ""
+    """Why no features were written; empty if they were."""
+
+
+def find_files(images: Path) -> list[Path]:
+    """Return the file itself, or all files in the folder and its subfolders, sorted.
+
+    Raises:
+        FeatureError: there is no file.
+    """
+    files = [images] if images.is_file() else sorted(path for path in images.rglob("*") if path.is_file())
+    if not files:
+        raise FeatureError(f"{images}: no file there; name an image or a folder of images")
+    return files
+
+
+def extract_all(
+    files: list[Path], root: Path, output: Path, detector: FeatureDetector, longest_side_px: int
+) -> Iterator[Extraction]:
+    """Write the features of each image below ``output``, at the image's path relative to ``root``.
+
+    Files that cannot be read are skipped and reported.
+
+    Raises:
+        OutputError: features cannot be written.
+    """
+    written: dict[Path, Path] = {}
+    for path in files:
+        target = output / path.relative_to(root).with_suffix(".npz")
+        try:
+            if target in written:
+                raise FeatureError(f"{path}: has the features' name in common with {written[target]}; rename one")
+            image = read_grey(path)
+        except FeatureError as error:
+            yield Extraction(path, 0, str(error))
+            continue
+        features = extract(image, detector, longest_side_px)
+        write_features(target, features, (image.shape[1], image.shape[0]))
+        written[target] = path
+        yield Extraction(path, len(features.scores))
+
+
+def extract(image: GreyImage, detector: FeatureDetector, longest_side_px: int) -> ImageFeatures:
+    """Detect the features of an image (H, W), downscaled if its longer side exceeds ``longest_side_px``.
+
+    Keypoints are in pixels of the original image.
+    """
+    shrunk = shrink(image, longest_side_px / max(image.shape))
+    found = detector.detect(shrunk)
+    positions = in_original(found.keypoints_px, shrunk, image)
+    return ImageFeatures(frozen(positions, np.float32), found.scores, found.descriptors)

@@ -44,16 +44,10 @@ class LidarView(NamedTuple):
 def locate_keypoints(
     keypoints_px: NDArray[np.float32], camera: CameraModel, lidar: LidarView, ceiling_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Compute metric positions of image keypoints from the LiDAR's range in their direction.
+    """Positions (K, 3) of keypoints (K, 2) in ``base`` by the LiDAR range in their direction, and which have one, (K,).
 
-    Args:
-        keypoints_px: shape (K, 2), x and y in pixels.
-        camera: intrinsics and mounting; ``base`` lies on the floor.
-        lidar: the scan at the image's stamp.
-        ceiling_m: largest height of a keypoint.
-
-    Returns:
-        Positions (K, 3) in ``base``, metres, 0 without a position; and which keypoints have a position, shape (K,).
+    ``base`` lies on the floor; the LiDAR scanned at the image's stamp. Keypoints above ``ceiling_m`` have no position;
+    then it is 0.
     """
     rays = _rays(keypoints_px.astype(np.float64), camera)
     level = np.hypot(rays[:, 0], rays[:, 1])

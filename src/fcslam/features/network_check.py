@@ -164,8 +164,7 @@ def _main(path: Path) -> int:
     """Load and run a network with limits of memory and time."""
     import numpy as np
 
-    from fcslam.features.detector import OnnxConfig, OnnxDetector
-    from fcslam.features.onnx_runtime import load_onnx_runtime
+    from fcslam.features.detector import OnnxConfig, OnnxDetector, load_onnx_runtime
 
     load_onnx_runtime()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])

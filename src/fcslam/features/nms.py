@@ -11,14 +11,10 @@ axis stay, and so do keypoints 3 px apart along one axis and 2 px along the othe
 
 
 def box_nms(positions_px: ArrayLike, side_px: float) -> NDArray[np.int64]:
-    """Suppress keypoints whose box overlaps that of a stronger remaining keypoint by more than ``MOST_OVERLAP``.
+    """Rows (K,), ascending, of the keypoints that no box of a stronger one overlaps by more than ``MOST_OVERLAP``.
 
-    Args:
-        positions_px: shape (N, 2), the strongest first; finite.
-        side_px: side of the boxes; 0 keeps everything.
-
-    Returns:
-        Rows of the remaining keypoints, shape (K,), ascending.
+    ``positions_px`` (N, 2) are finite, the strongest first. Suppressed keypoints suppress none. Boxes of side 0 keep
+    everything.
     """
     points = np.asarray(positions_px, np.float64).reshape(-1, 2)
     if side_px <= 0.0 or not len(points):

@@ -1,9 +1,10 @@
 """Batches of view pairs, prepared ahead in threads. A batch depends on the seed and its step alone."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -16,8 +17,19 @@ TEACHER_POINTS = 192
 """Most points of the teacher that are used in a pair."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingBatch:
+@dataclass(frozen=True, slots=True, eq=False)
+class TensorRecord:
+    """A record of tensors."""
+
+    def to(self, device: torch.device) -> Self:
+        """The record on another device."""
+        return replace(
+            self, **{field.name: getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)}
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingBatch(TensorRecord):
     """B pairs; the first B images are first views, the others second views."""
 
     images: Tensor
@@ -38,12 +50,6 @@ class TrainingBatch:
     """Shape (B, M, D); D is 0 without a teacher."""
     homographies: Tensor
     """Shape (B, 3, 3): map pixels of the first view to pixels of the second."""
-
-    def to(self, device: torch.device) -> "TrainingBatch":
-        """The batch on another device."""
-        return TrainingBatch(
-            **{field.name: getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)}
-        )
 
 
 def draw_batch(examples: Sequence[TrainingExample], settings: TrainingSettings, step: int) -> TrainingBatch:
@@ -78,7 +84,7 @@ def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
 
 def batch_stream(
     examples: Sequence[TrainingExample], settings: TrainingSettings, first: int, ahead: int, threads: int
-) -> Iterator[tuple[int, TrainingBatch]]:
+) -> Generator[tuple[int, TrainingBatch], None, None]:
     """Step numbers and batches from step ``first``, in order; ``threads`` threads prepare up to ``ahead`` of them."""
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[Future[TrainingBatch]] = deque()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import TrainingError, writing
 from fcslam.learning.arrays import write_arrays
 from fcslam.untrusted import read_arrays
 
@@ -52,12 +52,8 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     }
     arrays: dict[str, Any] = {_HEADER: np.array(json.dumps(header))}
     arrays |= {name: tensor.detach().cpu().numpy() for name, tensor in checkpoint.tensors.items()}
-    try:
+    with writing(path):
         write_arrays(path, arrays)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error}); free disk space and run the same command again"
-        ) from error
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

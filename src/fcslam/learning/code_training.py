@@ -5,7 +5,7 @@ image. The keypoints depend on the trained layers a little, so a loss keeps the 
 keeps the codes of what the robot does not see.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from fcslam.errors import TrainingError
 from fcslam.features.detector import GreyImage
+from fcslam.learning.code_batches import RevisitExamples, draw_rehearsal, draw_revisits, draw_views
 from fcslam.learning.local_training import (
     LocalTrainingPlan,
     LocalTrainingResult,
@@ -24,9 +25,6 @@ from fcslam.learning.local_training import (
 )
 from fcslam.learning.network import Description, KeypointNetwork
 from fcslam.learning.objective import rehearsal_loss, revisit_objective
-from fcslam.learning.rehearsal import draw_rehearsal, draw_views
-from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
-from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import reduced_precision
 
 _IMAGES_AT_ONCE: Final = 8
@@ -47,7 +45,7 @@ class CodeInputs:
 
         ``seed`` is that of the views; None for none.
         """
-        heads = layer_names(network, (*network.code_layers, *network.point_layers))
+        heads = layer_names(network, (*network.body.code_layers, *network.body.point_layers))
         frozen = {name: value for name, value in network.state_dict().items() if name not in heads}
         is_same = self._frozen.keys() == frozen.keys() and all(
             torch.equal(value, self._frozen[name]) for name, value in frozen.items()
@@ -59,44 +57,27 @@ class CodeInputs:
             for k in range(0, len(shown), _IMAGES_AT_ONCE):
                 grey = np.stack(shown[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
                 with torch.no_grad():
-                    parts.append(network.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
+                    parts.append(network.body.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
             self._inputs = torch.cat(parts)
         return self._inputs
 
 
 def train_codes(
-    start: Mapping[str, Tensor],
-    revisits: RevisitExamples,
-    inputs: CodeInputs,
-    settings: TrainingSettings,
-    plan: LocalTrainingPlan,
-    device: torch.device,
-    on_step: Callable[[int], None] = lambda _steps: None,
-    legacy: Mapping[str, Tensor] | None = None,
-    optimizer_state: Mapping[str, Tensor] | None = None,
+    start: Mapping[str, Tensor], revisits: RevisitExamples, inputs: CodeInputs, plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
-    """Train for some steps, with the batch statistics as they are. The result depends on the arguments alone.
+    """Train for some steps from the state ``start``, which is not changed, with the batch statistics as they are.
 
-    Args:
-        start: state of a network, which is not changed.
-        revisits: points that were seen again.
-        inputs: of the images of ``revisits``, kept from call to call.
-        settings: of the whole run; the learning rate falls towards the end of its steps.
-        plan: which steps are done, and how.
-        device: to train on.
-        on_step: called with the number of steps done.
-        legacy: state of the network that the whole training started from; None for ``start``. Keypoints stay where it
-            finds them, and codes compatible with it.
-        optimizer_state: result of an earlier local training, to continue it.
+    The result depends on the arguments alone. ``inputs`` are kept from call to call. Keypoints stay where the legacy
+    detector of the plan finds them; without one, where that of ``start`` does.
 
     Raises:
-        TrainingError: nothing was seen again; ``start``, ``legacy`` or ``optimizer_state`` does not fit the network, or
-            training diverged.
+        TrainingError: nothing was seen again, a state does not fit the network, or training diverged.
     """
+    settings, device = plan.settings, plan.device
     if not revisits:
         raise TrainingError("codes are trained on places seen again, but no place was; set trained to all")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
-    before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
+    before = network_from_state(settings.encoder, start if plan.legacy is None else plan.legacy).to(device)
     known = inputs.of(network, revisits.images, settings.seed if plan.compatible else None, device)
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
 
@@ -111,13 +92,13 @@ def train_codes(
             total = total + plan.compatible * losses["compatible"]
         return total, losses
 
-    return train_layers(network, network.code_layers, losses_of, settings, plan, on_step, optimizer_state)
+    return train_layers(network, network.body.code_layers, losses_of, plan)
 
 
 def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:
     """Descriptions by both networks of inputs of the trained layers, shape (B, C, H/8, W/8)."""
     given = inputs.float().contiguous(memory_format=torch.channels_last)
     with reduced_precision(given.device):
-        described = network.describe(given)
+        described = network.body.describe(given)
         with torch.no_grad():
-            return described, before.describe(given)
+            return described, before.body.describe(given)

@@ -17,7 +17,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-from fcslam.errors import OutputError
+from fcslam.errors import writing
 from fcslam.features.detector import NETWORK_FORMAT
 from fcslam.learning.network import KeypointNetwork
 from fcslam.storage.files import write_file
@@ -82,10 +82,8 @@ def _write(graph: Any, version: str, path: Path) -> None:
     for key, value in (("fcslam_format", NETWORK_FORMAT), ("fcslam_version", version)):
         graph.metadata_props.add(key=key, value=value)
     onnx.checker.check_model(graph)
-    try:
+    with writing(path, "free disk space or choose another folder"):
         write_file(path, graph.SerializeToString(deterministic=True))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); free disk space or choose another folder") from error
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """Local training: a client's part of a federated round. It trains some steps from given weights."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import torch
@@ -19,24 +20,36 @@ from fcslam.learning.training_step import (
     get_optimizer_state,
     learning_rate,
     restore_optimizer_state,
-    training_step,
+    step_losses,
 )
 
 RAMP_STEPS: Final = 10
 """Steps over which the learning rate rises of a new optimizer: without moments, Adam only follows gradients' signs."""
+
+LossesOf = Callable[[int], tuple[Tensor, dict[str, Tensor]]]
+"""Gives the loss to descend at a step of the whole run, and its parts by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocalTrainingPlan:
     """The steps of the whole run that are done now, and how."""
 
+    settings: TrainingSettings
+    """Of the whole run; the learning rate falls towards the end of its steps."""
     first_step: int
     """Counted from 0 over the whole run."""
     steps: int
     compatible: float = 0.0
     """Weight of the loss that keeps codes compatible with those of a legacy detector; 0 for none."""
+    legacy: Mapping[str, Tensor] | None = None
+    """State of the network whose codes are still in use."""
     frozen_statistics: bool = False
     """Batch normalisation uses the means and variances that it has, and does not change them."""
+    optimizer_state: Mapping[str, Tensor] | None = None
+    """Result of an earlier local training, which is continued."""
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    on_step: Callable[[int], None] = lambda _steps: None
+    """Called with the number of steps done."""
 
 
 class LocalTrainingResult(NamedTuple):
@@ -50,118 +63,64 @@ class LocalTrainingResult(NamedTuple):
 
 
 def local_training(
-    start: Mapping[str, Tensor],
-    examples: Sequence[TrainingExample],
-    settings: TrainingSettings,
-    plan: LocalTrainingPlan,
-    device: torch.device,
-    on_step: Callable[[int], None] = lambda _steps: None,
-    legacy: Mapping[str, Tensor] | None = None,
-    optimizer_state: Mapping[str, Tensor] | None = None,
+    start: Mapping[str, Tensor], examples: Sequence[TrainingExample], plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
-    """Train for some steps. The result depends on the arguments alone.
-
-    Args:
-        start: state of a network, which is not changed.
-        examples: to train on.
-        settings: of the whole run; the learning rate falls towards the end of its steps.
-        plan: which steps are done, and how.
-        device: to train on.
-        on_step: called with the number of steps done.
-        legacy: state of the network whose codes are still in use.
-        optimizer_state: result of an earlier local training, to continue it.
+    """Train for some steps from the state ``start``, which is not changed. The result depends on the arguments alone.
 
     Raises:
-        TrainingError: ``start``, ``legacy`` or ``optimizer_state`` does not fit the network, or training diverged.
+        TrainingError: a state does not fit the network, or training diverged.
     """
+    settings, device = plan.settings, plan.device
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
     if plan.frozen_statistics:
         freeze_statistics(network)
     legacy_detector = None
-    if legacy is not None and plan.compatible > 0.0:
-        legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, legacy).to(device))
-    optimizer = continued_optimizer(network, optimizer_state)
-    sums: dict[str, float] = {}
+    if plan.legacy is not None and plan.compatible > 0.0:
+        legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, plan.legacy).to(device))
     until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
-    for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
-        done = step - plan.first_step + 1
-        rate = local_rate(settings, step, done, optimizer_state is None)
-        losses = training_step(network, optimizer, batch.to(device), settings, step, rate, legacy=legacy_detector)
-        for name, loss in losses.items():
-            sums[name] = sums.get(name, 0.0) + float(loss)
-        on_step(done)
-    return local_result(network, optimizer, sums, plan)
+    batches = batch_stream(examples, until, plan.first_step, ahead=2, threads=1)
+
+    def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        _, batch = next(batches)
+        return step_losses(network, batch.to(device), settings, step, legacy=legacy_detector)
+
+    with closing(batches):
+        return _descended(network, losses_of, plan)
 
 
 def train_layers(
-    network: KeypointNetwork,
-    layers: Sequence[nn.Module],
-    losses_of: Callable[[int], tuple[Tensor, dict[str, Tensor]]],
-    settings: TrainingSettings,
-    plan: LocalTrainingPlan,
-    on_step: Callable[[int], None] = lambda _steps: None,
-    optimizer_state: Mapping[str, Tensor] | None = None,
+    network: KeypointNetwork, layers: Sequence[nn.Module], losses_of: LossesOf, plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
-    """Train some layers of a network in place by losses of the caller's, with the batch statistics as they are.
-
-    Args:
-        network: in evaluation mode.
-        layers: to train; all others stay as they are.
-        losses_of: the loss to descend at a step of the whole run, and its parts by name.
-        settings: of the whole run; the learning rate falls towards the end of its steps.
-        plan: which steps are done, and how.
-        on_step: called with the number of steps done.
-        optimizer_state: result of an earlier local training, to continue it.
+    """Train some layers of a network in place, with the batch statistics as they are. All others stay as they are.
 
     Raises:
-        TrainingError: ``optimizer_state`` belongs to another network, or training diverged.
+        TrainingError: the optimizer's state belongs to another network, or training diverged.
     """
-    freeze_all_but(network, layer_names(network, layers))
-    optimizer = continued_optimizer(network, optimizer_state)
+    trained = layer_names(network, layers)
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(name in trained)
+    freeze_statistics(network)
+    return _descended(network, losses_of, plan)
+
+
+def _descended(network: KeypointNetwork, losses_of: LossesOf, plan: LocalTrainingPlan) -> LocalTrainingResult:
+    """The network after the steps of the plan, in evaluation mode."""
+    optimizer = create_optimizer(network)
+    if plan.optimizer_state is not None:
+        try:
+            restore_optimizer_state(optimizer, plan.optimizer_state)
+        except (KeyError, ValueError) as error:
+            raise TrainingError(f"the optimizer cannot continue ({error})") from error
     sums: dict[str, float] = {}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
-        for group in optimizer.param_groups:
-            group["lr"] = local_rate(settings, step, done, optimizer_state is None)
+        ramp = min(done / RAMP_STEPS, 1.0) if plan.optimizer_state is None else 1.0
         total, losses = losses_of(step)
-        descend(network, optimizer, total, step)
+        descend(network, optimizer, total, step, ramp * learning_rate(plan.settings, step))
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss.detach())
-        on_step(done)
-    return local_result(network, optimizer, sums, plan)
-
-
-def continued_optimizer(
-    network: KeypointNetwork, optimizer_state: Mapping[str, Tensor] | None
-) -> torch.optim.Optimizer:
-    """A new optimizer, or one that continues from the result of an earlier local training.
-
-    Raises:
-        TrainingError: the state belongs to another network.
-    """
-    optimizer = create_optimizer(network)
-    if optimizer_state is not None:
-        try:
-            restore_optimizer_state(optimizer, optimizer_state)
-        except (KeyError, ValueError) as error:
-            raise TrainingError(f"the optimizer cannot continue ({error})") from error
-    return optimizer
-
-
-def local_rate(settings: TrainingSettings, step: int, done: int, is_new: bool) -> float:
-    """Learning rate of a step of the whole run, the ``done``-th here, of an optimizer that may be new."""
-    return learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if is_new else 1.0)
-
-
-def local_result(
-    network: KeypointNetwork, optimizer: torch.optim.Optimizer, sums: Mapping[str, float], plan: LocalTrainingPlan
-) -> LocalTrainingResult:
-    """The result after the last step, from sums of the losses over the steps.
-
-    Raises:
-        TrainingError: training diverged.
-    """
+        plan.on_step(done)
     network.eval()
     state = get_optimizer_state(optimizer)
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
@@ -174,13 +133,6 @@ def layer_names(network: KeypointNetwork, layers: Sequence[nn.Module]) -> set[st
     """Names of the parameters and statistics of some layers of a network."""
     values = {id(value) for layer in layers for value in layer.state_dict(keep_vars=True).values()}
     return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
-
-
-def freeze_all_but(network: KeypointNetwork, names: Collection[str]) -> None:
-    """Let only the parameters of these names be trained, without batch statistics."""
-    for name, parameter in network.named_parameters():
-        parameter.requires_grad_(name in names)
-    freeze_statistics(network)
 
 
 def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:

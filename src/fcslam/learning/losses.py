@@ -89,11 +89,8 @@ def distillation_loss(logits: Tensor, teacher: Tensor, valid: Tensor) -> Tensor:
 def detector_loss(point_logits: Tensor, targets: Tensor, valid: Tensor) -> Tensor:
     """Cross entropy over the 65 classes of a cell: a keypoint at one of its 64 pixels, or none.
 
-    Args:
-        point_logits: (B, H, W).
-        targets: (B, H, W), weight of a keypoint at each pixel. If the weights of a cell sum to less than 1, the rest is
-            "none"; if to more, they are scaled to 1.
-        valid: (B, H, W) bool; a cell counts if all its pixels are valid.
+    ``point_logits`` (B, H, W), and the weight of a keypoint at each pixel. If the weights of a cell sum to less than 1,
+    the rest is "none"; if to more, they are scaled to 1. A cell counts if all its pixels are ``valid``.
     """
     log_places, log_none = cell_log_probabilities(point_logits)
     wanted = F.pixel_unshuffle(targets.unsqueeze(1), CELL_PX)

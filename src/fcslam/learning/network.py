@@ -49,25 +49,7 @@ class KeypointNetwork(nn.Module):
         super().__init__()
         self.encoder: Encoder = encoder
         self.body: LightBody | VggBody = LightBody() if encoder == "light" else VggBody()
-
-    @property
-    def code_layers(self) -> tuple[nn.Module, ...]:
-        """The layers that give the codes at 1/8 of the resolution; the keypoints depend on them a little."""
-        return self.body.code_layers
-
-    @property
-    def point_layers(self) -> tuple[nn.Module, ...]:
-        """The layers that turn features into keypoints; the codes do not depend on them."""
-        return self.body.point_layers
-
-    def code_inputs(self, image: Tensor) -> Tensor:
-        """Input of the layers of the codes for images (B, 1, H, W), shape (B, C, H/8, W/8)."""
-        inputs: Tensor = self.body.code_inputs(image)
-        return inputs
-
-    def describe(self, code_inputs: Tensor) -> Description:
-        """The codes for the output of ``code_inputs``."""
-        return self.body.describe(code_inputs)
+        """The encoder and its heads. Its ``code_inputs`` (B, C, H/8, W/8) of images give ``describe`` the codes."""
 
     def forward(self, image: Tensor) -> Maps:
         """Maps of a batch.
@@ -116,20 +98,23 @@ class LightBody(nn.Module):
 
     @property
     def code_layers(self) -> tuple[nn.Module, ...]:
-        """As in ``KeypointNetwork``."""
+        """The layers that give the codes at 1/8 of the resolution; the keypoints depend on them a little."""
         return self.to_sixteenth, self.joint, self.code_head
 
     @property
     def point_layers(self) -> tuple[nn.Module, ...]:
-        """As in ``KeypointNetwork``; ``context_eighth`` is left out: by it, training of the codes keeps keypoints."""
+        """The layers that turn features into keypoints; the codes do not depend on them.
+
+        ``context_eighth`` is left out: by it, training of the codes keeps keypoints.
+        """
         return self.context_quarter, self.point_head, self.refine
 
     def code_inputs(self, image: Tensor) -> Tensor:
-        """As in ``KeypointNetwork``."""
+        """Input of the layers of the codes for images (B, 1, H, W), shape (B, C, H/8, W/8)."""
         return self._resolutions(_even_contrast(image))[-1]
 
     def describe(self, code_inputs: Tensor) -> Description:
-        """As in ``KeypointNetwork``."""
+        """The codes for the output of ``code_inputs``."""
         around = _twice(self.to_sixteenth(code_inputs))[..., : code_inputs.shape[-2], : code_inputs.shape[-1]]
         joint = self.joint(code_inputs + around)
         return Description(self.code_head(joint), self.context_eighth(joint))
@@ -174,21 +159,21 @@ class VggBody(nn.Module):
 
     @property
     def code_layers(self) -> tuple[nn.Module, ...]:
-        """As in ``KeypointNetwork``."""
+        """As in ``LightBody``."""
         return (self.code_head,)
 
     @property
     def point_layers(self) -> tuple[nn.Module, ...]:
-        """As in ``KeypointNetwork``."""
+        """As in ``LightBody``."""
         return (self.point_head,)
 
     def code_inputs(self, image: Tensor) -> Tensor:
-        """As in ``KeypointNetwork``."""
+        """As in ``LightBody``."""
         features: Tensor = self.encoder(image)
         return features
 
     def describe(self, code_inputs: Tensor) -> Description:
-        """As in ``KeypointNetwork``; the keypoints do not depend on the head of the codes."""
+        """As in ``LightBody``; the keypoints do not depend on the head of the codes."""
         return Description(self.code_head(code_inputs), code_inputs)
 
     def forward(self, image: Tensor) -> Maps:
@@ -214,15 +199,7 @@ def cell_log_probabilities(point_logits: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
-    """Logits at points, interpolated linearly.
-
-    Args:
-        code_logits: shape (B, 256, H/8, W/8).
-        points_px: shape (B, N, 2), x and y in pixels.
-
-    Returns:
-        Shape (B, N, 256).
-    """
+    """Logits (B, N, 256) at points (B, N, 2), x and y in pixels, interpolated linearly in (B, 256, H/8, W/8)."""
     rows, columns = code_logits.shape[-2:]
     size = points_px.new_tensor([columns * CELL_PX, rows * CELL_PX])
     grid = (2.0 * points_px + 1.0) / size - 1.0

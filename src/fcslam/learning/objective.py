@@ -9,9 +9,9 @@ from torch.nn import functional as F
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
-from fcslam.learning.batches import TrainingBatch
+from fcslam.learning.batches import TensorRecord, TrainingBatch
+from fcslam.learning.code_batches import RevisitBatch
 from fcslam.learning.network import Description, Maps, sample_codes
-from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import Encoder, LossSettings
 
 MIN_NEGATIVE_DISTANCE_PX = 8.0
@@ -28,18 +28,14 @@ _SEEN = 0.999
 """Least interpolated visibility of a pixel that counts as visible: all four neighbours are, up to rounding."""
 
 
-@dataclass(frozen=True, slots=True)
-class TeacherBits:
+@dataclass(frozen=True, slots=True, eq=False)
+class TeacherBits(TensorRecord):
     """A fixed projection of a teacher's float descriptors to 256 values whose signs are its bits."""
 
     mean: Tensor
     """Shape (D,)."""
     projection: Tensor
     """Shape (D, 256); its outputs have unit variance on the training set."""
-
-    def to(self, device: torch.device) -> "TeacherBits":
-        """The projection on another device."""
-        return TeacherBits(self.mean.to(device), self.projection.to(device))
 
     def probabilities(self, descriptors: Tensor) -> Tensor:
         """Probability that each bit is 1, shape (..., 256), for descriptors (..., D)."""
@@ -56,14 +52,9 @@ def objective(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise, and the losses in it by name.
 
-    Args:
-        maps: output of the network for ``batch.images``.
-        batch: images and ground truth.
-        weights: of the losses.
-        progress: share of the training that is done, in [0, 1].
-        grid_shift: rows and columns by which the detector's cells are shifted, 0 to 7, so that the network does not
-            learn one grid of cells.
-        bits: the teacher's, if there is a teacher.
+    ``progress`` is the share of the training that is done, in [0, 1]. ``grid_shift``: rows and columns by which the
+    detector's cells are shifted, 0 to 7, so that the network does not learn one grid of cells. ``bits`` are a
+    teacher's.
     """
     logits = sample_codes(maps.code_logits.float(), batch.points)
     first, second = logits.chunk(2)
@@ -96,14 +87,9 @@ def revisit_objective(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise for points that were seen again, and the losses in it by name.
 
-    The codes of a point in both views must agree and differ from those of all other points of the batch, also in
-    images of other places. The balance of the bits, and the negatives, keep codes from becoming all the same.
-
-    Args:
-        described: by the network, for the batch's images.
-        before: by the network that training started from.
-        batch: the points.
-        weights: of the losses.
+    The codes of a point in both views must agree and differ from those of all other points of the batch, also in images
+    of other places. The balance of the bits, and the negatives, keep codes from becoming all the same. ``before`` is
+    described by the network that training started from.
     """
     soft = torch.tanh(sample_codes(described.code_logits.float(), batch.points))
     first, second = (side[batch.valid] for side in soft.chunk(2))
@@ -161,9 +147,7 @@ def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, T
 def negatives(points: Tensor, valid: Tensor) -> Tensor:
     """Which pairs of points are negatives, shape (B, N, N), bool: both valid, and far apart in both views.
 
-    Args:
-        points: shape (2B, N, 2) [px], first views before second views.
-        valid: shape (B, N), bool.
+    ``points`` (2B, N, 2) [px]: first views before second views; ``valid``: shape (B, N).
     """
     first, second = points.chunk(2)
     apart = (torch.cdist(first, first) > MIN_NEGATIVE_DISTANCE_PX) & (

@@ -17,8 +17,7 @@ from fcslam.learning.warps import (
     warp_image,
     well_inside,
 )
-from fcslam.metrics.framing import Size
-from fcslam.metrics.homography import Mask, inverse, warp
+from fcslam.metrics.homography import Mask, Size, inverse, warp
 from fcslam.records import FloatArray
 
 BORDER_PX: Final = 4
@@ -74,12 +73,7 @@ def draw_pair(
 ) -> ViewPair:
     """Draw a pair of views.
 
-    Args:
-        example: image and labels.
-        size: width and height of a view [px].
-        points: number of points, N.
-        teacher_points: number of points of the teacher, M.
-        rng: source of randomness.
+    ``size``: width and height of a view [px]; ``points`` and ``teacher_points``: their numbers N and M.
     """
     image = example.image
     window = random_view(image, size, rng)

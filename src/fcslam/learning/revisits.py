@@ -73,15 +73,10 @@ class Keyframe:
 
 
 def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Where the second keyframe shows the keypoints of the first.
+    """Where the second keyframe shows the keypoints of the first, pixels (K, 2), and which of them it shows, (K,).
 
-    Args:
-        first, second: two keyframes, also of two robots.
-        T_first_second: pose of the second base in the first, shape (3,), metres and radians.
-
-    Returns:
-        Pixels (K, 2), and which of them are shown, shape (K,): in the image, and on the surface that the LiDAR measures
-        in their direction, so that nothing hides them.
+    A point is shown in the image, and on the surface that the LiDAR measures in its direction, so that nothing hides
+    it. ``T_first_second`` (3,) is the pose of the second base in the first, in metres and radians.
     """
     there = first.positions.copy()
     there[:, :2] = se2.transform(se2.inverse(T_first_second), first.positions[:, :2])
@@ -96,11 +91,7 @@ def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tu
 
 
 def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> NDArray[np.int64]:
-    """Find the keypoints that two keyframes share, given the estimated pose of the second base in the first, (3,).
-
-    Returns:
-        Numbers of the keypoints in the first and in the second keyframe, shape (M, 2).
-    """
+    """Numbers of the keypoints that two keyframes share, (M, 2), by the pose of the second base in the first, (3,)."""
     pixels, shown = predict(first, second, T_first_second)
     return correspond_predicted(first.features, second.features, pixels, shown)
 
@@ -108,15 +99,10 @@ def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) ->
 def correspond_predicted(
     first: ImageFeatures, second: ImageFeatures, pixels: FloatArray, shown: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """Find the keypoints that two images share.
+    """Numbers of the keypoints that two images share, shape (M, 2).
 
-    Args:
-        first, second: keypoints of both images.
-        pixels: where the second image shows the K keypoints of the first, some pixels off, shape (K, 2).
-        shown: which of them it shows, shape (K,).
-
-    Returns:
-        Numbers of the keypoints in the first and in the second image, shape (M, 2).
+    ``pixels`` (K, 2) are where the second image shows the K keypoints of the first, some pixels off; ``shown`` (K,)
+    says which of them it shows.
     """
     none = np.empty((0, 2), np.int64)
     asked = np.flatnonzero(shown & (len(second.keypoints_px) > 0))

@@ -15,7 +15,7 @@ from typing import Final, overload
 import numpy as np
 import torch
 
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import TrainingError, writing
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.export import detector_version
@@ -104,8 +104,7 @@ def train_detector(
     Args:
         roots: folders of images.
         folder: for all files of the run; a run in it is continued.
-        settings: of the run.
-        options: where and how to compute.
+        settings, options: of the run.
         teacher: folder of a teacher's files; None without a teacher.
         on_progress: called after every step.
         most_images: train on the first ones alone; None for all.
@@ -131,7 +130,7 @@ def train_detector(
     if start is not None:
         key = zlib.crc32(detector_version(start).encode(), key)
     state = None if first is None else first.state_dict()
-    run = TrainingRun(settings, "joint", _created(folder / "joint"), options, state, key)
+    run = TrainingRun(settings, "joint", folder / "joint", options, state, key)
     return run.train(
         images.train, images.held_out, _teacher_bits(images.train, settings.seed), partial(on_progress, "joint")
     ), images
@@ -240,12 +239,8 @@ def _labels(
     else:
         others = corners
     labels = fuse_keypoints(corners, others)
-    try:
+    with writing(place):
         write_labels(place, labels, key)
-    except OSError as error:
-        raise OutputError(
-            f"{place}: cannot be written ({error}); free disk space and run the same command again"
-        ) from error
     return labels
 
 
@@ -254,18 +249,14 @@ def train_on_shapes(
 ) -> KeypointNetwork:
     """Train a detector of the corners of synthetic shapes; its descriptors are not trained yet.
 
-    Args:
-        folder: for the files of this stage, which is continued if it is in there.
-        settings: of the run.
-        options: where and how to compute.
-        on_progress: called after every step.
+    ``folder`` is for the files of this stage, which is continued if it is in there.
 
     Raises:
         TrainingError: ``folder`` belongs to another run.
         OutputError: a file cannot be written.
     """
     shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
-    run = TrainingRun(shapes, "shapes", _created(folder), options)
+    run = TrainingRun(shapes, "shapes", folder, options)
     return run.train(
         SyntheticShapes(0, SHAPE_COUNT), SyntheticShapes(1, HELD_OUT_SHAPES), on_progress=partial(on_progress, "shapes")
     )
@@ -293,11 +284,3 @@ def keypoint_response(network: KeypointNetwork, device: torch.device) -> Callabl
 
     response_of: Callable[[GreyImage], Response] = detector
     return response_of
-
-
-def _created(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
-    return folder

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.errors import OutputError, TrainingError
-from fcslam.learning.batches import TrainingBatch, batch_stream
+from fcslam.errors import TrainingError, writing
+from fcslam.learning.batches import batch_stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits
@@ -23,10 +23,11 @@ from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import (
     create_optimizer,
+    descend,
     get_optimizer_state,
     learning_rate,
     restore_optimizer_state,
-    training_step,
+    step_losses,
 )
 from fcslam.learning.validation import collapse_warnings, validate
 
@@ -111,18 +112,14 @@ class TrainingRun:
         bits: TeacherBits | None = None,
         on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
     ) -> KeypointNetwork:
-        """Train to the last step; returns the averaged network.
-
-        Args:
-            examples: to train on.
-            held_out: to validate on.
-            bits: a teacher's, if the examples have a teacher.
-            on_progress: called after every step.
+        """Train to the last step; returns the averaged network. ``bits`` are a teacher's, if the examples have one.
 
         Raises:
             TrainingError: the folder's checkpoint belongs to another run, or training diverged.
-            OutputError: a checkpoint or the log cannot be written.
+            OutputError: the folder cannot be written.
         """
+        with writing(self.folder, "choose another output folder"):
+            self.folder.mkdir(parents=True, exist_ok=True)
         self._resume()
         bits = None if bits is None else bits.to(self.device)
         views = validation_pairs(held_out, self.options.validation_pairs)
@@ -131,11 +128,14 @@ class TrainingRun:
         for step, batch in batch_stream(
             examples, self.settings, self.step, 4 * self.options.threads, self.options.threads
         ):
-            parts = self._step(step, batch.to(self.device), bits)
+            self.network.train()
+            total, parts = step_losses(self.network, batch.to(self.device), self.settings, step, bits)
+            descend(self.network, self.optimizer, total, step, learning_rate(self.settings, step))
+            self._average(step)
             self.step = step + 1
             last = self.step == self.settings.steps
             if self.step % self.options.log_every == 0 or last:
-                losses = {name: float(part) for name, part in parts.items()}
+                losses = {name: float(part.detach()) for name, part in parts.items()}
                 metrics |= losses
                 self._log(losses)
             if self.step % self.options.validate_every == 0 or last:
@@ -148,13 +148,6 @@ class TrainingRun:
             on_progress(TrainingProgress(self.step, self.settings.steps, dict(metrics), warnings))
         trained: KeypointNetwork = self.average
         return trained
-
-    def _step(self, step: int, batch: TrainingBatch, bits: TeacherBits | None) -> dict[str, Tensor]:
-        self.network.train()
-        rate = learning_rate(self.settings, step)
-        parts = training_step(self.network, self.optimizer, batch, self.settings, step, rate, bits)
-        self._average(step)
-        return parts
 
     @torch.no_grad()
     def _average(self, step: int) -> None:
@@ -182,14 +175,11 @@ class TrainingRun:
                 f"{path}: has {checkpoint.step} steps already, more than {self.settings.steps}; give another --output"
             )
         try:
-            self._load(checkpoint)
+            self.network.load_state_dict(checkpoint.part(NETWORK))
+            self.average.load_state_dict(checkpoint.part(AVERAGE))
+            restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
         except (KeyError, RuntimeError, ValueError) as error:
             raise TrainingError(f"{path}: does not fit this network ({error})") from error
-
-    def _load(self, checkpoint: Checkpoint) -> None:
-        self.network.load_state_dict(checkpoint.part(NETWORK))
-        self.average.load_state_dict(checkpoint.part(AVERAGE))
-        restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
         self.step = checkpoint.step
 
     def _save(self) -> None:
@@ -203,32 +193,11 @@ class TrainingRun:
 
     def _log(self, metrics: Mapping[str, float]) -> None:
         path = self.folder / PROGRESS_FILE
-        try:
-            with path.open("a", newline="", encoding="utf-8") as file:
-                rows = csv.writer(file)
-                if not file.tell():
-                    rows.writerow(("stage", "step", "name", "value"))
-                rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
-        except OSError as error:
-            raise OutputError(
-                f"{path}: cannot be written ({error}); free disk space and run the command again"
-            ) from error
-
-
-def trained_network(path: Path) -> KeypointNetwork:
-    """The averaged network of a checkpoint, the result of its run, in evaluation mode.
-
-    Raises:
-        TrainingError: the file is not a checkpoint, or belongs to a network that this version does not have.
-    """
-    checkpoint = read_checkpoint(path)
-    try:
-        network = KeypointNetwork(checkpoint.settings["encoder"])
-        network.load_state_dict(checkpoint.part(AVERAGE))
-    except (KeyError, RuntimeError) as error:
-        raise TrainingError(f"{path}: does not fit this network ({error})") from error
-    network.eval()
-    return network
+        with writing(path), path.open("a", newline="", encoding="utf-8") as file:
+            rows = csv.writer(file)
+            if not file.tell():
+                rows.writerow(("stage", "step", "name", "value"))
+            rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
 
 
 def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION_PAIRS) -> list[ViewPair]:

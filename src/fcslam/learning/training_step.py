@@ -52,7 +52,7 @@ def reduced_precision(device: torch.device) -> torch.autocast:
 
 
 def create_optimizer(network: KeypointNetwork) -> torch.optim.Optimizer:
-    """An optimizer without moments; ``training_step`` sets its learning rate."""
+    """An optimizer without moments; ``descend`` sets its learning rate."""
     return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
 
 
@@ -81,36 +81,18 @@ def restore_optimizer_state(optimizer: torch.optim.Optimizer, tensors: Mapping[s
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
-def training_step(
+def step_losses(
     network: KeypointNetwork,
-    optimizer: torch.optim.Optimizer,
     batch: TrainingBatch,
     settings: TrainingSettings,
     step: int,
-    rate: float,
     bits: TeacherBits | None = None,
     legacy: LegacyDetector | None = None,
-) -> dict[str, Tensor]:
-    """Do one step in place; batch, network and optimizer are on one device.
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The sum to minimise at a step, and the losses in it by name.
 
-    Args:
-        network: in training mode.
-        optimizer: of the network's parameters.
-        batch: of this step.
-        settings: of the whole run.
-        step: number of the step in the whole run, from 0.
-        rate: learning rate.
-        bits: the teacher's, if there is a teacher.
-        legacy: the detector whose codes are still in use, if there is one.
-
-    Returns:
-        The losses by name.
-
-    Raises:
-        TrainingError: the losses are not finite; the step changed nothing.
+    The network is in training mode, on the device of the batch; ``step`` counts from 0 over the whole run.
     """
-    for group in optimizer.param_groups:
-        group["lr"] = rate
     with reduced_precision(batch.images.device):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     shift = grid_shift(settings.encoder, settings.seed, step)
@@ -118,18 +100,19 @@ def training_step(
     if legacy is not None:
         losses["former"] = legacy.loss(maps, batch)
         total = total + legacy.strength * losses["former"]
-    descend(network, optimizer, total, step)
-    return {name: loss.detach() for name, loss in losses.items()}
+    return total, losses
 
 
-def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int) -> None:
-    """Follow the gradient of a step's sum of losses in place, with the rate that the optimizer has.
+def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int, rate: float) -> None:
+    """Follow the gradient of a step's sum of losses in place, with this learning rate.
 
     Raises:
         TrainingError: the sum is not finite; the step changed nothing.
     """
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
+    for group in optimizer.param_groups:
+        group["lr"] = rate
     optimizer.zero_grad(set_to_none=True)
     total.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)

@@ -13,8 +13,14 @@ from fcslam.features.dense import find_peaks, sample_codes
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import ViewPair
 from fcslam.learning.warps import well_inside
-from fcslam.metrics.homography import inverse, match_errors, matching_accuracy
-from fcslam.metrics.repeatability import CORRECT_PX, in_common_view, repeatability
+from fcslam.metrics.homography import (
+    CORRECT_PX,
+    in_common_view,
+    inverse,
+    match_errors,
+    matching_accuracy,
+    repeatability,
+)
 from fcslam.records import Codes, FloatArray
 
 NMS_PX: Final = 4.0

@@ -6,8 +6,7 @@ A thread follows the cloud. No scan waits for it, and while the cloud is away ev
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -78,7 +77,7 @@ class FleetView:
             robot: its name.
             own_pose: index of its map and its pose there, if both are known.
             limit_kBps: limit of the tiles, kB per second; None: ``DOWNLINK_KB_PER_S``.
-            clock: seconds.
+            clock: any, in seconds.
         """
         self._clients, self._robot, self._own_pose, self.clock = clients, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments
@@ -88,7 +87,8 @@ class FleetView:
         """The newest one and when it came."""
         self.mates: Mates | None = None
         """As the newest reply says; None if the robot is in no map that the cloud draws."""
-        self._map: OccupancyMap | None = None
+        self.joint_map: OccupancyMap | None = None
+        """The joint map of the newest tiles, in its own frame; None before all tiles of that frame came."""
         self._is_settling = False
         """In a new frame, some tiles are missing yet."""
         self.drawn_s = -np.inf
@@ -125,11 +125,6 @@ class FleetView:
     def received_bytes(self) -> int:
         """Bytes of the cloud's replies so far."""
         return sum(client.received_bytes for client in self._clients)
-
-    @property
-    def joint_map(self) -> OccupancyMap | None:
-        """The joint map of the newest tiles, in its own frame; None before all tiles of that frame came."""
-        return self._map
 
     @property
     def map_index(self) -> int | None:
@@ -176,7 +171,7 @@ class FleetView:
                 raise UnavailableError(f"the cloud's reply is broken: {error}") from error
             self._etag = found[1]
             self._is_settling = (self._is_settling or is_new) and not is_complete
-            self._map = None if self._is_settling else self._tiled.occupancy()
+            self.joint_map = None if self._is_settling else self._tiled.occupancy()
             self.version += 1
         before, self._reply = self.mates, reply
         self.mates = _mates(self._robot, *reply)
@@ -230,16 +225,3 @@ def _mates(robot: str, reply: FleetReply, came_s: float) -> Mates | None:
     others = [one for one in reply.robots if one.map_index == own and one.robot != robot]
     places = np.array([(*one.T_map_base[:2], one.age_s) for one in others], np.float64).reshape(-1, 3)
     return Mates(own, frozenset(one.robot for one in others), places, came_s)
-
-
-@contextmanager
-def following(
-    clients: Sequence[FleetClient],
-    robot: str,
-    own_pose: Callable[[], tuple[int, FloatArray] | None],
-    limit_kBps: float | None,
-) -> Iterator[FleetView]:
-    """A view that follows its fleet in this block; arguments as for ``FleetView``."""
-    with closing(FleetView(clients, robot, own_pose, limit_kBps)) as view:
-        view.start()
-        yield view

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from fcslam.cloud.sessions import check_robot
 from fcslam.errors import InputError, PacketError
 from fcslam.geometry.beams import is_field_of_view, misfit, spread
-from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan
+from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan, frozen
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
 
@@ -58,13 +58,9 @@ def checked_lasers(lasers: Lasers | None) -> dict[str, LaserModel]:
 
 
 def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, laser: LaserModel) -> LaserScan:
-    """A scan as a record; negative ranges are made invalid.
+    """A scan as a record; negative ranges are made invalid. The stamp and the pose were checked before.
 
-    Args:
-        ranges_m: shape (N,); N may vary from scan to scan, the field of view does not.
-        stamp: checked, seconds.
-        T_odom_base: checked, shape (3,).
-        laser: the laser.
+    The ranges have shape (N,); N may vary from scan to scan, the field of view does not.
 
     Raises:
         InputError: the ranges are not numbers, or not as many as the laser can have beams.
@@ -83,8 +79,7 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
                 "each"
             )
     ranges[ranges < 0.0] = np.nan
-    ranges.setflags(write=False)
-    return LaserScan(stamp, ranges, laser.with_beams(beams), T_odom_base)
+    return LaserScan(stamp, frozen(ranges, np.float32), laser.with_beams(beams), T_odom_base)
 
 
 def checked_camera(camera: CameraModel | None) -> CameraModel | None:
@@ -106,13 +101,9 @@ def checked_camera(camera: CameraModel | None) -> CameraModel | None:
 
 
 def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None, camera: CameraModel) -> CameraImage:
-    """An image as a record, encoded as JPEG: grey values are enough for keypoints.
+    """An image as a record, encoded as JPEG: grey values are enough for keypoints. The rest was checked before.
 
-    Args:
-        image: shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
-        stamp: checked, seconds.
-        T_odom_base: checked, shape (3,); None: unknown.
-        camera: the camera.
+    The image has shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
 
     Raises:
         InputError: the image has another type, or another shape than those of the camera.

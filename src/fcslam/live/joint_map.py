@@ -16,9 +16,10 @@ from fcslam.live.fleet_view import FleetView
 from fcslam.live.records import RobotPose
 from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
-from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, frozen, without
+from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
 from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.track import ScanTrack
+from fcslam.robot.warmup import made_up_scans
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Hello, Packet
 
@@ -37,22 +38,6 @@ class _DrawnKeyscan(NamedTuple):
     on_teammates: NDArray[np.bool_] | None
     """As in ``LaserScan``."""
 
-
-_MADE_UP = (
-    LaserScan(
-        stamp=0.0,
-        ranges_m=frozen(np.ones(4), np.float32),
-        laser=LaserModel(4, -np.pi, 0.5 * np.pi, 2.0),
-        T_odom_base=se2.IDENTITY,
-    ),
-    se2.IDENTITY,
-    se2.IDENTITY,
-    np.zeros((1, 3)),
-    0.0,
-    OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0)),
-    0.5,
-)
-"""A scan beside a robot, as ``beams_on_teammates`` takes it."""
 
 _ScanKey = tuple[float, tuple[float, float, float], int]
 
@@ -76,7 +61,8 @@ class JointMap:
         self._met: dict[_ScanKey, NDArray[np.bool_]] = {}
         """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
-        beams_on_teammates(*_MADE_UP)  # no scan waits for the compiler
+        (scan,), here, cell = made_up_scans(1), se2.IDENTITY, OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0))
+        beams_on_teammates(scan, here, here, np.zeros((1, 3)), 0.0, cell, 0.5)  # no scan waits for the compiler
 
     def add(self, packets: Iterable[Packet]) -> None:
         """Keep the next keyscans until the cloud has drawn them."""
@@ -91,14 +77,9 @@ class JointMap:
                     self._drawn.append(_DrawnKeyscan(packet.epoch, keyscan, laser, on_teammates))
 
     def draw(self, part: int, track: ScanTrack, localizer: CorrectedOdometry) -> OccupancyMap | None:
-        """The joint map, with the keyscans of a part drawn into it that the cloud has not drawn yet.
+        """The joint map, with the keyscans of a part of the robot drawn into it that the cloud has not drawn yet.
 
         None: the server has not drawn the map that the robot's poses are in.
-
-        Args:
-            part: the part of the robot.
-            track: that of the part.
-            localizer: that of the part.
         """
         fleet, joint = self._fleet, self._fleet.joint_map
         if joint is None or fleet.map_index is None or fleet.map_index != localizer.map_index:
@@ -119,10 +100,7 @@ class JointMap:
     def mark_teammates(self, scan: LaserScan, part: int, newest: RobotPose | None) -> LaserScan:
         """The next scan with the beams marked that hit other robots.
 
-        Args:
-            scan: the scan.
-            part: the part that it is of; ``odom`` is another frame in each.
-            newest: the pose of the scan before; None before the first one.
+        ``newest`` is the pose of the scan before. ``odom`` is another frame in each part.
         """
         fleet, radius_m = self._fleet, self._config.robot_radius_m
         before, self._newest = self._newest, (part, scan.T_odom_base)

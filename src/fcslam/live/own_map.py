@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from fcslam.cloud.report import Track, fuse_members
+from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import FcslamError
 from fcslam.geometry import se2
 from fcslam.maps.fusion import fuse
@@ -70,11 +71,7 @@ class OwnMap:
             return len(self._applying)
 
     def draw(self, session: str, T_map_own: FloatArray) -> OccupancyMap:
-        """The map that a session is in, moved into another frame.
-
-        Args:
-            session: its name.
-            T_map_own: pose of the robot's own map in ``map``, shape (3,), metres and radians.
+        """The map that a session is in, moved by the pose of the robot's own map in ``map``, shape (3,).
 
         Raises:
             FcslamError: the worker has ended.
@@ -168,29 +165,29 @@ def _in_epoch(packet: Packet, epoch: int) -> Packet:
     return replace(packet, epoch=epoch, body=body)
 
 
+def _in_map_of(session: str, result: FleetResult) -> dict[str, MappedRobot]:
+    """The sessions in the map of one session, by name; empty before its first keyscan."""
+    index = next((mapped.map_index for mapped in result.robots if mapped.robot == session), None)
+    return {mapped.robot: mapped for mapped in result.robots if mapped.map_index == index}
+
+
 def _draw(robot: str, session: str, T_map_own: FloatArray) -> OccupancyMap:
     cloud = _clouds[robot]
-    robots = {mapped.robot: mapped for mapped in cloud.fleet.estimate().robots}
-    if session not in robots:  # before the first keyscan
-        return fuse((), np.empty((0, 3)), {}, cloud.config.map)
-    index = robots[session].map_index
     members = [
         replace(mapped, T_map_base=frozen(se2.compose(T_map_own, mapped.T_map_base)))
-        for mapped in robots.values()
-        if mapped.map_index == index
+        for mapped in _in_map_of(session, cloud.fleet.estimate()).values()
     ]
-    return fuse_members(members, cloud.config.map)
+    return fuse_members(members, cloud.config.map) if members else fuse((), np.empty((0, 3)), {}, cloud.config.map)
 
 
 def _closures(robot: str, session: str, T_map_own: FloatArray) -> FloatArray:
     result = _clouds[robot].fleet.estimate()
-    robots = {mapped.robot: mapped for mapped in result.robots}
-    index = robots[session].map_index if session in robots else None
-    poses = {name: mapped.T_map_base for name, mapped in robots.items() if mapped.map_index == index}
-    accepted = (
-        c for c in result.closures if c.status is ClosureStatus.ACCEPTED and {c.i.robot, c.j.robot} <= poses.keys()
-    )
-    ends = [[poses[end.robot][end.number] for end in (closure.i, closure.j)] for closure in accepted]
+    members = _in_map_of(session, result)
+    ends = [
+        [members[end.robot].T_map_base[end.number] for end in (closure.i, closure.j)]
+        for closure in result.closures
+        if closure.status is ClosureStatus.ACCEPTED and {closure.i.robot, closure.j.robot} <= members.keys()
+    ]
     return se2.compose(T_map_own, np.array(ends).reshape(-1, 2, 3))[..., :2]
 
 

@@ -39,12 +39,7 @@ def play(
 ) -> None:
     """Map a whole recording and send all packets; what a resumed robot did before is not paced.
 
-    Args:
-        robot: maps.
-        records: of the recording.
-        pace: of the playback.
-        watch: called with the robot's state.
-        stay: called after the last record, before the recording ends; None: it ends at once.
+    ``stay`` is called after the last record, before the recording ends.
 
     Raises:
         CloudError: the cloud rejects the robot; unconfirmed packets stay in the state folder.

@@ -21,13 +21,8 @@ from fcslam.api import settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
-from fcslam.live.fleet_view import FleetView, following
-from fcslam.live.inputs import (
-    Lasers,
-    checked_camera,
-    checked_image,
-    checked_stamp,
-)
+from fcslam.live.fleet_view import FleetView
+from fcslam.live.inputs import Lasers, checked_camera, checked_image, checked_stamp
 from fcslam.live.joint_map import JointMap
 from fcslam.live.map_poses import MapPoses
 from fcslam.live.own_map import OwnMap
@@ -59,6 +54,7 @@ from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server, addresses
+from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
@@ -160,13 +156,14 @@ class Robot(LiveTracker):
             if folder is not None:
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, LARGEST_OUTBOX_BYTES)))
             if access is not None and outbox is not None:
-                urls, shown = addresses(access.url), (access.token, access.ca, access.certificate)
+                urls, shown = addresses(access.url), Credentials(access.token, access.ca, access.certificate)
                 transport = InstancesTransport(
-                    [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, *shown))) for url in urls]
+                    [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, shown))) for url in urls]
                 )
                 if own_map:
-                    followed = [FleetClient(url, *shown) for url in urls]
-                    self.fleet = stack.enter_context(following(followed, name, self._place, budget_kBps))
+                    followed = [FleetClient(url, shown) for url in urls]
+                    self.fleet = FleetView(followed, name, self._place, budget_kBps)
+                    stack.enter_context(closing(self.fleet)).start()
                     self._joint = JointMap(self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)
             keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None

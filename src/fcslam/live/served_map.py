@@ -7,12 +7,13 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import CloudError, EvaluationError, SourceError, UnavailableError
-from fcslam.records import frozen
+from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
 from fcslam.runs.map_files import area_of, map_stem, parse_map
+from fcslam.wire.fleet_client import MapClient, ServedMap
 from fcslam.wire.http_transport import Server, addresses
-from fcslam.wire.map_client import MapClient, ServedMap
+from fcslam.wire.keys import Credentials
 
 _ATTEMPTS: Final = 3
 """The cloud may draw its maps again while the robot reads them."""
@@ -21,9 +22,7 @@ _ATTEMPTS: Final = 3
 def fetch_maps(folder: Path, server: Server) -> str | None:
     """Copy the maps of a cloud into a run folder, whole or not at all: their files, robots and floors.
 
-    Args:
-        folder: the folder; an earlier copy in it is replaced.
-        server: the cloud; its token has the rights of a viewer.
+    An earlier copy in ``folder`` is replaced. The token of ``server`` has the rights of a viewer.
 
     Returns:
         None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
@@ -36,7 +35,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     prepare_output(folder, force=True)
     troubles = []
     for address in addresses(server.url):
-        with closing(MapClient(address, server.token, server.ca, server.certificate)) as client:
+        with closing(MapClient(address, Credentials(server.token, server.ca, server.certificate))) as client:
             try:
                 _read(client, address).save(folder, force=True)
                 return None
@@ -64,9 +63,14 @@ def _read(client: MapClient, server: str) -> Run:
             for suffix, content in (("yaml", client.description(one.number)), ("pgm", client.image(one.number)))
         }
         if all(_fits(one, files, server) for one in served):
-            return Run(
-                trajectories={robot: _nowhere(robot, one) for one in served for robot in one.robots}, map_files=files
-            )
+            poses: tuple[FloatArray, FloatArray] = (
+                frozen(np.empty(0)),
+                frozen(np.empty((0, 3))),
+            )  # they stay in the cloud
+            trajectories = {
+                robot: RobotTrajectory(robot, one.number, *poses, one.floor) for one in served for robot in one.robots
+            }
+            return Run(trajectories=trajectories, map_files=files)
     raise UnavailableError(f"{server}: its maps change all the time")
 
 
@@ -82,8 +86,3 @@ def _fits(served: ServedMap, files: dict[str, bytes], server: str) -> bool:
     except EvaluationError as error:
         raise CloudError(f"{server}: {error}") from error
     return True
-
-
-def _nowhere(robot: str, served: ServedMap) -> RobotTrajectory:
-    """A robot of a map, without its poses: these stay in the cloud."""
-    return RobotTrajectory(robot, served.number, frozen(np.empty(0)), frozen(np.empty((0, 3))), served.floor)

@@ -27,7 +27,9 @@ class Standstill:
     def follow(self, pose: RobotPose) -> None:
         """Take the pose of the next scan, by odometry if there is one."""
         T = pose.T_map_base if pose.T_odom_base is None else pose.T_odom_base
-        if self._reference is None or _has_moved(se2.between(self._reference, T)) or pose.stamp < self._since:
+        moved = None if self._reference is None else se2.between(self._reference, T)
+        has_moved = moved is None or np.hypot(moved[0], moved[1]) > MOVED_M or abs(moved[2]) > MOVED_RAD
+        if has_moved or pose.stamp < self._since:
             self._reference, self._since = T, pose.stamp
             if self._stands:
                 self._stands = False
@@ -35,7 +37,3 @@ class Standstill:
         elif not self._stands and pose.stamp - self._since >= STANDS_AFTER_S:
             self._stands = True
             self._on_stop()
-
-
-def _has_moved(T: FloatArray) -> bool:
-    return bool(np.hypot(T[0], T[1]) > MOVED_M or abs(T[2]) > MOVED_RAD)

@@ -46,8 +46,7 @@ def beams_on_teammates(
         places: of the other robots in that map: x, y and the age of their poses ``since_s`` ago, shape (N, 3), metres
             and seconds.
         since_s: time since then.
-        joint: the joint map.
-        radius_m: of a robot.
+        joint, radius_m: the joint map, and the radius of a robot.
     """
     rays = rays_of(scan.laser, scan.sweep)
     found: NDArray[np.bool_] | None = _on_discs(

@@ -99,12 +99,8 @@ def certify(
 ) -> dict[str, Any]:
     """The certificate of one map, as ``quality.json`` has it; lengths in metres.
 
-    Args:
-        graph: the pose graph of all maps, at its optimized poses.
-        paths: the sessions of the map, at least one keyscan in all; the first one begins its frame.
-        occupancy: the map.
-        bar_m: a cell is good if 95 % of such cells have a smaller error relative to their surroundings.
-        within_m: radius of the surroundings.
+    ``paths`` are the sessions of the map, at least one keyscan in all; the first one begins its frame. A cell is good
+    if 95 % of such cells have a smaller error than ``bar_m`` relative to their surroundings, within ``within_m``.
     """
     places = covariances(graph, paths)
     absolute, relative = places.absolute_m(), places.relative_m(within_m)

@@ -68,11 +68,8 @@ class Changes:
 def compare(maps: Sequence[OccupancyMap], periods: Sequence[Period]) -> Changes:
     """Find the changes from the first of ``maps`` to the last.
 
-    Only cells that are known in both count, and surfaces that moved by more than ``TOLERANCE_M``.
-
-    Args:
-        maps: the map after each of ``periods``, all of one size, 1 or more.
-        periods: the periods.
+    Only cells that are known in both count, and surfaces that moved by more than ``TOLERANCE_M``. The maps are those
+    after each of ``periods``, all of one size, 1 or more.
     """
     then, now = maps[0], maps[-1]
     reach = max(1, round(TOLERANCE_M / now.resolution_m))

@@ -48,8 +48,7 @@ def earth_frame(folder: Path, number: int) -> EarthFrame | None:
 def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
     """A map of a run folder as ``svg`` or ``tif``, or its ``pgm`` and ``yaml`` as ``zip``.
 
-    Returns:
-        None if there is no such map, or if it is to be on the earth and its place there is not known.
+    None if there is no such map, or if it is to be on the earth and its place there is not known.
 
     Raises:
         EvaluationError: the files of the map are broken.
@@ -126,24 +125,12 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     turn = math.radians(frame.x_axis_from_east_deg)
     cos, sin, top = math.cos(turn), math.sin(turn), y + occupancy.cells.shape[0] * side
     # (column, row) of a pixel's upper left corner -> (east, north): rows run against y.
-    affine = (
-        side * cos,
-        side * sin,
-        0.0,
-        cos * x - sin * top,
-        side * sin,
-        -side * cos,
-        0.0,
-        sin * x + cos * top,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
+    affine = np.eye(4)
+    affine[:2] = (
+        (side * cos, side * sin, 0.0, cos * x - sin * top),
+        (side * sin, -side * cos, 0.0, sin * x + cos * top),
     )
+    affine[2, 2] = 0.0
     numbers = (frame.longitude_deg, frame.latitude_deg, 0.0, 0.0, 1.0)
     # Key, tag of its value, number of values, value or index of the value.
     keys = (
@@ -163,7 +150,7 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     )
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     for tag, kind, values in (
-        (_TRANSFORMATION, _DOUBLE, affine),
+        (_TRANSFORMATION, _DOUBLE, tuple(affine.ravel().tolist())),
         (_NUMBERS, _DOUBLE, numbers),
         (_KEYS, _SHORT, sum(keys, ())),
     ):

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label, uniform_filter
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from fcslam.geometry.cell_graph import cell_graph
 from fcslam.records import FloatArray
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
@@ -58,10 +58,8 @@ class Frontier(NamedTuple):
 def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -> list[Frontier]:
     """The frontiers that one of the robots can reach, that with the largest gain first.
 
-    Args:
-        occupancy: the map.
-        robots_xy: where the robots are, shape (R, 2), metres in the frame of the map.
-        radius_m: of a robot; its centre stays this far from occupied cells, and it passes no unknown cell.
+    ``robots_xy`` (R, 2) in metres, in the frame of the map. The centre of a robot stays ``radius_m`` from occupied
+    cells, and it passes no unknown cell.
     """
     free, occupied, side_m, origin = search_grid(occupancy)
     if not free.any():
@@ -107,9 +105,8 @@ class Explorer:
     def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
         """The frontier of each robot that can reach one.
 
-        Args:
-            found: of the map as it is now, with a distance for each of the robots, in their order.
-            robots: where each robot is, metres in the frame of the map.
+        The frontiers are those of the map as it is now, with a distance for each of the robots, in their order;
+        positions in metres, in the frame of the map.
         """
         for robot, at in robots.items():
             goal = self._goals.get(robot)
@@ -192,24 +189,9 @@ def start_cells(
 def path_lengths(passable: Cells, starts: Sequence[tuple[int, int] | None], side_m: float) -> Iterator[FloatArray]:
     """Length of the shortest path from each cell ``starts`` to all cells, shape (H, W) each; infinite without one."""
     numbers = np.cumsum(passable).reshape(passable.shape) - 1
-    graph = _graph(passable, numbers, side_m)
+    graph = cell_graph(passable, side_m, np.ones(passable.shape))
     for start in starts:
         field = np.full(passable.shape, np.inf)
         if start is not None:
             field[passable] = dijkstra(graph, indices=numbers[start])
         yield field
-
-
-def _graph(passable: Cells, numbers: NDArray[np.int64], side_m: float) -> csr_array:
-    """Lengths of the steps between neighbouring passable cells."""
-    starts, ends, lengths = [], [], []
-    height, width = passable.shape
-    for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = slice(0, height - row), slice(max(0, -column), width - max(0, column))
-        there = slice(row, None), slice(max(0, column), width + min(0, column))
-        both = passable[here] & passable[there]
-        starts.append(numbers[here][both])
-        ends.append(numbers[there][both])
-        lengths.append(np.full(len(starts[-1]), side_m * float(np.hypot(row, column))))
-    ways = np.concatenate(starts + ends), np.concatenate(ends + starts)
-    return csr_array((np.concatenate(lengths + lengths), ways), shape=(int(numbers.max(initial=-1)) + 1,) * 2)

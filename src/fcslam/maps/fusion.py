@@ -12,6 +12,7 @@ import numpy as np
 from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast_periods, classify
+from fcslam.maps.joint_tiles import tiled_map
 from fcslam.maps.teammates import RobotPath, without_teammates
 from fcslam.records import FloatArray, Keyscan, LaserModel, MapTile
 from fcslam.runs.map_files import OccupancyMap
@@ -54,12 +55,9 @@ def fuse(
 ) -> OccupancyMap:
     """Compute the occupancy map of keyscans; their order does not matter, their stamps do.
 
-    Args:
-        keyscans: N keyscans of any robots.
-        T_map_base: their poses in ``map``, shape (N, 3), metres and radians.
-        lasers: the lasers that each robot announced.
-        config: the occupancy grid.
-        senders: the robot of each session, if points on other robots are not drawn. None: all are.
+    ``T_map_base`` (N, 3) are the poses of the keyscans in ``map``, in metres and radians; ``lasers`` those that each
+    robot announced. ``senders`` names the robot of each session, if points on other robots are not drawn; None: all
+    are.
 
     Raises:
         ValueError: the numbers of poses and keyscans or of ranges and beams differ, or a pose is not finite.
@@ -110,25 +108,15 @@ def _without_teammates(
 def joined_tiles(tiles: Iterable[MapTile]) -> OccupancyMap:
     """One map, in their frame, of tiles of one resolution, at least one."""
     at = {(tile.row, tile.column): tile for tile in tiles}
-    numbers = np.array(list(at))
-    first, (rows, columns) = numbers.min(axis=0), np.ptp(numbers, axis=0) + 1
-    side, resolution_m = len(next(iter(at.values())).cells), next(iter(at.values())).resolution_m
-    cells = np.zeros((rows * side, columns * side), np.uint8)
-    for number, tile in at.items():
-        row, column = side * (np.array(number) - first)
-        cells[row : row + side, column : column + side] = tile.cells
-    row, column = (float(edge) for edge in first * side * resolution_m)
-    return OccupancyMap(cells, resolution_m, (column, row))
+    return tiled_map({number: tile.cells for number, tile in at.items()}, next(iter(at.values())).resolution_m)
 
 
 def laid_together(maps: Sequence[tuple[OccupancyMap, FloatArray]], maximum_cells: int) -> OccupancyMap:
     """Maps moved as a whole into one frame.
 
-    A cell is occupied if it is in one of the maps, else free if it is in one, so no wall is lost.
-
-    Args:
-        maps: each with its pose in the common frame, shape (3,), metres and radians; at least one.
-        maximum_cells: of the result. Its cells are those of the first map, doubled until they are few enough.
+    A cell is occupied if it is in one of the maps, else free if it is in one, so no wall is lost. Each map has a pose
+    (3,) in the common frame, in metres and radians. Cells are those of the first map, doubled until they are few
+    enough.
     """
     boxes = [_box(occupancy, pose) for occupancy, pose in maps]
     low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)

@@ -143,26 +143,24 @@ class TiledMap:
         tiles = {number: cells for number, cells in {**before, **added}.items() if cells is not None}
         if tiles and np.prod(np.ptp(np.array(list(tiles)), axis=0) + 1.0) * TILE * TILE > LARGEST_GRID:
             raise ValueError(f"a map of more than {LARGEST_GRID} cells")
-        self.frame, self.version, self._resolution_m, self._tiles = (
-            batch.frame,
-            batch.version,
-            batch.resolution_m,
-            tiles,
-        )
+        self.frame, self.version = batch.frame, batch.version
+        self._resolution_m, self._tiles = batch.resolution_m, tiles
 
     def occupancy(self) -> OccupancyMap | None:
         """The map, in whole tiles; None before the first tile."""
-        tiles = self._tiles
-        if not tiles:
-            return None
-        numbers = np.array(list(tiles))
-        first, (rows, columns) = numbers.min(axis=0), np.ptp(numbers, axis=0) + 1
-        cells = np.zeros((rows * TILE, columns * TILE), np.uint8)
-        for number, tile in tiles.items():
-            row, column = TILE * (np.array(number) - first)
-            cells[row : row + TILE, column : column + TILE] = tile
-        row, column = (float(edge) * TILE * self._resolution_m for edge in first)
-        return OccupancyMap(cells, self._resolution_m, (column, row))
+        return tiled_map(self._tiles, self._resolution_m) if self._tiles else None
+
+
+def tiled_map(tiles: Mapping[Number, Cells], resolution_m: float) -> OccupancyMap:
+    """The map of square tiles of one size by number, at least one; tile (0, 0) begins at the origin."""
+    side, numbers = len(next(iter(tiles.values()))), np.array(list(tiles))
+    first, (rows, columns) = numbers.min(axis=0), np.ptp(numbers, axis=0) + 1
+    cells = np.zeros((rows * side, columns * side), np.uint8)
+    for number, tile in tiles.items():
+        row, column = side * (np.array(number) - first)
+        cells[row : row + side, column : column + side] = tile
+    row, column = (float(edge) for edge in first * side * resolution_m)
+    return OccupancyMap(cells, resolution_m, (column, row))
 
 
 def _tiles_of(occupancy: OccupancyMap) -> Iterator[tuple[Number, bytes]]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
+from fcslam.compiled import njit
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, frozen
@@ -44,13 +44,8 @@ def without_teammates(
     """The scans without the points that lie on other robots.
 
     Between two poses of its path, a robot may be anywhere on the line between them. After the last one it stands there.
-
-    Args:
-        scans: N scans with poses in ``map``.
-        stamps: of the scans, shape (N,), seconds of the same clock as the paths.
-        senders: the robot that made each scan, N names.
-        paths: the paths of each robot, one for each of its sessions.
-        config: radius of a robot, and thresholds of free cells.
+    The N scans have poses in ``map``; their stamps are of the same clock as the paths, and ``senders`` names the robot
+    that made each scan. ``paths`` has one for each session of a robot.
     """
     found = [
         suspects
@@ -99,18 +94,14 @@ def _suspects(
         if senders[k] == robot:
             continue
         scan = scans[k]
-        ranges_m = np.asarray(scan.ranges_m, np.float64)
-        reached = (ranges_m > 0.0) & (ranges_m < scan.laser.max_range_m) & (ranges_m > apart_m[k] - radius_m - 1.0)
-        if not reached.any():
-            continue
         origins, directions = rays_of(scan.laser, scan.sweep)
-        returns = origins[reached] + ranges_m[reached, None] * directions[reached]
-        in_map = se2.transform(scan.T_map_base, returns)
-        on_robot = _distance(in_map, begin[k], end[k]) <= radius_m
-        hit = np.flatnonzero(reached)[on_robot]
+        reach_m = scan.laser.max_range_m
+        hit, at = _returns_near(
+            scan.ranges_m, origins, directions, reach_m, scan.T_map_base, begin[k], end[k], radius_m
+        )
         numbers.append(np.full(len(hit), k))
         beams.append(hit)
-        points.append(in_map[on_robot])
+        points.append(at)
     if not sum(map(len, beams)):
         return None
     return _Suspects(robot, np.concatenate(numbers), np.concatenate(beams), np.concatenate(points))
@@ -134,6 +125,27 @@ def _distance(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatAr
     share = np.clip(((points - begin) * along).sum(axis=-1) / length, 0.0, 1.0)
     distance: FloatArray = np.hypot(*np.moveaxis(points - begin - share[..., None] * along, -1, 0))
     return distance
+
+
+@njit
+def _returns_near(ranges_m, origins, directions, reach_m, T_map_base, begin, end, radius_m):  # type: ignore[no-untyped-def]
+    """Beams whose returns lie within ``radius_m`` of the line between two points, and these returns in ``map``."""
+    cos, sin = np.cos(T_map_base[2]), np.sin(T_map_base[2])
+    along_x, along_y = end[0] - begin[0], end[1] - begin[1]
+    length = max(along_x * along_x + along_y * along_y, 1e-12)
+    beams, points = np.empty(len(ranges_m), np.int64), np.empty((len(ranges_m), 2))
+    count = 0
+    for i in range(len(ranges_m)):
+        r = np.float64(ranges_m[i])
+        if not (r > 0.0 and r < reach_m):  # true for NaN
+            continue
+        x, y = origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1]
+        x, y = T_map_base[0] + cos * x - sin * y, T_map_base[1] + sin * x + cos * y
+        share = min(max(((x - begin[0]) * along_x + (y - begin[1]) * along_y) / length, 0.0), 1.0)
+        if np.hypot(x - begin[0] - share * along_x, y - begin[1] - share * along_y) <= radius_m:
+            beams[count], points[count, 0], points[count, 1] = i, x, y
+            count += 1
+    return beams[:count], points[:count]
 
 
 def _drop(scans: list[Casting], suspects: _Suspects, chosen: NDArray[np.bool_]) -> None:

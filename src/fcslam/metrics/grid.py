@@ -71,12 +71,8 @@ class GridAgreement:
 def grid_agreement(grid: LabelledGrid, truth: LabelledGrid, T_truth_map: FloatArray) -> GridAgreement:
     """Compare ``grid`` with ``truth``.
 
-    Grids are not resampled: cell centres are transformed, and free space is looked up at them.
-
-    Args:
-        grid: the map, in its frame ``map``.
-        truth: the true map, in its own frame.
-        T_truth_map: pose of ``map`` in the frame of the truth, shape (3,); NaN if unknown.
+    Grids are not resampled: cell centres are transformed, and free space is looked up at them. ``T_truth_map`` (3,) is
+    the pose of ``map`` in the frame of the truth; NaN if unknown.
     """
     if not np.isfinite(T_truth_map).all():
         return GridAgreement(np.nan, np.nan, np.nan)

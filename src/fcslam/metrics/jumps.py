@@ -44,15 +44,9 @@ class Jumps:
 
 
 def find_jumps(stamps: FloatArray, poses: FloatArray, limits: JumpLimits) -> Jumps | None:
-    """Find the steps of a trajectory that exceed the limits of motion.
+    """The steps of a trajectory that exceed the limits of motion; None without any.
 
-    Args:
-        stamps: shape (N,), seconds; a clock may step back.
-        poses: at the stamps, shape (N, 3), metres and radians.
-        limits: the fastest motion.
-
-    Returns:
-        The jumps; None without any.
+    ``stamps`` (N,) in seconds are of a clock that may step back; ``poses`` (N, 3), metres and radians.
     """
     if len(stamps) < 2:
         return None

@@ -65,11 +65,8 @@ class PoseTable:
     ) -> "PoseTable":
         """Make a table of poses in any order of time (stamps of intel run backwards).
 
-        Args:
-            stamps: shape (M,), seconds.
-            T_map_base: shape (M, 3).
-            robots: number of each pose's robot, shape (M,); None: all of one robot.
-            maps: number of each pose's map, shape (M,); None: all in one map.
+        ``stamps`` (M,) in seconds, poses (M, 3). ``robots`` and ``maps`` are the numbers of each pose's robot and map,
+        shape (M,); None: all of one robot, or in one map.
         """
         stamp_column = np.asarray(stamps, dtype=np.float64)
         order = np.argsort(stamp_column, kind="stable")
@@ -176,11 +173,7 @@ def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
 
 
 def motion_errors(T_true: FloatArray, T_estimated: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Errors of estimated motions (N, 3), metres and radians, against true ones (N, 3).
-
-    Returns:
-        Norm of the translation error in metres and absolute rotation error in degrees, shape (N,) each.
-    """
+    """Errors of estimated motions (N, 3), metres and radians, against true ones: metres and degrees, (N,) each."""
     error = se2.between(T_true, T_estimated)
     return frozen(np.hypot(error[:, 0], error[:, 1])), frozen(np.degrees(np.abs(error[:, 2])))
 

@@ -75,12 +75,7 @@ def recall_at(similarity: FloatArray, truth: PairTruth, k: int) -> FloatArray:
     """Recall@k of every query that has a match, shape (answerable,), in [0, 1].
 
     It is 1 if a match is among the ``k`` most similar places, and a probability in between if ties decide. Queries
-    without a match are excluded.
-
-    Args:
-        similarity: shape (Q, G).
-        truth: ground truth of the pairs.
-        k: number of retrieved places.
+    without a match are excluded. ``similarity``: shape (Q, G).
     """
     return np.array(
         [_found_within(similarity[q], truth, int(q), k) for q in np.flatnonzero(truth.answerable)], np.float64
@@ -180,10 +175,7 @@ def _curve(scores: FloatArray, right: FloatArray, to_find: int) -> PrecisionReca
 def excluding_recent(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDArray[np.bool_]:
     """Mask of the places (columns) that a query (row) may retrieve: those at least ``gap`` before it, shape (N, N).
 
-    A place is always similar to those just before it, so retrieving them is not a loop.
-
-    Args:
-        stamps: shape (N,), ascending; times, or numbers of places.
-        gap: in the unit of the stamps.
+    A place is always similar to those just before it, so retrieving them is not a loop. ``stamps`` (N,) ascend: times,
+    or numbers of places.
     """
     return np.asarray((stamps[:, None] - stamps >= gap) & np.tri(len(stamps), k=-1, dtype=np.bool_))

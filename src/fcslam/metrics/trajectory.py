@@ -62,14 +62,10 @@ def interpolate(stamps: FloatArray, T: FloatArray, wanted: FloatArray, gap_s: fl
 
 
 def align(T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
-    """Align estimated to true positions by least squares (Umeyama 1991, without scale).
+    """``T_truth_map`` (3,) that aligns positions by least squares (Umeyama 1991, without scale).
 
-    Args:
-        T_truth_base: true poses, shape (N, 3).
-        T_map_base: estimated poses at the same stamps, shape (N, 3).
-
-    Returns:
-        ``T_truth_map``, shape (3,); NaN if the robots did not move, because positions then determine no rotation.
+    The true and the estimated poses (N, 3) have the same stamps. NaN if the robots did not move, because positions then
+    determine no rotation.
     """
     return n_point_alignment(T_truth_base[:, :2], T_map_base[:, :2])
 
@@ -77,10 +73,7 @@ def align(T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
 def position_errors(T_truth_map: FloatArray, T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
     """Distances (N,) in metres between true positions and estimated positions after alignment.
 
-    Args:
-        T_truth_map: the alignment, shape (3,).
-        T_truth_base: true poses, shape (N, 3).
-        T_map_base: estimated poses at the same stamps, shape (N, 3).
+    The alignment has shape (3,), the poses at the same stamps (N, 3).
     """
     moved = se2.transform(T_truth_map, T_map_base[:, :2])
     distances: FloatArray = np.linalg.norm(moved - T_truth_base[:, :2], axis=-1)
@@ -118,18 +111,7 @@ def placement_error(a: TrajectoryPair, b: TrajectoryPair) -> tuple[float, float]
 def near_pairs(
     truth: PoseTable, rng: np.random.Generator, across_robots: bool, count: int = 2000, reach_m: float = 5.0
 ) -> NDArray[np.int64]:
-    """Draw up to ``count`` random pairs of rows whose true positions are less than ``reach_m`` apart.
-
-    Args:
-        truth: true poses.
-        rng: random generator.
-        across_robots: whether the pairs are of different robots, or of one robot.
-        count: largest number of pairs.
-        reach_m: largest distance.
-
-    Returns:
-        Shape (P, 2).
-    """
+    """Up to ``count`` random pairs of rows (P, 2) whose true positions are less than ``reach_m`` apart."""
     if not len(truth.stamps):
         return np.empty((0, 2), dtype=np.int64)
     rows: NDArray[np.int64] = rng.integers(0, len(truth.stamps), (_DRAWS_PER_PAIR * count, 2))

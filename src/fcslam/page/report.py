@@ -81,8 +81,7 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
             raise EvaluationError(f"the run has closures that cannot be shown ({error})") from error
     if mission.run_folder is not None:
         texts |= {f"maps/{k}/walls": _json(walls_of(mission.run_folder, k)) for k in zooms}
-    located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
-    if mission.run_folder is not None:
+        located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
         for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):
             texts[path] = read_text(mission.run_folder / unquote(path), mission.run_folder)
         certificate = mission.run_folder / f"{QUALITY}.json"

@@ -4,9 +4,7 @@ import threading
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from fcslam.cloud.sessions import robot_and_epoch
@@ -15,15 +13,6 @@ from fcslam.mission.mission_store import MissionStore
 from fcslam.runs.folder import MISSION, identity, is_run_folder
 from fcslam.service.intake import SessionState
 from fcslam.service.viewed_mission import PacketCounts, viewed_run
-
-
-@dataclass(frozen=True, slots=True)
-class _Opened:
-    """A copy of a mission file."""
-
-    store: MissionStore
-    packets: Mapping[tuple[str, int], int]
-    """How many of each session, by robot and epoch."""
 
 
 class ShownRun:
@@ -35,24 +24,18 @@ class ShownRun:
         Raises:
             StoreError: its mission file is damaged or of another version.
         """
-        self._place, self._name = place, name
+        self.name, self._place = name, place
         self._lock, self._copies = threading.Lock(), ExitStack()
-        self._opened: dict[tuple[int, int] | None, _Opened] = {}
-        """By the identity of the run folder; None: of all run folders without a mission file."""
+        self._opened: dict[tuple[int, int] | None, tuple[MissionStore, Mapping[tuple[str, int], int]]] = {}
+        """A copy of each mission file, and how many packets of each session, by robot and epoch, it holds; by the
+        identity of the run folder. None: of all run folders without a mission file."""
         self._open()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._copies.close()
-
-    @property
-    def name(self) -> str:
-        """Name of the run on the page."""
-        return self._name
 
     @property
     def run_folder(self) -> Path | None:
@@ -62,11 +45,11 @@ class ShownRun:
     @property
     def store(self) -> MissionStore:
         """The run folder's mission file; without packets if it has none."""
-        return self._open().store
+        return self._open()[0]
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch."""
-        folder, packets = self.run_folder, self._open().packets
+        folder, (_, packets) = self.run_folder, self._open()
         mapped = {} if folder is None else viewed_run(folder).trajectories
         known = sorted({*packets, *map(robot_and_epoch, mapped)})
         return [SessionState(*session, packets.get(session, 0)) for session in known if robot in (None, session[0])]
@@ -77,10 +60,10 @@ class ShownRun:
 
     def packet_counts(self) -> PacketCounts:
         """All packets of a finished run took effect."""
-        count = sum(self._open().packets.values())
+        count = sum(self._open()[1].values())
         return PacketCounts(count, count, 0)
 
-    def _open(self) -> _Opened:
+    def _open(self) -> tuple[MissionStore, Mapping[tuple[str, int], int]]:
         """A copy of the mission file of the run folder as it is now."""
         folder = self.run_folder
         mission = folder / MISSION if folder is not None and (folder / MISSION).is_file() else None
@@ -89,5 +72,5 @@ class ShownRun:
             if key not in self._opened:
                 store = self._copies.enter_context(opened_copy(mission))
                 packets = Counter((envelope.robot, envelope.epoch) for envelope in store.envelopes())
-                self._opened[key] = _Opened(store, packets)
+                self._opened[key] = store, packets
             return self._opened[key]

@@ -1,8 +1,8 @@
 """The place index: an inverted index over a dynamic vocabulary that retrieves the places most similar to a query."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import asdict
-from typing import Any, Generic, Self
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from fcslam.features.codes import CODE_WORDS, CodeWords, code_words
 from fcslam.places.kmeans_tree import TreeShape
 from fcslam.places.postings import GROWTH_FACTOR, Postings
-from fcslam.places.query_result import PlaceId, QueryResult, ScoredPlace
 from fcslam.places.scoring import TINY, empty_buffers, score_matches, score_words
 from fcslam.places.similarity import BagOfWords, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray, frozen
 from fcslam.storage.state_file import State
+
+PlaceId = TypeVar("PlaceId")
+
+_NO_ROWS, _NO_SCORES = np.empty(0, np.int32), np.empty(0)
 
 _MOST_LEVELS = 16
 """Depth limit of a tree whose leaves split; no tree reaches it in practice."""
@@ -24,6 +27,67 @@ _MERGED_SHARE = 4
 _ROWS_KEPT = 2
 """Most rows per stored place. Beyond, the index is compacted: rows of forgotten places go."""
 _NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
+
+
+class ScoredPlace(NamedTuple, Generic[PlaceId]):
+    """A stored place and its similarity to the query."""
+
+    id: PlaceId
+    similarity: float
+    """In [0, 1], by the measure that ``VocabularyConfig.scoring`` names."""
+
+
+class QueryResult(Generic[PlaceId]):
+    """Similarities of the stored places to one query. Valid until the index changes."""
+
+    def __init__(
+        self,
+        ids: Sequence[PlaceId] = (),
+        rows: NDArray[np.int32] = _NO_ROWS,
+        scores: FloatArray = _NO_SCORES,
+    ) -> None:
+        """Wrap the scores of a query.
+
+        Args:
+            ids: identifiers by row of the index.
+            rows: shape (K,), rows that share a word or a descriptor with the query.
+            scores: shape (K,), their similarities in [0, 1].
+        """
+        self._ids, self._rows, self._scores = ids, rows, scores
+        self._by_place: dict[PlaceId, float] | None = None
+
+    def similarity_of(self, place: PlaceId, default: float = 0.0) -> float:
+        """Similarity of one place; ``default`` if it has nothing in common with the query."""
+        if self._by_place is None:
+            ids = (self._ids[row] for row in self._rows)
+            self._by_place = dict(zip(ids, self._scores.tolist(), strict=True))
+        return self._by_place.get(place, default)
+
+    def best(self, top_k: int, wanted: Callable[[PlaceId], bool] = lambda _: True) -> list[ScoredPlace[PlaceId]]:
+        """Return up to ``top_k`` places for which ``wanted`` holds, the most similar first.
+
+        Ties are broken by the order of storage. A place that has nothing in common with the query is never returned.
+        """
+        found: list[ScoredPlace[PlaceId]] = []
+        looked_at, count = 0, 2 * top_k + 16
+        while looked_at < len(self._rows) and len(found) < top_k:
+            order = self._order(count)
+            for position in order[looked_at:]:
+                place = self._ids[self._rows[position]]
+                if wanted(place):
+                    found.append(ScoredPlace(place, float(self._scores[position])))
+                    if len(found) == top_k:
+                        break
+            looked_at, count = len(order), 4 * count
+        return found
+
+    def _order(self, count: int) -> NDArray[np.int64]:
+        """At least the first ``count`` positions in ``rows``, by descending score, then by row."""
+        if count >= len(self._rows):
+            return np.lexsort((self._rows, -self._scores))
+        least = np.partition(self._scores, len(self._scores) - count)[len(self._scores) - count]
+        chosen = np.flatnonzero(self._scores >= least)
+        return chosen[np.lexsort((self._rows[chosen], -self._scores[chosen]))]
 
 
 class PlaceIndex(Generic[PlaceId]):
@@ -167,11 +231,8 @@ class PlaceIndex(Generic[PlaceId]):
     ) -> Self:
         """Restore an index from its ``state``; it behaves exactly like the original.
 
-        Args:
-            config: that of the original.
-            state: of the original.
-            ids: the stored places, in the order in which they were added.
-            descriptors: of each place, shape (N, 32).
+        ``ids`` are those of the stored places, in the order in which they were added; the descriptors of each have
+        shape (N, 32).
         """
         index = cls(config, np.random.default_rng(0))
         index._training = Training(**state["training"]) if state["training"] else None

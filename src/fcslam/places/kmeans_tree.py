@@ -64,13 +64,10 @@ def find_leaves(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
 
 @njit
 def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
-    """Find at most ``beam`` leaves near each code (K, 4) by beam search; the first is that of ``find_leaves``.
+    """At most ``beam`` leaves near each code (K, 4), shape (K, beam), -1 after the last; first that of ``find_leaves``.
 
     Each level keeps the ``beam`` nearest vertices, and always the one on the path of ``find_leaves``. All codes descend
     together, one level at a time, so that their cache misses overlap.
-
-    Returns:
-        Shape (K, beam), -1 after the last leaf.
     """
     kept, distances = np.full((codes.shape[0], beam), -1, np.int32), np.zeros((codes.shape[0], beam), np.int32)
     above, reached = np.empty(beam, np.int32), np.empty(beam, np.int32)
@@ -159,15 +156,10 @@ def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
 
 @njit
 def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
-    """Cluster codes (N, 4) by Hamming distance.
+    """Cluster codes (N, 4) by Hamming distance: centres (C, 4), none without members, and the cluster of each, (N,).
 
-    Args:
-        codes: shape (N, 4).
-        shape: ``branching`` clusters at most, ``iterations`` rounds at most.
-        state: shape (1,), state of the random generator; it is advanced.
-
-    Returns:
-        Centres (C, 4), none without members, and the cluster of every code, shape (N,).
+    There are ``shape.branching`` clusters at most, after ``shape.iterations`` rounds at most. The ``state`` (1,) of the
+    random generator is advanced.
     """
     centres = _seed_centres(codes, shape.branching, state)
     labels = np.full(codes.shape[0], -1, np.int64)

@@ -18,12 +18,11 @@ from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig
-from fcslam.places.index import PlaceIndex
+from fcslam.places.index import PlaceIndex, QueryResult
 from fcslam.places.motions import Motion, propose_motions
-from fcslam.places.query_result import QueryResult
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, ReasonCode, Tag, frozen
+from fcslam.records import Channel, ClosureStatus, FloatArray, KeyscanId, LoopClosure, Place, Reason, ReasonCode, frozen
 from fcslam.storage.state_file import State
 
 START_SHARE = 1.0 / 3.0
@@ -97,30 +96,22 @@ class MatcherConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class PlaceMatch:
-    """The comparison of a stored place i with the new place j."""
+class PlaceMatch(LoopClosure):
+    """The comparison of a stored place i with the new place j: verified if they match, else a candidate.
 
-    i: KeyscanId
-    j: KeyscanId
-    channel: Channel
-    similarity: float
-    """In [0, 1], by the place index; before the first vocabulary, the share of matching descriptors if it is known."""
-    M: bool
-    """The matching flag M_ij of FC-SLAM: whether both are the same place."""
-    reason: Reason
-    """Why it is no match, or what the match lacks."""
-    T_i_j: FloatArray
-    """Shape (3,), metres and radians."""
-    information: FloatArray
-    """Shape (3, 3), as of ``Verification``; all zero if no geometry measured ``T_i_j``."""
-    informative: bool
-    """Whether geometry fixes the pose in every direction."""
-    explained: float
+    Before the first vocabulary, ``similarity`` is the share of matching descriptors if it is known. ``information`` is
+    that of ``Verification``, or zero if no geometry measured ``T_i_j``.
+    """
+
+    explained: float = 0.0
     """Share of the points in known area that lie on a surface, of the worse direction."""
-    predicted: bool
+    predicted: bool = False
     """Whether the robots were in one map already and it predicted this pair."""
-    tag: Tag | None = None
-    """The tag that both saw, of channel ``tag``."""
+
+    @property
+    def M(self) -> bool:
+        """The matching flag M_ij of FC-SLAM: whether both are the same place."""
+        return self.status is ClosureStatus.VERIFIED
 
     @classmethod
     def verified(
@@ -132,10 +123,10 @@ class PlaceMatch:
             j,
             channel,
             similarity,
-            M=check.loose if predicted else check.strict,
+            T_i_j=frozen(check.T_a_b),
+            information=frozen(check.information),
+            status=_status(check.loose if predicted else check.strict),
             reason=(check.loose_reason if predicted else check.reason).under("verification"),
-            T_i_j=check.T_a_b,
-            information=check.information,
             informative=check.informative,
             explained=check.worse.explained,
             predicted=predicted,
@@ -150,14 +141,16 @@ class PlaceMatch:
             j,
             channel,
             similarity,
-            M=score >= delta,
-            reason=Reason(ReasonCode.SIMILAR, score, delta, "delta"),
             T_i_j=frozen(np.zeros(3)),
             information=frozen(np.zeros((3, 3))),
+            status=_status(score >= delta),
+            reason=Reason(ReasonCode.SIMILAR, score, delta, "delta"),
             informative=False,
-            explained=0.0,
-            predicted=False,
         )
+
+
+def _status(matches: bool) -> ClosureStatus:
+    return ClosureStatus.VERIFIED if matches else ClosureStatus.CANDIDATE
 
 
 class _Comparison(NamedTuple):
@@ -223,11 +216,9 @@ class PlaceMatcher:
     ) -> list[PlaceMatch]:
         """Compare a new place with the stored places that may be the same, then store it.
 
-        Args:
-            place: the new place, j.
-            predicted: T_i_j, shape (3,), of the stored places i that the joint map predicts to be near; forgotten
-                places are ignored.
-            is_unaligned: whether a stored place belongs to a robot in another map, whose relative pose is unknown.
+        ``predicted`` has T_i_j (3,) of the stored places i that the joint map predicts to be near; forgotten places are
+        ignored. ``is_unaligned`` says whether a stored place belongs to a robot in another map, whose relative pose is
+        unknown.
         """
         comparable = bool(predicted) or any(is_unaligned(i) for i in self._places)
         result = self._query(place) if comparable else QueryResult[KeyscanId]()  # Algorithm 1, lines 11-13
@@ -243,9 +234,8 @@ class PlaceMatcher:
     def match_at(self, place: Place, expected: Mapping[KeyscanId, FloatArray]) -> list[PlaceMatch]:
         """The stored places that a new place overlaps about where known starts of their robots put it.
 
-        Args:
-            place: the new place, j, which is not stored here.
-            expected: T_i_j, shape (3,), of the stored places i; forgotten places are ignored.
+        ``place`` is j, which is not stored here; ``expected`` has T_i_j (3,) of the stored places i; forgotten places
+        are ignored.
         """
         kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
         pairs = [self._pair(self._places[i], place, T_i_j, NO_PRIOR) for i, T_i_j in kept]

@@ -1,5 +1,6 @@
-"""Planar motions between two places from their matching keypoints, each with its information matrix.
+"""Planar motions between two places that many of their keypoint matches support (two-point RANSAC, all pairs tried).
 
+A hypothesis is a proposal: its inlier count says little about whether it is true. ``lidar.verification`` decides.
 LiDAR keypoints are points in the plane. Keypoints of images also have a height. Robots drive on one floor, so matching
 keypoints must have the same height, and the motion is planar as well.
 """
@@ -8,12 +9,27 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.geometry import se2
-from fcslam.places.hypotheses import Hypothesis, rigid_hypotheses
-from fcslam.records import Channel, FloatArray, Place
+from fcslam.records import Channel, FloatArray, Place, frozen
 
+_REFINEMENTS = 5
+"""Most rounds of least squares and inlier selection. The inliers nearly always stop changing after two or three."""
+SEEDS = 50
+"""Closest matches that seed the search: every two of them propose a motion."""
+INLIER_M = 0.3
+"""Largest distance between the matched keypoints of an inlier, metres."""
+MINIMUM_INLIERS = 4
+"""Fewest inliers of a motion hypothesis."""
+MOST_HYPOTHESES = 2
+"""Most motion hypotheses of a pair of places."""
+DISTINCT_M = 1.0
+"""Distance of two motion hypotheses, in metres, from which on they are distinct."""
+DISTINCT_RAD = 0.26
+"""Angle between two motion hypotheses, in radians, from which on they are distinct."""
 INDEPENDENT_KEYPOINTS: Final = 10
 """Most independent keypoints of one image. The errors of its keypoints are correlated, because they share one scan and
 one robot pose, so more keypoints do not add information."""
@@ -25,6 +41,156 @@ LARGEST_LEVEL_M = 0.1
 """Largest difference in height of two matching image keypoints, metres."""
 KEYPOINT_SIGMA_M = 0.1
 """Standard deviation of the position of an image keypoint, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A rigid motion and its inliers."""
+
+    T_a_b: FloatArray
+    """Shape (3,): x, y in metres and theta in radians; takes coordinates of place b to place a."""
+    inliers: NDArray[np.int64]
+    """Shape (K,): rows of ``matches.pairs``, ascending."""
+
+    @property
+    def inlier_count(self) -> int:
+        """Number of inliers."""
+        return len(self.inliers)
+
+
+def rigid_hypotheses(
+    keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches
+) -> list[Hypothesis]:
+    """The motions that most matches of keypoints (N, 2) and (M, 2) support, the best first.
+
+    Every two of the ``SEEDS`` closest matches propose a motion (two-point alignment). All matches score it, and least
+    squares over the inliers refines the best. The search is deterministic and never proposes a reflection. There are at
+    most ``MOST_HYPOTHESES``, and none without ``MINIMUM_INLIERS``. Keypoints are in metres in their place's coordinate
+    frame.
+    """
+    if len(matches.pairs) < MINIMUM_INLIERS:
+        return []
+    a = keypoints_a[matches.pairs[:, 0]].astype(np.float64)
+    b = keypoints_b[matches.pairs[:, 1]].astype(np.float64)
+    seeds = np.argsort(matches.distances, kind="stable")[:SEEDS]
+    poses, agreeing = _best(a, b, _trials(a, b, seeds))
+    return [
+        Hypothesis(frozen(pose), frozen(np.flatnonzero(agrees), np.int64))
+        for pose, agrees in zip(poses, agreeing, strict=True)
+    ]
+
+
+@njit
+def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64]) -> FloatArray:
+    """Motions of every two seeds whose keypoints are equally far apart in both places: rows x, y, theta, score.
+
+    Pairs of keypoints closer than twice ``INLIER_M`` are skipped, because they do not determine the angle.
+    """
+    trials = np.empty((seeds.shape[0] * (seeds.shape[0] - 1) // 2, 4))
+    count = 0
+    for p in range(1, seeds.shape[0]):
+        for q in range(p):
+            i, j = seeds[p], seeds[q]
+            ax, ay = a[j, 0] - a[i, 0], a[j, 1] - a[i, 1]
+            bx, by = b[j, 0] - b[i, 0], b[j, 1] - b[i, 1]
+            length_a, length_b = np.hypot(ax, ay), np.hypot(bx, by)
+            if min(length_a, length_b) < 2.0 * INLIER_M or abs(length_a - length_b) > INLIER_M:
+                continue
+            cos = (bx * ax + by * ay) / (length_a * length_b)
+            sin = (bx * ay - by * ax) / (length_a * length_b)
+            middle_x, middle_y = 0.5 * (b[i, 0] + b[j, 0]), 0.5 * (b[i, 1] + b[j, 1])
+            x = 0.5 * (a[i, 0] + a[j, 0]) - (cos * middle_x - sin * middle_y)
+            y = 0.5 * (a[i, 1] + a[j, 1]) - (sin * middle_x + cos * middle_y)
+            trials[count, 0], trials[count, 1], trials[count, 2] = x, y, np.arctan2(sin, cos)
+            trials[count, 3] = _score(a, b, (x, y, cos, sin))
+            count += 1
+    return trials[:count]
+
+
+@njit
+def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, float]) -> float:
+    """Sum over the inliers of 1 - (distance / ``INLIER_M``)^2 (MSAC): smaller residuals break ties of their count."""
+    x, y, cos, sin = motion
+    score = 0.0
+    scale = 1.0 / INLIER_M**2
+    for k in range(a.shape[0]):
+        dx = x + cos * b[k, 0] - sin * b[k, 1] - a[k, 0]
+        dy = y + sin * b[k, 0] + cos * b[k, 1] - a[k, 1]
+        score += max(0.0, 1.0 - scale * (dx * dx + dy * dy))
+    return score
+
+
+@njit
+def _best(a: FloatArray, b: FloatArray, trials: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Refine the best trials one after another and suppress trials near a hypothesis that was found before."""
+    scores = trials[:, 3].copy()
+    poses = np.empty((MOST_HYPOTHESES, 3))
+    agreeing = np.empty((MOST_HYPOTHESES, a.shape[0]), np.bool_)
+    found = 0
+    while found < MOST_HYPOTHESES and scores.shape[0]:
+        best = np.argmax(scores)
+        if scores[best] <= 0.0:
+            break
+        pose, agrees = _refine(a, b, trials[best, :3])
+        scores[best] = 0.0
+        if agrees.sum() < MINIMUM_INLIERS or _near(pose, poses[:found]):
+            continue
+        poses[found], agreeing[found] = pose, agrees
+        found += 1
+        for index in range(scores.shape[0]):
+            if _near(trials[index], pose.reshape(1, 3)):
+                scores[index] = 0.0
+    return poses[:found], agreeing[:found]
+
+
+@njit
+def _near(pose: FloatArray, others: FloatArray) -> bool:
+    for index in range(others.shape[0]):
+        turn = abs(pose[2] - others[index, 2])
+        turn = min(turn, 2.0 * np.pi - turn)
+        if np.hypot(pose[0] - others[index, 0], pose[1] - others[index, 1]) <= DISTINCT_M and turn <= DISTINCT_RAD:
+            return True
+    return False
+
+
+@njit
+def _refine(a: FloatArray, b: FloatArray, pose: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    agrees = _agreeing(a, b, pose)
+    for _ in range(_REFINEMENTS):
+        refined = _least_squares(a, b, agrees)
+        now = _agreeing(a, b, refined)
+        if now.sum() < agrees.sum():
+            break
+        unchanged = (now == agrees).all()
+        pose, agrees = refined, now
+        if unchanged:
+            break
+    return pose, agrees
+
+
+@njit
+def _agreeing(a: FloatArray, b: FloatArray, pose: FloatArray) -> NDArray[np.bool_]:
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    dx = pose[0] + cos * b[:, 0] - sin * b[:, 1] - a[:, 0]
+    dy = pose[1] + sin * b[:, 0] + cos * b[:, 1] - a[:, 1]
+    agrees: NDArray[np.bool_] = dx * dx + dy * dy <= INLIER_M * INLIER_M
+    return agrees
+
+
+@njit
+def _least_squares(a: FloatArray, b: FloatArray, agrees: NDArray[np.bool_]) -> FloatArray:
+    """The rigid motion with the least squared distances, from the centred sums of products."""
+    n = agrees.sum()
+    ax, ay = (a[:, 0] * agrees).sum() / n, (a[:, 1] * agrees).sum() / n
+    bx, by = (b[:, 0] * agrees).sum() / n, (b[:, 1] * agrees).sum() / n
+    dot = cross = 0.0
+    for k in range(a.shape[0]):
+        if agrees[k]:
+            dot += (a[k, 0] - ax) * (b[k, 0] - bx) + (a[k, 1] - ay) * (b[k, 1] - by)
+            cross += (b[k, 0] - bx) * (a[k, 1] - ay) - (b[k, 1] - by) * (a[k, 0] - ax)
+    theta = np.arctan2(cross, dot)
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.array([ax - (cos * bx - sin * by), ay - (sin * bx + cos * by), theta])
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,21 +209,19 @@ class Motion:
 def propose_motions(a: Place, b: Place) -> list[Motion]:
     """Find the motions that enough matching keypoints support, the best first.
 
-    Args:
-        a, b: two places with descriptors of the same detector version.
+    Both places have descriptors of the same detector version.
     """
     matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     if a.channel is Channel.CAMERA:
-        matches = _level(a, b, matches)
+        matches = level_matches(a.keypoints, b.keypoints, matches)
     proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
     return [Motion(h.T_a_b, _information(b, h, matches), share) for h in proposed if h.inlier_count >= LEAST_INLIERS]
 
 
-def _level(a: Place, b: Place, matches: Matches) -> Matches:
-    """Keep the matches whose keypoints have the same height to within ``LARGEST_LEVEL_M``."""
-    heights_a, heights_b = a.keypoints[matches.pairs[:, 0], 2], b.keypoints[matches.pairs[:, 1], 2]
-    level = np.abs(heights_a - heights_b) <= LARGEST_LEVEL_M
+def level_matches(a: NDArray[np.floating], b: NDArray[np.floating], matches: Matches) -> Matches:
+    """The matches of keypoints (N, 3) and (M, 3) that have the same height to within ``LARGEST_LEVEL_M``."""
+    level = np.abs(a[matches.pairs[:, 0], 2] - b[matches.pairs[:, 1], 2]) <= LARGEST_LEVEL_M
     return Matches(matches.pairs[level], matches.distances[level])
 
 

@@ -29,10 +29,8 @@ class BagOfWords:
 def bag_of_words(words: NDArray[np.int64], idf: FloatArray, vocabulary_version: int) -> BagOfWords:
     """Compute the tf-idf vector of a place.
 
-    Args:
-        words: shape (N,), the word of every descriptor.
-        idf: shape (word_count,), inverse document frequency of every word of the vocabulary.
-        vocabulary_version: version of the vocabulary that the words belong to.
+    ``words`` (N,) are those of every descriptor, ``idf`` the inverse document frequency of every word of the
+    vocabulary.
     """
     present, counts = np.unique(words, return_counts=True)
     weights = counts * idf[present]

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import InputError, OutputError
+from fcslam.errors import InputError, OutputError, writing
 from fcslam.features.codes import code_words, nearest_codes
 from fcslam.places.kmeans_tree import TreeShape, k_means
 from fcslam.records import CODE_BYTES, NAME, PLACE_CHANNELS, Channel, Codes, frozen
@@ -90,10 +90,8 @@ def write_vocabularies(vocabularies: Sequence[WordVocabulary], path: Path) -> No
         arrays[f"{vocabulary.channel}.version"] = np.frombuffer(vocabulary.detector_version.encode("ascii"), np.uint8)
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
-    try:
+    with writing(path, "make room or choose another place"):
         write_file(path, content.getvalue())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
 
 
 def _check_replaceable(path: Path) -> None:

@@ -4,11 +4,10 @@ from collections.abc import Collection
 
 import numpy as np
 
-from fcslam.features.birdseye import BIRDSEYE, BirdseyeFeatures, describe
+from fcslam.features.birdseye import BirdseyeFeatures, describe
 from fcslam.features.codes import mutual_matches
-from fcslam.places.hypotheses import rigid_hypotheses
 from fcslam.places.index import PlaceIndex
-from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS
+from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS, rigid_hypotheses
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
 
@@ -27,7 +26,7 @@ class OwnPlaces:
 
     def store(self, keyscan: int, surface: FloatArray) -> None:
         """Describe and store a submap by the points of its surfaces, shape (N, 2), metres in its anchor's base."""
-        self._features[keyscan] = describe(surface, BIRDSEYE)
+        self._features[keyscan] = describe(surface)
         self._backlog.append(keyscan)
 
     def features(self, keyscan: int) -> BirdseyeFeatures:

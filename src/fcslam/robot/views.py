@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.classical import OrbConfig
+from fcslam.features.classical import OrbConfig, make_detector
 from fcslam.features.detector import GreyImage, OnnxConfig, decode_grey
 from fcslam.features.detector_file import open_detector_file
 from fcslam.features.detector_kinds import DetectorKind
-from fcslam.features.factory import make_detector
 from fcslam.features.lidar_depth import LidarView, locate_among
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose

@@ -48,10 +48,8 @@ def parse_address(text: str) -> RosAddress:
     return RosAddress(match[1], namespace)
 
 
-def open_network(
-    address: RosAddress, domain: int | None = None, environment: Mapping[str, str] = os.environ
-) -> RosNetwork:
-    """Join the network of ``address``; ``domain``, of ROS 2, is by default ROS_DOMAIN_ID, or 0.
+def open_network(address: RosAddress, environment: Mapping[str, str] = os.environ) -> RosNetwork:
+    """Join the network of ``address``; the domain of ROS 2 is ROS_DOMAIN_ID, or 0.
 
     Raises:
         NetworkError: the domain is out of range, the middleware is missing, or the network cannot be joined.
@@ -60,7 +58,7 @@ def open_network(
         from fcslam.ros.ros1 import Ros1Network
 
         return Ros1Network()
-    text = environment.get("ROS_DOMAIN_ID") or "0" if domain is None else str(domain)
+    text = environment.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
         raise NetworkError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")
     if address.network == "zenoh":

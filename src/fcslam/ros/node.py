@@ -7,12 +7,13 @@ publishes the map, the path and diagnostics, and a fourth one obeys commands. So
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,21 +22,22 @@ from fcslam.errors import FcslamError, NetworkError
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
 from fcslam.ros.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
-from fcslam.ros.outputs import MAP, OWN_MAP, POSE, OutputNames, Outputs, nanoseconds
+from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors, Notify
 from fcslam.ros.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
 from fcslam.ros.transform_stream import TransformStream
-from fcslam.runs import RobotTrajectory
-from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
+from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.transforms import planar, transform_of
+from fcslam.sources.bags.transforms import last_part, planar, transform_of
 from fcslam.storage.files import write_file
 
 if TYPE_CHECKING:
     from fcslam.live.fleet_view import FleetView
+    from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotPose
+    from fcslam.live.robot import Robot
 
 STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
 SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
@@ -54,34 +56,6 @@ _SILENCE_S = 2.0
 _DEPTHS = {**dict.fromkeys((*SCANS, COMPRESSED_IMAGE, IMAGE), 10), **dict.fromkeys(LASER_SCANS, 100), CAMERA_INFO: 1}
 _DEPTH = 1000
 """Messages that the middleware keeps for this process; of odometry and tf there are many."""
-
-
-class LiveRobot(Protocol):
-    """The robot that maps; ``fcslam.Robot`` is one."""
-
-    name: str
-
-    def add(self, record: SensorRecord) -> "RobotPose | None":
-        """The next record; returns the pose of a scan."""
-
-    @property
-    def fleet(self) -> "FleetView | None":
-        """What the robot knows of its fleet; None without a server."""
-
-    def map(self) -> OccupancyMap:
-        """The map now: with a fleet, that of all its robots."""
-
-    def joint_map(self) -> OccupancyMap | None:
-        """The map of the fleet; None before there is one, and without a fleet."""
-
-    def own_map(self) -> OccupancyMap:
-        """The map of what this robot saw."""
-
-    def trajectory(self) -> RobotTrajectory:
-        """The poses of all scans now."""
-
-    def closures(self) -> FloatArray:
-        """Both ends of each closure, shape (N, 2, 2), metres in ``map``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +97,7 @@ class RobotNode:
         namespace: str,
         topics: SensorTopics,
         options: BagOptions,
-        robot: LiveRobot,
+        robot: "Robot | LocalizedRobot",
         parameters: NodeParameters,
         notify: Notify,
         suggest_pose: Callable[[FloatArray], None] | None = None,
@@ -138,6 +112,7 @@ class RobotNode:
             NetworkError: another node publishes what this one would.
         """
         self._network, self._namespace, self._topics = network, namespace, topics
+        self._map_topic = resolved(namespace, MAP)
         self._robot, self._parameters, self._notify = robot, parameters, notify
         self._suggest_pose, self._change_floor = suggest_pose, change_floor
         self._codec = MessageCodec(network.ros1)
@@ -150,9 +125,12 @@ class RobotNode:
         self._state: tuple[bool, float] | None = None
         """Whether the robot knows its pose in the map, and since which stamp."""
         self._clock = RosClock(parameters.use_sim_time)
-        self._refuse_namesake()
-        names = OutputNames(map_frame=parameters.map_frame, tf=topics.transforms[0])
-        self._outputs = Outputs(network, namespace, names)
+        if self._has_namesake(network.endpoints()):
+            raise NetworkError(
+                f"another node publishes {self._map_topic}: a second robot of this name, or a map_server; stop it, or "
+                "give each robot a namespace of its own"
+            )
+        self._outputs = Outputs(network, namespace, parameters.map_frame, topics.transforms[0])
         self._transforms = TransformStream(
             nanoseconds(parameters.transform_bound), nanoseconds(parameters.transform_timeout)
         )
@@ -178,7 +156,9 @@ class RobotNode:
         is_silent = False
         try:
             while not self._stop.is_set():
-                message = self._next()
+                message: _Message | None = None
+                with suppress(queue.Empty):
+                    message = self._inbox.get(timeout=_POLL_S)
                 now_s = time.monotonic()
                 before = self.scans
                 records = (
@@ -277,12 +257,6 @@ class RobotNode:
             goal = np.array((*point, np.arctan2(*(point - own[:2])[::-1])))
         self._outputs.frontiers(now_ns, free, taken, goal)
 
-    def _next(self) -> _Message | None:
-        try:
-            return self._inbox.get(timeout=_POLL_S)
-        except queue.Empty:
-            return None
-
     def _map(self, record: SensorRecord) -> None:
         pose = self._robot.add(record)
         if self.sensors.restarts != self._restarts:
@@ -353,9 +327,9 @@ class RobotNode:
         for topic, kind in self._topics.kinds.items():
             # Ask for reliable messages where all publishers offer them: then none is lost.
             reliable = all(point.quality.reliable for point in offered if point.topic == topic)
-            latched = topic.rsplit("/", 1)[-1] == TF_STATIC
+            latched = last_part(topic) == TF_STATIC
             quality = Quality(reliable or latched, latched, _DEPTHS.get(kind, _DEPTH))
-            self._network.subscribe(topic, kind, quality, self._deliver(topic))
+            self._network.subscribe(topic, kind, quality, partial(self._deliver, topic))
         commands: list[tuple[str, str, Callable[[bytes], object]]] = [
             (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
             (FINISH, EMPTY, lambda _: self.stop()),
@@ -371,15 +345,12 @@ class RobotNode:
                 CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
             )
 
-    def _deliver(self, topic: str) -> Callable[[bytes], None]:
-        def deliver(payload: bytes) -> None:
-            if self._inbox.qsize() < _LONGEST_INBOX:
-                self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
-                return
-            self._lost_messages += 1
-            self._tell_once("messages come faster than this computer can map; some are lost")
-
-        return deliver
+    def _deliver(self, topic: str, payload: bytes) -> None:
+        if self._inbox.qsize() < _LONGEST_INBOX:
+            self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
+            return
+        self._lost_messages += 1
+        self._tell_once("messages come faster than this computer can map; some are lost")
 
     def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
         """Obey a command later."""
@@ -448,27 +419,19 @@ class RobotNode:
         except (ValueError, FcslamError) as error:  # anybody on the network may send it
             self._tell_once(f"a floor is refused: {one_line(str(error))}")
 
-    def _refuse_namesake(self) -> None:
-        taken = resolved(self._namespace, MAP)
-        if any(point.publishes and not point.own and point.topic == taken for point in self._network.endpoints()):
-            raise NetworkError(
-                f"another node publishes {taken}: a second robot of this name, or a map_server; stop it, or give each "
-                "robot a namespace of its own"
-            )
+    def _has_namesake(self, endpoints: Sequence[Endpoint]) -> bool:
+        return any(point.publishes and not point.own and point.topic == self._map_topic for point in endpoints)
 
     def watch_network(self) -> None:
         """Tell once which peers get nothing, and whether another robot has this name."""
         endpoints = self._network.endpoints()
         own = [point for point in endpoints if point.own]
         for point in endpoints:
-            if point.own:
-                continue
-            for mine in own:
+            for mine in () if point.own else own:
                 if mine.topic == point.topic:
                     self._tell_once(_mismatch(mine, point))
-        taken = resolved(self._namespace, MAP)
-        if any(point.publishes and not point.own and point.topic == taken for point in endpoints):
-            self._tell_once(f"another node publishes {taken} now, too; give each robot a name of its own")
+        if self._has_namesake(endpoints):
+            self._tell_once(f"another node publishes {self._map_topic} now, too; give each robot a name of its own")
 
     def _tell_once(self, line: str) -> None:
         if line and line not in self._told and len(self._told) < _LINES_TOLD:

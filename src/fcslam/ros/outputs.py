@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray
 from fcslam.ros.network import Publish, Quality, RosNetwork
 from fcslam.ros.topics import resolved
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
+from fcslam.runs.map_files import OccupancyMap
 from fcslam.sources.bags.codec import GRID_UPDATE, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
@@ -30,18 +30,22 @@ POSES, POSE_STAMPED = "geometry_msgs/PoseArray", "geometry_msgs/PoseStamped"
 
 MAP: Final = "map"
 """Topic of the map in the robot's namespace."""
+UPDATES: Final = "_updates"
+"""Ends the topic of the parts of a map that changed."""
 OWN_MAP: Final = "own_map"
 """Topic of what a robot of a fleet saw itself."""
 FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
 FLEET_FRONTIERS, FLEET_GOAL = "fleet/frontiers", "fleet/goal"
 FLEET_QUALITY = "fleet/quality"
+DIAGNOSTICS_TOPIC: Final = "/diagnostics"
 MOST_TEAMMATES: Final = 64
 """Robots with a topic of their own; the others are in ``fleet/poses`` only."""
 LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
 STREAMED: Final = Quality(reliable=True, depth=10)
 TRANSFORMED: Final = Quality(reliable=True, depth=100)
 
-GRID_VALUES: Final = {Occupancy.UNKNOWN: -1, Occupancy.FREE: 0, Occupancy.OCCUPIED: 100}
+_GRID_VALUES: Final = np.array([-1, 0, 100], np.int8)
+"""Values of ROS by ``Occupancy``."""
 SMALL_MAP_CELLS: Final = 1_000_000
 """Largest number of cells of a map that is published whole at every change."""
 PATH_STEP_M: Final = 0.1
@@ -52,15 +56,6 @@ LINE_WIDTH_M: Final = 0.05
 _OK, _WARN = 0, 1
 SPHERE_M: Final = 0.3
 _LINE_LIST, _SPHERE_LIST, _ADD = 5, 7, 0
-
-
-@dataclass(frozen=True, slots=True)
-class OutputNames:
-    """Topics and frames of what a robot publishes; topics without a leading slash are in its namespace."""
-
-    map_frame: str = "map"
-    tf: str = "/tf"
-    diagnostics: str = "/diagnostics"
 
 
 class Grid(NamedTuple):
@@ -82,44 +77,40 @@ class Region(NamedTuple):
 
 
 @dataclass(slots=True)
-class _GridTopic:
-    """A map and the updates of it."""
+class _Shown:
+    """What subscribers of a map have."""
 
-    publish: Publish
-    update: Publish
     whole: Grid | None = None
     """The newest map that was published whole."""
     newest: Grid | None = None
-    """The newest map that subscribers have."""
+    """The newest map, with its updates."""
 
 
 class Outputs:
     """The publishers of one robot. Any thread may call."""
 
-    def __init__(self, network: RosNetwork, namespace: str, names: OutputNames) -> None:
-        def publisher(name: str, kind: str, quality: Quality) -> Publish:
-            return network.publisher(resolved(namespace, name), kind, quality)
-
+    def __init__(self, network: RosNetwork, namespace: str, map_frame: str, tf: str) -> None:
+        """``tf``: topic of the transforms; those without a leading slash are in the namespace."""
+        self._network, self._namespace, self._map_frame, self._tf = network, namespace, map_frame, tf
         self._codec = MessageCodec(network.ros1)
-        self._names = names
         self._lock = threading.Lock()
-        self._publisher = publisher
-        self._grids: dict[str, _GridTopic] = {}
-        self._teammates: dict[str, Publish] = {}
-        self._fleet: tuple[Publish, Publish] | None = None
-        self._exploration: tuple[Publish, Publish] | None = None
+        self._publishers: dict[str, Publish] = {}
+        """By topic; new ones are made under the lock."""
+        self._maps: dict[str, _Shown] = {}
+        """By topic."""
+        self._teammates: set[str] = set()
+        """Topics of their poses."""
         self._goal_xy: FloatArray = np.full(2, np.nan)
-        self._quality: Publish | None = None
-        self._grid_topic(MAP)
-        self._pose = publisher("pose", POSE, STREAMED)
-        self._path = publisher("path", PATH, LATCHED)
-        self._closures = publisher("closures", MARKERS, LATCHED)
-        self._tf = publisher(names.tf, TRANSFORMS, TRANSFORMED)
-        self._diagnostics = publisher(names.diagnostics, DIAGNOSTICS, STREAMED)
+        self._begin_map(MAP)
+        self._begin("pose", POSE, STREAMED)
+        self._begin("path", PATH, LATCHED)
+        self._begin("closures", MARKERS, LATCHED)
+        self._begin(tf, TRANSFORMS, TRANSFORMED)
+        self._begin(DIAGNOSTICS_TOPIC, DIAGNOSTICS, STREAMED)
 
     def transform(self, stamp_ns: int, odom_frame: str, T_map_odom: FloatArray) -> None:
         """Publish ``map -> odom`` for this stamp."""
-        header = self._codec.header(stamp_ns, self._names.map_frame)
+        header = self._codec.header(stamp_ns, self._map_frame)
         self._send(self._tf, TRANSFORMS, self._codec.transforms(header, odom_frame, in_space(T_map_odom)))
 
     def pose(self, stamp_ns: int, T_map_base: FloatArray, covariance: FloatArray) -> None:
@@ -131,13 +122,13 @@ class Outputs:
         posed = make(
             "geometry_msgs/PoseWithCovariance", pose=self._codec.pose(in_space(T_map_base)), covariance=whole.ravel()
         )
-        header = self._codec.header(stamp_ns, self._names.map_frame)
-        self._send(self._pose, POSE, make(POSE, header=header, pose=posed))
+        header = self._codec.header(stamp_ns, self._map_frame)
+        self._send("pose", POSE, make(POSE, header=header, pose=posed))
 
     def path(self, stamp_ns: int, stamps: FloatArray, T_map_base: FloatArray) -> None:
         """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of at least ``PATH_STEP_M``."""
         header, make = self._codec.header, self._codec.make
-        frame = self._names.map_frame
+        frame = self._map_frame
         poses = [
             make(
                 "geometry_msgs/PoseStamped",
@@ -146,42 +137,36 @@ class Outputs:
             )
             for at in _steps(T_map_base)
         ]
-        self._send(self._path, PATH, make(PATH, header=header(stamp_ns, frame), poses=poses))
+        self._send("path", PATH, make(PATH, header=header(stamp_ns, frame), poses=poses))
 
     def closures(self, stamp_ns: int, ends_xy: FloatArray) -> None:
         """Publish the accepted closures as lines between two places (N, 2, 2), metres in ``map``."""
         lines = self._marker(stamp_ns, "closures", _LINE_LIST, LINE_WIDTH_M, (0.1, 0.6, 0.2), ends_xy)
-        self._send(self._closures, MARKERS, self._codec.make(MARKERS, markers=[lines]))
+        self._send("closures", MARKERS, self._codec.make(MARKERS, markers=[lines]))
 
     def frontiers(self, now_ns: int, free_xy: FloatArray, taken_xy: FloatArray, T_map_goal: FloatArray | None) -> None:
-        """Publish where the map can be explored further, and where this robot shall go.
+        """Publish where the map can be explored further, and where this robot shall go if that changed.
 
-        Args:
-            now_ns: the time now.
-            free_xy: frontiers that no robot has, shape (N, 2), metres in ``map``.
-            taken_xy: those that robots have, shape (M, 2).
-            T_map_goal: that of this robot; None: it has none. It is published when it changes.
+        Frontiers that no robot has, and those that robots have, have shape (N, 2), metres in ``map``.
         """
         with self._lock:
-            if self._exploration is None:
-                goals = self._publisher(FLEET_GOAL, POSE_STAMPED, LATCHED)
-                self._exploration = self._publisher(FLEET_FRONTIERS, MARKERS, LATCHED), goals
+            self._begin(FLEET_FRONTIERS, MARKERS, LATCHED)
+            self._begin(FLEET_GOAL, POSE_STAMPED, LATCHED)
             markers = [
                 self._marker(now_ns, name, _SPHERE_LIST, SPHERE_M, colour, points)
                 for name, colour, points in (("free", (0.9, 0.6, 0.1), free_xy), ("taken", (0.1, 0.4, 0.9), taken_xy))
             ]
-            self._send(self._exploration[0], MARKERS, self._codec.make(MARKERS, markers=markers))
+            self._send(FLEET_FRONTIERS, MARKERS, self._codec.make(MARKERS, markers=markers))
             if T_map_goal is not None and not np.array_equal(T_map_goal[:2], self._goal_xy):
                 self._goal_xy = T_map_goal[:2]
-                header = self._codec.header(now_ns, self._names.map_frame)
+                header = self._codec.header(now_ns, self._map_frame)
                 goal = self._codec.make(POSE_STAMPED, header=header, pose=self._codec.pose(in_space(T_map_goal)))
-                self._send(self._exploration[1], POSE_STAMPED, goal)
+                self._send(FLEET_GOAL, POSE_STAMPED, goal)
 
     def quality(self, now_ns: int, robot: str, maps: "Sequence[QualityReply]") -> None:
         """Publish how good the map of a robot is, by its certificate."""
         with self._lock:
-            if self._quality is None:
-                self._quality = self._publisher(FLEET_QUALITY, DIAGNOSTICS, LATCHED)
+            self._begin(FLEET_QUALITY, DIAGNOSTICS, LATCHED)
             statuses = [
                 self._status(
                     f"map {one.map_index}",
@@ -199,8 +184,7 @@ class Outputs:
                 )
                 for one in maps
             ]
-            message = self._codec.make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
-            self._send(self._quality, DIAGNOSTICS, message)
+            self._diagnose(FLEET_QUALITY, now_ns, statuses)
 
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
         """Publish a map if it changed; returns whether it did.
@@ -210,9 +194,9 @@ class Outputs:
         subscriber, who gets the whole one, is complete after any update, and one who got all updates keeps no cell that
         changed back.
         """
-        grid = grid_of(occupancy)
+        grid = Grid(_GRID_VALUES[occupancy.cells], occupancy.resolution_m, occupancy.origin_xy)
         with self._lock:
-            shown = self._grid_topic(topic)
+            shown = self._begin_map(topic)
             goes_whole = grid.values.size <= SMALL_MAP_CELLS and not only_changes
             known = (shown.whole, shown.newest) if goes_whole else (shown.newest,)
             if all(last is not None and _is_same(last, grid) for last in known):
@@ -221,10 +205,10 @@ class Outputs:
             of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
             if goes_whole or of_whole is None or of_newest is None:
                 shown.whole = grid
-                self._send(shown.publish, GRID, self._grid_message(stamp_ns, grid))
+                self._send(topic, GRID, self._grid_message(stamp_ns, grid))
             else:
                 region = _bounding(of_whole, of_newest)
-                self._send(shown.update, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
+                self._send(topic + UPDATES, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
             return True
 
     def fleet(
@@ -234,32 +218,26 @@ class Outputs:
         separations: Sequence[tuple[tuple[int, int], str]],
         own: int | None,
     ) -> None:
-        """Publish where the robots of the own map are, and which robots are in which map.
+        """Publish where the robots of the own map are, and which of all robots, this one as well, are in which map.
 
-        Args:
-            now_ns: the time now.
-            teammates: all robots of the fleet, this one as well.
-            separations: for every two maps that are apart: their indices and the reason.
-            own: index of the robot's own map; None: it is in none, so no pose is in its frame.
+        ``separations`` are the indices of every two maps that are apart, and the reason. ``own`` is the index of the
+        robot's own map; None: no pose is in its frame.
         """
-        make, frame = self._codec.make, self._names.map_frame
+        make, frame = self._codec.make, self._map_frame
         with self._lock:
-            if self._fleet is None:
-                self._fleet = (
-                    self._publisher(FLEET_POSES, POSES, STREAMED),
-                    self._publisher(FLEET_STATUS, DIAGNOSTICS, STREAMED),
-                )
+            self._begin(FLEET_POSES, POSES, STREAMED)
+            self._begin(FLEET_STATUS, DIAGNOSTICS, STREAMED)
             near = [mate for mate in teammates if mate.map_index == own]
             poses = [self._codec.pose(in_space(mate.T_map_base)) for mate in near]
-            self._send(self._fleet[0], POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
+            self._send(FLEET_POSES, POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
             for mate, pose in zip(near, poses, strict=True):
-                name = _topic_name(mate.robot)
-                if name not in self._teammates:
-                    if len(self._teammates) >= MOST_TEAMMATES:
-                        continue
-                    self._teammates[name] = self._publisher(f"fleet/{name}/pose", POSE_STAMPED, STREAMED)
+                topic = f"fleet/{_topic_name(mate.robot)}/pose"
+                if topic not in self._teammates and len(self._teammates) >= MOST_TEAMMATES:
+                    continue
+                self._teammates.add(topic)
+                self._begin(topic, POSE_STAMPED, STREAMED)
                 header = self._codec.header(max(0, now_ns - nanoseconds(mate.age_s)), frame)
-                self._send(self._teammates[name], POSE_STAMPED, make(POSE_STAMPED, header=header, pose=pose))
+                self._send(topic, POSE_STAMPED, make(POSE_STAMPED, header=header, pose=pose))
             statuses = [
                 self._status(
                     f"robot {mate.robot}",
@@ -282,22 +260,19 @@ class Outputs:
                 self._status(f"maps {a} and {b}", "", _WARN, why, {"map_a": a, "map_b": b})
                 for (a, b), why in separations
             ]
-            message = make(DIAGNOSTICS, header=self._codec.header(now_ns, ""), status=statuses)
-            self._send(self._fleet[1], DIAGNOSTICS, message)
+            self._diagnose(FLEET_STATUS, now_ns, statuses)
 
     def event(self, stamp_ns: int, robot: str, text: str) -> None:
         """Publish one event of the fleet's map on the topic of diagnostics."""
         status = self._status(f"fcslam: {robot}: fleet", robot, _OK, text, {"event": "fleet"})
-        message = self._codec.make(DIAGNOSTICS, header=self._codec.header(stamp_ns, ""), status=[status])
-        self._send(self._diagnostics, DIAGNOSTICS, message)
+        self._diagnose(DIAGNOSTICS_TOPIC, stamp_ns, [status])
 
     def diagnostics(
         self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
     ) -> None:
         """Publish the state of the robot: ``trouble``, or ``well`` if that is empty."""
         status = self._status(f"fcslam: {robot}", robot, _WARN if trouble else _OK, trouble or well, values)
-        header = self._codec.header(stamp_ns, "")
-        self._send(self._diagnostics, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=[status]))
+        self._diagnose(DIAGNOSTICS_TOPIC, stamp_ns, [status])
 
     def _status(self, name: str, hardware: str, level: int, message: str, values: Mapping[str, object]) -> Any:
         make = self._codec.make
@@ -311,15 +286,22 @@ class Outputs:
             values=pairs,
         )
 
-    def _grid_topic(self, topic: str) -> "_GridTopic":
-        if topic not in self._grids:
-            self._grids[topic] = _GridTopic(
-                self._publisher(topic, GRID, LATCHED), self._publisher(f"{topic}_updates", GRID_UPDATE, LATCHED)
-            )
-        return self._grids[topic]
+    def _diagnose(self, topic: str, stamp_ns: int, statuses: Sequence[Any]) -> None:
+        header = self._codec.header(stamp_ns, "")
+        self._send(topic, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=statuses))
 
-    def _send(self, publish: Publish, kind: str, message: Any) -> None:
-        publish(self._codec.encode(message, kind))
+    def _begin(self, topic: str, kind: str, quality: Quality) -> None:
+        """Begin to publish a topic, once."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self._network.publisher(resolved(self._namespace, topic), kind, quality)
+
+    def _begin_map(self, topic: str) -> _Shown:
+        self._begin(topic, GRID, LATCHED)
+        self._begin(topic + UPDATES, GRID_UPDATE, LATCHED)
+        return self._maps.setdefault(topic, _Shown())
+
+    def _send(self, topic: str, kind: str, message: Any) -> None:
+        self._publishers[topic](self._codec.encode(message, kind))
 
     def _marker(
         self,
@@ -336,7 +318,7 @@ class Outputs:
         r, g, b = colour
         return make(
             "visualization_msgs/Marker",
-            header=self._codec.header(stamp_ns, self._names.map_frame),
+            header=self._codec.header(stamp_ns, self._map_frame),
             ns=name,
             id=0,
             type=kind,
@@ -372,20 +354,15 @@ class Outputs:
             height=height,
             origin=self._codec.pose(in_space(np.array((*grid.origin_xy, 0.0)))),
         )
-        header = self._codec.header(stamp_ns, self._names.map_frame)
+        header = self._codec.header(stamp_ns, self._map_frame)
         return self._codec.make(GRID, header=header, info=info, data=grid.values.ravel())
 
     def _update_message(self, stamp_ns: int, grid: Grid, region: Region) -> Any:
         cells = grid.values[region.y : region.y + region.height, region.x : region.x + region.width]
-        header = self._codec.header(stamp_ns, self._names.map_frame)
+        header = self._codec.header(stamp_ns, self._map_frame)
         return self._codec.make(
             GRID_UPDATE, header=header, **region._asdict(), data=np.ascontiguousarray(cells).ravel()
         )
-
-
-def grid_of(occupancy: OccupancyMap) -> Grid:
-    """The map with the values of ROS."""
-    return Grid(_values(occupancy.cells), occupancy.resolution_m, occupancy.origin_xy)
 
 
 def changed_region(before: Grid, after: Grid) -> Region | None:
@@ -419,13 +396,6 @@ def _topic_name(robot: str) -> str:
 def nanoseconds(stamp: float) -> int:
     """A stamp in seconds as ROS counts, not below 0."""
     return max(0, round(stamp * 1e9))
-
-
-def _values(cells: Cells) -> NDArray[np.int8]:
-    table = np.zeros(len(Occupancy), np.int8)
-    for known, value in GRID_VALUES.items():
-        table[known] = value
-    return np.asarray(table[cells])
 
 
 def _is_same(before: Grid, after: Grid) -> bool:

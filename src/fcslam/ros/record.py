@@ -18,6 +18,7 @@ from fcslam.ros.sensors import Notify
 from fcslam.ros.topics import TF_STATIC, SensorTopics
 from fcslam.sources.bags.codec import full_name, typestore
 from fcslam.sources.bags.mcap_records import end_mcap
+from fcslam.sources.bags.transforms import last_part
 
 _POLL_S = 0.2
 _DEPTH = 1000
@@ -41,23 +42,23 @@ def record(
     """
     inbox = _Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
-
-    def subscribe(topic: str, kind: str, reliable: bool) -> None:
-        latched = topic.rsplit("/", 1)[-1] == TF_STATIC
-        quality = Quality(reliable or latched, latched, _DEPTH)
-        network.subscribe(topic, kind, quality, lambda payload: inbox.put(topic, time.time_ns(), payload))
-
     offered = [point for point in network.endpoints() if point.publishes]
     for topic, kind in kinds.items():
-        publishers = [point for point in offered if point.topic == topic]
-        subscribe(topic, kind, bool(publishers) and all(point.quality.reliable for point in publishers))
+        reliable = [point.quality.reliable for point in offered if point.topic == topic]
+        latched = last_part(topic) == TF_STATIC
+        quality = Quality((bool(reliable) and all(reliable)) or latched, latched, _DEPTH)
+
+        def deliver(payload: bytes, topic: str = topic) -> None:
+            inbox.put(topic, time.time_ns(), payload)
+
+        network.subscribe(topic, kind, quality, deliver)
     counts: Counter[str] = Counter()
     kept = ""
     try:
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
             recording = _Recording(Path(staging, output.stem), network.ros1)
             try:
-                recording.open()
+                recording.writer.open()
                 while not stop.is_set() or not inbox.is_empty:
                     try:
                         topic, received_ns, payload = inbox.get(_POLL_S)
@@ -65,7 +66,7 @@ def record(
                         continue
                     recording.write(topic, kinds[topic], received_ns, payload)
                     counts[topic] += 1
-                recording.close()
+                recording.writer.close()
             except BaseException as error:
                 if recording.rescue(error):
                     kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}"
@@ -136,21 +137,13 @@ class _Recording:
         self._ros1, self._store = ros1, typestore(ros1)
         self._connections: dict[str, Any] = {}
         self._latest_ns = 0
-        self._writer: Any
+        self.writer: Any
         if ros1:
-            self._writer = rosbag1.Writer(place)
+            self.writer = rosbag1.Writer(place)
             self.file = place
         else:
-            self._writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+            self.writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
             self.file = place / f"{place.name}.mcap"
-
-    def open(self) -> None:
-        """Make the file."""
-        self._writer.open()
-
-    def close(self) -> None:
-        """Complete the file."""
-        self._writer.close()
 
     def rescue(self, error: BaseException) -> bool:
         """End the file after an error, and return whether it holds messages.
@@ -159,21 +152,21 @@ class _Recording:
         """
         if not isinstance(error, OSError):
             with suppress(Exception):
-                self.close()
+                self.writer.close()
                 return bool(self._connections)
         with suppress(Exception):
-            self._writer.abort()
+            self.writer.abort()
         try:
-            return _end_bag(self._writer) if self._ros1 else end_mcap(self.file)
+            return _end_bag(self.writer) if self._ros1 else end_mcap(self.file)
         except OSError:
             return self.file.exists()
 
     def write(self, topic: str, kind: str, received_ns: int, payload: bytes) -> None:
         """Write a message; the time of recording only ever grows."""
         if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, full_name(kind), typestore=self._store)
+            self._connections[topic] = self.writer.add_connection(topic, full_name(kind), typestore=self._store)
         self._latest_ns = max(self._latest_ns, received_ns)
-        self._writer.write(self._connections[topic], self._latest_ns, payload)
+        self.writer.write(self._connections[topic], self._latest_ns, payload)
 
 
 def _end_bag(writer: Any) -> bool:

@@ -18,7 +18,6 @@ from functools import cache
 from typing import Any, Final
 
 from fcslam.errors import NetworkError
-from fcslam.ros.dds_names import dds_type, kind_of
 from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
 from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec
 
@@ -36,6 +35,7 @@ _BLOCKING_NS = 100_000_000
 _HEADER_BYTES, _IDENTITY_BYTES = 4, 16
 """Sizes of a message's encoding header, and of the caller and number in front of a request."""
 _TOPIC = re.compile(r"rt(/.+)")
+_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _PEER = re.compile(r"[\w.:-]+", re.ASCII)
 
 
@@ -257,3 +257,15 @@ def _quality_of(qos: Any) -> Quality:
     reliable = qos[Policy.Reliability] not in (None, Policy.Reliability.BestEffort)
     latched = qos[Policy.Durability] not in (None, Policy.Durability.Volatile)
     return Quality(reliable, latched)
+
+
+def dds_type(kind: str, group: str = "msg") -> str:
+    """The name of a type, as in ``sensor_msgs::msg::dds_::LaserScan_`` of ``sensor_msgs/LaserScan``."""
+    package, name = kind.split("/")
+    return f"{package}::{group}::dds_::{name}_"
+
+
+def kind_of(dds_type: str) -> str | None:
+    """The type of messages with this name; None: it is no such name."""
+    match = _TYPE.fullmatch(dds_type)
+    return f"{match[1]}/{match[2]}" if match else None

@@ -15,8 +15,8 @@ from concurrent.futures import Future
 from typing import Any, Final
 
 from fcslam.errors import NetworkError
-from fcslam.ros.dds_names import dds_type, kind_of
 from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
+from fcslam.ros.ros2 import dds_type, kind_of
 from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec, full_name
 
 INSTALL: Final = "pip install 'fcslam[zenoh]'"
@@ -176,7 +176,7 @@ class ZenohNetwork:
 
     def _show(self, kind: str, topic: str, dds_kind: str, type_hash: str, quality: Quality) -> bytes:
         """Declare an endpoint; returns its identity."""
-        words = (_mangled(topic), dds_kind, type_hash, quality_text(quality))
+        words = (topic.replace("/", "%"), dds_kind, type_hash, quality_text(quality))
         token = "/".join((self._token(next(self._numbers), kind), *words))
         self._declare(self._session.liveliness().declare_token(token))
         return hashlib.blake2b(token.encode(), digest_size=16).digest()
@@ -251,13 +251,12 @@ def endpoint_of(token: str, own: str) -> Endpoint | None:
     parts = token.split("/")
     if len(parts) < _PARTS or parts[5] not in _KINDS:
         return None
-    kind = kind_of(_demangled(parts[10]))
-    reliability, _, rest = parts[12].partition(":")
-    durability = rest.partition(":")[0]
+    kind = kind_of(parts[10].replace("%", "/"))
     if kind is None:
         return None
+    reliability, durability, *_ = f"{parts[12]}:".split(":")
     quality = Quality(reliability in ("", _RELIABLE), durability == _LATCHED)
-    return Endpoint(_demangled(parts[9]), kind, _KINDS[parts[5]], quality, parts[2] == own)
+    return Endpoint(parts[9].replace("%", "/"), kind, _KINDS[parts[5]], quality, parts[2] == own)
 
 
 def _identity(attached: Any) -> tuple[int, bytes]:
@@ -267,14 +266,6 @@ def _identity(attached: Any) -> tuple[int, bytes]:
         return 0, bytes(16)
     number, _, _, sender = struct.unpack("<qqB16s", data)
     return number, sender
-
-
-def _mangled(name: str) -> str:
-    return name.replace("/", "%")
-
-
-def _demangled(name: str) -> str:
-    return name.replace("%", "/")
 
 
 def _first_line(error: Exception) -> str:

@@ -6,13 +6,14 @@ whose odometry is silent from the start is mapped without.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from math import inf
 
 from fcslam.errors import NetworkError
 from fcslam.records import Beams, GnssFix, SensorRecord
-from fcslam.ros.topics import SensorTopics, info_beside
+from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
 from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import (
@@ -26,7 +27,7 @@ from fcslam.sources.bags.codec import (
     TRANSFORMS,
     MessageCodec,
 )
-from fcslam.sources.bags.fixes import FixAtZeroError, fix_of
+from fcslam.sources.bags.fixes import fix_of
 from fcslam.sources.bags.merging import ScanMerger
 from fcslam.sources.bags.messages import (
     UNKNOWN_RANGE_M,
@@ -39,20 +40,31 @@ from fcslam.sources.bags.messages import (
     transforms_of,
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan, without_odometry
+from fcslam.sources.bags.pairing import (
+    Entry,
+    EntryGate,
+    Message,
+    OdometryPairing,
+    PosedImage,
+    PosedScan,
+    without_odometry,
+)
 from fcslam.sources.bags.rig import (
+    MountingError,
     Rig,
-    TiltedLaserError,
+    check_frames,
     given_mounting,
     mounted_camera,
     rig_of,
     sensor_mounting,
     tilt_note,
+    usual_scan,
 )
-from fcslam.sources.bags.sectors import SectorJoiner, are_sectors
+from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, joined_turns
+from fcslam.sources.bags.topics import info_beside
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransformError, TransformTree
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
+from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY
 
 USUAL_ODOM = "odom"
@@ -94,7 +106,7 @@ class LiveSensors:
         """Whether the robot is mapped without odometry."""
         self.restarts = 0
         """Number of times that the clock stepped back."""
-        self.newest_stamp: float | None = None
+        self._newest_stamp: float | None = None
         """Stamp of the newest scan that was read."""
         self._topics, self._options, self._notify = topics, options, notify
         self._prefix = namespace.strip("/")
@@ -123,19 +135,10 @@ class LiveSensors:
         self._beams: list[Beams] = []
         """Usual beams of each laser, once they are known."""
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether the mounting of every laser is known."""
-        return self._rig is not None
-
     def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
-        """Read the next message; yields the records that are complete.
+        """Read the next message; yields the records that are complete at ``now_s`` of a clock that only grows.
 
-        Args:
-            topic: where the message comes from.
-            payload: its bytes.
-            now_s: any clock that only grows.
-            received_ns: the time of a message without a stamp.
+        ``received_ns`` is the time of a message without a stamp.
 
         Raises:
             NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
@@ -194,11 +197,9 @@ class LiveSensors:
         """Yield all that waits, as no more messages come."""
         if self._rig is None:
             return
-        for joiner in self._joiners.values():
-            for turn in joiner.flush():
-                for number, item in self._merger.add(0, turn):
-                    yield from self._paired(number, item)
-        for number, item in self._merger.flush():
+        turns = (turn for joiner in self._joiners.values() for turn in joiner.flush())
+        merged = chain.from_iterable(self._merger.add(0, turn) for turn in turns)
+        for number, item in chain(merged, self._merger.flush()):
             yield from self._paired(number, item)
         for number, entry in self._pairing.flush():
             yield from self._recorded(number, entry)
@@ -218,13 +219,12 @@ class LiveSensors:
             return
         try:
             fix = fix_of(self._codec.decode(payload, FIX), received_ns, self._tree, self.base_frame)
-        except FixAtZeroError:
-            self.audit.add(Fault.FIX_AT_ZERO, self._counts[topic])
         except ValueError:
-            self.audit.add(Fault.BROKEN_MESSAGE, self._counts[topic])
-        else:
-            if fix is not None:
-                yield fix
+            fix = Fault.BROKEN_MESSAGE
+        if isinstance(fix, Fault):
+            self.audit.add(fix, self._counts[topic])
+        elif fix is not None:
+            yield fix
 
     def _keep_early(self, number: int, item: Message) -> None:
         """Keep a message until the mounting is known; of images, the newest."""
@@ -237,7 +237,7 @@ class LiveSensors:
     def _begin(self) -> None:
         """Begin to read scans; those before have no part in it."""
         self._merger, self._pairing = ScanMerger(len(self._topics.scans)), OdometryPairing()
-        self._gates = [ScanGate(beams, self.audit) for beams in self._beams]
+        self._gate = EntryGate(self._beams, self.audit)
 
     def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:
         """Raises ValueError if the message is invalid."""
@@ -301,16 +301,12 @@ class LiveSensors:
     def _transforms(self, content: object, received_ns: int) -> list[Message]:
         transforms = list(transforms_of(content, received_ns))
         for transform in transforms if self._rig is None else ():
-            if self._is_own(transform.child):
+            prefix = transform.child.rpartition("/")[0]  # another one is that of another robot on the same tf
+            if not prefix or not self._prefix or prefix == self._prefix:
                 self._tree.add(transform.parent, transform.child, transform.T_parent_child)
         if self._topics.odometry is not None or self.is_without_odometry:
             return []
         return [odometry_in(each) for each in transforms if self._edge in (None, (each.parent, each.child))]
-
-    def _is_own(self, frame: str) -> bool:
-        """Whether a frame is not that of another robot on the same tf."""
-        prefix, _, _ = frame.rpartition("/")
-        return not prefix or not self._prefix or prefix == self._prefix
 
     def _rig_now(self, now_s: float) -> Rig | None:
         """The rig if enough is known; None to wait for more."""
@@ -320,9 +316,8 @@ class LiveSensors:
             return None
         self.base_frame = base_frame = self._known_base_frame()
         self._joiners = {laser: SectorJoiner() for laser, scans in enumerate(self._first) if are_sectors(scans)}
-        turns = [self._turns(laser, scans) for laser, scans in enumerate(self._first)]
-        usual = [usual_beams([scan.beams for scan in scans]) for scans in turns]
-        first = [next(scan for scan in scans if scan.beams == beams) for scans, beams in zip(turns, usual, strict=True)]
+        turns = [joined_turns(scans) if laser in self._joiners else scans for laser, scans in enumerate(self._first)]
+        first = list(map(usual_scan, turns))
         try:
             mountings = self._mountings(first, base_frame)
         except NoTransformError as error:
@@ -337,18 +332,16 @@ class LiveSensors:
             )
             if camera is None and not is_late:
                 return None
-        self._tell_rig(mountings, note)
-        self._beams = usual
+        if note:
+            self._notify(f"the camera of {self._topics.camera} {note}")
+        for topic, mounted in zip(self._topics.scans, mountings, strict=True):
+            if tilt := tilt_note(mounted):
+                self._notify(f"the laser of {topic} is {tilt}")
+        self._beams = [scan.beams for scan in first]
+        farthest_m = [max(scan.range_max_m for scan in scans) for scans in turns]
         for scans in self._first:
             scans.clear()
-        return rig_of(usual, [max(scan.range_max_m for scan in scans) for scans in turns], mountings, camera)
-
-    def _turns(self, laser: int, scans: Sequence[ScanMessage]) -> list[ScanMessage]:
-        """The first scans of a laser, with sectors joined."""
-        if laser not in self._joiners:
-            return list(scans)
-        joiner = SectorJoiner()
-        return [turn for sector in scans for turn in joiner.add(sector)] or list(joiner.flush())
+        return rig_of(first, farthest_m, mountings, camera)
 
     def _find_odometry(self, is_late: bool) -> None:
         """Find the odometry in tf, on the way up from the laser; only without a way, elsewhere."""
@@ -383,34 +376,19 @@ class LiveSensors:
                 )
         return enough and (self._has_odometry or self.is_without_odometry)
 
-    def _tell_rig(self, mountings: list[Mounting], camera_note: str) -> None:
-        if camera_note:
-            self._notify(f"the camera of {self._topics.camera} {camera_note}")
-        for topic, mounted in zip(self._topics.scans, mountings, strict=True):
-            if tilt_note(mounted):
-                self._notify(f"the laser of {topic} is {tilt_note(mounted)}")
-
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
         if self._options.laser_poses:
             kinds = [self._topics.kinds[topic] for topic in self._topics.scans]
             return list(map(given_mounting, self._options.laser_poses, kinds))
-        frames = [scan.frame for scan in first]
-        if len(set(frames)) < len(frames):
-            raise NetworkError(
-                f"the scans of {' and '.join(self._topics.scans)} have one frame, so tf cannot give the pose of "
-                "each laser; give it with --sensors laser-pose=X,Y,THETA for each"
-            )
-        mountings = []
-        for topic, scan in zip(self._topics.scans, first, strict=True):
-            try:
-                kind = self._topics.kinds[topic]
-                mountings.append(sensor_mounting(self._tree, base_frame, scan.frame, kind))
-            except TiltedLaserError as error:
-                raise NetworkError(
-                    f"the laser of {topic} is {error} and does not look along the floor; choose a level one by "
-                    "--sensors scan-topic, or give its pose with --sensors laser-pose"
-                ) from error
-        return mountings
+        sensors = [(topic, scan.frame) for topic, scan in zip(self._topics.scans, first, strict=True)]
+        try:
+            check_frames(sensors)
+            return [
+                sensor_mounting(self._tree, base_frame, frame, self._topics.kinds[topic], topic)
+                for topic, frame in sensors
+            ]
+        except MountingError as error:
+            raise NetworkError(str(error)) from error
 
     def _read(self, number: int, item: Message) -> Iterator[SensorRecord]:
         if isinstance(item, OdometryReading) and self._edge not in (None, (item.odom_frame, item.base_frame)):
@@ -469,10 +447,10 @@ class LiveSensors:
         """Start again if the clock stepped back and stays there, as when a bag is played again."""
         if not isinstance(item, ScanMessage):
             return
-        newest = self.newest_stamp
+        newest = self._newest_stamp
         if newest is None or item.stamp >= newest - MAX_STEP_BACK_S:
             self._misplaced = 0
-            self.newest_stamp = item.stamp if newest is None else max(newest, item.stamp)
+            self._newest_stamp = item.stamp if newest is None else max(newest, item.stamp)
             return
         self._misplaced += 1
         if self._misplaced >= STEPS_BACK_FOR_RESTART:
@@ -481,23 +459,17 @@ class LiveSensors:
                 "the robot goes on from there"
             )
             self.restarts += 1
-            self._misplaced, self.newest_stamp = 0, item.stamp
+            self._misplaced, self._newest_stamp = 0, item.stamp
             self._begin()
 
     def _recorded(self, number: int, entry: Entry) -> Iterator[SensorRecord]:
         rig = self._rig
         assert rig is not None  # nothing is read before
-        if isinstance(entry, OdometryReading) and entry.is_after_jump:
-            self.audit.add(Fault.ODOMETRY_JUMP, number)
+        if not self._gate.admits(number, entry):
+            if isinstance(entry, PosedScan) and entry.fault is Fault.NO_ODOMETRY:
+                self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
+            return
         if isinstance(entry, PosedScan):
-            if not self._gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
-                return
-            if entry.fault is not None:
-                self.audit.add(entry.fault, number)
-            if entry.fault is Fault.NO_ODOMETRY:
-                if self.audit.faults()[Fault.NO_ODOMETRY].count == 1:
-                    self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
-                return
             yield rig.scan(entry)
         elif isinstance(entry, PosedImage) and rig.camera is not None:
             try:

@@ -20,7 +20,8 @@ from fcslam.sources.bags.codec import (
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.robots import is_truth
-from fcslam.sources.bags.topics import is_depth
+from fcslam.sources.bags.topics import info_beside, is_depth
+from fcslam.sources.bags.transforms import last_part
 
 TF, TF_STATIC = "tf", "tf_static"
 
@@ -65,9 +66,18 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     """
     known = published(endpoints)
     inside = [topic for topic in known if topic.startswith(f"{namespace}/")]
-    chosen = _Choice(endpoints, known, namespace)
     notes: list[str] = []
-    scans = [chosen.named(name, "--sensors scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
+
+    def named(name: str, option: str, *kinds: str) -> str:
+        """The full name of a topic that must have one of these types."""
+        topic = resolved(namespace, name)
+        if known.get(topic) not in kinds:
+            what = f"has the type {known[topic]}" if topic in known else "is not there"
+            needed = f"{option} needs {' or '.join(kinds[:2])}"
+            raise NetworkError(f"topic {topic} {what}; {needed}; {named_topics(endpoints)}")
+        return topic
+
+    scans = [named(name, "--sensors scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
     if not scans:
         depths = [
             topic for topic in inside if known[topic] == IMAGE and is_depth(topic) and info_beside(topic) in known
@@ -76,24 +86,33 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
         if not candidates:
             raise NetworkError(
                 f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images in {namespace or '/'}; start "
-                f"the driver; {chosen.known()}"
+                f"the driver; {named_topics(endpoints)}"
             )
         rank = [*SCANS, IMAGE].index
-        scans = [min(candidates, key=lambda topic: (rank(known[topic]), _basename(topic) != "scan", topic))]
+        scans = [min(candidates, key=lambda topic: (rank(known[topic]), last_part(topic) != "scan", topic))]
         notes += _note("laser scans", "--sensors scan-topic", scans[0], candidates)
     odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
     if options.odom_topic == NO_ODOMETRY:
         notes.append("reads no odometry, as --sensors odom-topic=none says")
     elif odometry is None:
         candidates = [topic for topic in inside if known[topic] == ODOMETRY and not is_truth(topic)]
-        odometry = min(candidates, key=lambda topic: (_basename(topic) != "odom", topic), default=None)
+        odometry = min(candidates, key=lambda topic: (last_part(topic) != "odom", topic), default=None)
         notes += _note("odometry", "--sensors odom-topic", odometry, candidates)
     else:
-        chosen.named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
-    transforms = _transforms(known, namespace)
+        named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+    own_or_common = {f"{namespace}/{name}": f"/{name}" for name in (TF, TF_STATIC)}  # they may appear later
+    transforms = tuple(own if own in known else common for own, common in own_or_common.items())
     if odometry is not None and known[odometry] != ODOMETRY:
         transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
-    camera, info = _camera(chosen, known, inside, options.camera_topic)
+    images = [topic for topic in inside if known[topic] in (COMPRESSED_IMAGE, IMAGE)]
+    if options.camera_topic is not None:
+        images = [named(options.camera_topic, "--sensors camera-topic", COMPRESSED_IMAGE, IMAGE)]
+    infos = {topic: info_beside(topic) for topic in images if not is_depth(topic)}
+    calibrated = [topic for topic, info in infos.items() if known.get(info) == CAMERA_INFO]
+    camera = min(calibrated, key=lambda topic: (known[topic] != COMPRESSED_IMAGE, topic), default=None)
+    if options.camera_topic is not None and camera is None:
+        raise NetworkError(f"topic {images[0]} has no calibration: {info_beside(images[0])} is not there; publish it")
+    info = None if camera is None else infos[camera]
     depth_infos = [info_beside(topic) for topic in scans if known[topic] == IMAGE]
     fixes = min((topic for topic in inside if known[topic] == FIX), default=None)
     read = (*scans, *depth_infos, *transforms, *filter(None, (odometry, camera, info, fixes)))
@@ -101,59 +120,6 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     return SensorTopics(kinds, tuple(scans), odometry, transforms, camera, info, fixes, tuple(notes))
 
 
-@dataclass(frozen=True)
-class _Choice:
-    """Topics that the user names."""
-
-    endpoints: Sequence[Endpoint]
-    topics: Mapping[str, str]
-    namespace: str
-
-    def named(self, name: str, option: str, *kinds: str) -> str:
-        """The full name of a topic that must have one of these types."""
-        topic = resolved(self.namespace, name)
-        if self.topics.get(topic) not in kinds:
-            what = f"has the type {self.topics[topic]}" if topic in self.topics else "is not there"
-            raise NetworkError(f"topic {topic} {what}; {option} needs {' or '.join(kinds[:2])}; {self.known()}")
-        return topic
-
-    def known(self) -> str:
-        return named_topics(self.endpoints)
-
-
-def _transforms(known: Mapping[str, str], namespace: str) -> tuple[str, ...]:
-    """Topics of tf; they may appear later."""
-    found = []
-    for name in (TF, TF_STATIC):
-        own = f"{namespace}/{name}"
-        found.append(own if own in known else f"/{name}")
-    return tuple(found)
-
-
-def _camera(
-    chosen: _Choice, known: Mapping[str, str], inside: Sequence[str], wanted: str | None
-) -> tuple[str | None, str | None]:
-    """Topics of images and of their calibration; without a calibration there is no camera."""
-    images = [topic for topic in inside if known[topic] in (COMPRESSED_IMAGE, IMAGE)]
-    if wanted is not None:
-        images = [chosen.named(wanted, "--sensors camera-topic", COMPRESSED_IMAGE, IMAGE)]
-    infos = {topic: info_beside(topic) for topic in images if not is_depth(topic)}
-    calibrated = {topic: info for topic, info in infos.items() if known.get(info) == CAMERA_INFO}
-    camera = min(calibrated, key=lambda topic: (known[topic] != COMPRESSED_IMAGE, topic), default=None)
-    if wanted is not None and camera is None:
-        raise NetworkError(f"topic {images[0]} has no calibration: {info_beside(images[0])} is not there; publish it")
-    return camera, None if camera is None else calibrated[camera]
-
-
-def info_beside(camera: str) -> str:
-    """The topic of the calibration of a camera."""
-    return camera.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-
-
 def _note(what: str, option: str, chosen: str | None, candidates: Sequence[str]) -> list[str]:
     others = ", ".join(topic for topic in candidates if topic != chosen)
     return [f"reads {what} from {chosen}, not from {others} ({option} chooses)"] if others else []
-
-
-def _basename(topic: str) -> str:
-    return topic.rsplit("/", 1)[-1]

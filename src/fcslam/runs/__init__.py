@@ -15,8 +15,7 @@ from fcslam.runs.folder import (
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.separations import Separation, separations
-from fcslam.runs.tables import metrics_json
-from fcslam.runs.trajectories import read_tum, write_tum
+from fcslam.runs.tables import metrics_json, read_tum, write_tum
 
 __all__ = [
     "CONFIG",

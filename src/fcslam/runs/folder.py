@@ -21,8 +21,7 @@ A run folder is whole or not there: it is written into a hidden folder beside it
 import csv
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -37,11 +36,12 @@ from fcslam.runs.tables import (
     read_localized,
     read_metrics,
     read_robots,
+    read_tum,
     write_closures,
     write_localized,
     write_robots,
+    write_tum,
 )
-from fcslam.runs.trajectories import read_tum, write_tum
 from fcslam.storage.files import bring_back, replacing_folder
 from fcslam.storage.own_files import write_own
 from fcslam.untrusted import read_bytes, read_text
@@ -97,7 +97,12 @@ class Run:
         Raises:
             EvaluationError: a map file is broken or has no description.
         """
-        return dict(sorted(self._decoded_maps()))
+        decoded = {}
+        for name, pgm in self.map_files.items():
+            if match := _MAP_FILE.fullmatch(name):
+                description = self.map_files.get(f"{name.removesuffix('.pgm')}.yaml", b"").decode(errors="replace")
+                decoded[int(match[1] or 0)] = parse_map(name, pgm, description)
+        return dict(sorted(decoded.items()))
 
     def save(self, folder: StrPath, force: bool = False) -> None:
         """Write the run folder, whole or not at all.
@@ -111,14 +116,12 @@ class Run:
                 file name, or writing fails.
         """
         check_names([*self.trajectories, *self.local_maps, *self.map_files])
-        with _staged(prepare_output(Path(folder), force)) as place:
-            _write(self, place)
-
-    def _decoded_maps(self) -> Iterator[tuple[int, OccupancyMap]]:
-        for name, pgm in self.map_files.items():
-            if match := _MAP_FILE.fullmatch(name):
-                description = self.map_files.get(f"{name.removesuffix('.pgm')}.yaml", b"").decode(errors="replace")
-                yield int(match[1] or 0), parse_map(name, pgm, description)
+        place = prepare_output(Path(folder), force)
+        try:
+            with replacing_folder(place) as staging:
+                _write(self, staging)
+        except OSError as error:
+            raise OutputError(f"{place}: cannot write the run ({error})") from error
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
@@ -190,15 +193,17 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         )
     try:
         robots = read_robots(path / ROBOTS, path)
+        pictures, certificates = (*path.glob("map*.*"), *path.glob("plan.*")), path.glob(f"{QUALITY}*.*")
+        own_maps = robots if maps and (path / LOCAL).exists() else ()
         return Run(
             trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
             closures=read_closures(path / CLOSURES, path),
             metrics=read_metrics(path / METRICS, path),
             config_yaml=read_text(path / CONFIG, path),
             pose_graph_g2o=read_text(path / POSE_GRAPH, path) if maps else "",
-            map_files={file.name: read_bytes(file, path) for file in _map_files(path) if maps},
-            local_maps=_read_local_maps(path, robots) if maps else {},
-            quality={file.name: read_bytes(file, path) for file in sorted(path.glob(f"{QUALITY}*.*")) if maps},
+            map_files={file.name: read_bytes(file, path) for file in sorted(pictures) if maps},
+            local_maps={robot: _read_local_map(path, robot) for robot in own_maps},
+            quality={file.name: read_bytes(file, path) for file in sorted(certificates) if maps},
             mission=read_bytes(path / MISSION, path) if maps and (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
@@ -206,27 +211,17 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         raise EvaluationError(f"{path}: a damaged run folder ({error})") from error
 
 
-def _map_files(folder: Path) -> list[Path]:
-    return sorted((*folder.glob("map*.*"), *folder.glob("plan.*")))
-
-
-@contextmanager
-def _staged(place: Path) -> Iterator[Path]:
-    try:
-        with replacing_folder(place) as folder:
-            yield folder
-    except OSError as error:
-        raise OutputError(f"{place}: cannot write the run ({error})") from error
-
-
 def _write(run: Run, folder: Path) -> None:
     (folder / TRAJECTORIES).mkdir()
     for trajectory in run.trajectories.values():
-        write_tum(_tum_path(folder, trajectory.robot), trajectory.stamps, trajectory.T_map_base)
+        write_tum(folder / TRAJECTORIES / f"{trajectory.robot}.tum", trajectory.stamps, trajectory.T_map_base)
     if run.local_maps:
         (folder / LOCAL).mkdir()
     for local in run.local_maps.values():
-        _write_local_map(folder / LOCAL, local)
+        own = folder / LOCAL / local.robot
+        write_tum(Path(f"{own}.tum"), local.stamps, local.T_local_base)
+        Path(f"{own}.pgm").write_bytes(local.pgm)
+        Path(f"{own}.yaml").write_text(local.yaml, encoding="utf-8")
     if run.localized:
         (folder / LOCALIZATION).mkdir()
     for poses in run.localized.values():
@@ -244,25 +239,11 @@ def _write(run: Run, folder: Path) -> None:
         (folder / name).write_bytes(content)
 
 
-def _tum_path(folder: Path, robot: str) -> Path:
-    return folder / TRAJECTORIES / f"{robot}.tum"
-
-
 def _read_trajectory(folder: Path, robot: str, map_index: int, floor: str) -> RobotTrajectory:
     if not _SAFE_NAME.fullmatch(robot):
         raise ValueError(f"{ROBOTS}: {robot!r} is not a robot's name")
-    stamps, poses = read_tum(_tum_path(folder, robot), folder)
+    stamps, poses = read_tum(folder / TRAJECTORIES / f"{robot}.tum", folder)
     return RobotTrajectory(robot, map_index, stamps, poses, floor)
-
-
-def _write_local_map(folder: Path, local: LocalMap) -> None:
-    write_tum(folder / f"{local.robot}.tum", local.stamps, local.T_local_base)
-    (folder / f"{local.robot}.pgm").write_bytes(local.pgm)
-    (folder / f"{local.robot}.yaml").write_text(local.yaml, encoding="utf-8")
-
-
-def _read_local_maps(run: Path, robots: Iterable[str]) -> dict[str, LocalMap]:
-    return {robot: _read_local_map(run, robot) for robot in robots} if (run / LOCAL).exists() else {}
 
 
 def _read_local_map(run: Path, robot: str) -> LocalMap:

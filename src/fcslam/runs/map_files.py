@@ -76,7 +76,12 @@ def pixels_of(cells: Cells) -> NDArray[np.uint8]:
     pixels = np.zeros(256, np.uint8)
     for known, pixel in PIXELS.items():
         pixels[known] = pixel
-    return np.frombuffer(cells.tobytes().translate(pixels.tobytes()), np.uint8).reshape(cells.shape)
+    return _looked_up(pixels, cells)
+
+
+def _looked_up(table: NDArray[np.uint8], values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """``table[values]``, bytes by bytes: an index array would take eight times as much memory."""
+    return np.frombuffer(values.tobytes().translate(table.tobytes()), np.uint8).reshape(values.shape)
 
 
 def map_yaml(occupancy: OccupancyMap, image: str) -> str:
@@ -117,9 +122,18 @@ class MapArea(NamedTuple):
 def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
     """As ``parse_map``, without a copy of the image, which may be large."""
     try:
-        return _image(pgm, description)
+        width, height, begin = _size(pgm)
+        if len(pgm) - begin != width * height:
+            raise ValueError(f"the image has {len(pgm) - begin} pixels, not {width} x {height}")
+        resolution_m, origin_xy, occupied_threshold, free_threshold = _own_description(description)
     except ValueError as error:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+    occupancy = (255 - np.arange(256)) / 255.0
+    known = np.full(256, Occupancy.UNKNOWN, np.uint8)
+    known[occupancy < free_threshold] = Occupancy.FREE
+    known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
+    pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
+    return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
 
 
 def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
@@ -135,9 +149,8 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
             number that is out of range, or rotates or negates the image.
     """
     image = parse_image(name, pgm, description)
-    # Bytes by bytes: an index array would take eight times as much memory as the image.
-    cells = np.frombuffer(image.pixels.tobytes().translate(image.meaning.tobytes()), np.uint8)
-    return OccupancyMap(frozen(cells.reshape(image.pixels.shape), np.uint8), image.resolution_m, image.origin_xy)
+    cells = frozen(_looked_up(image.meaning, image.pixels), np.uint8)
+    return OccupancyMap(cells, image.resolution_m, image.origin_xy)
 
 
 def area_of(name: str, header: bytes, description: str) -> MapArea:
@@ -147,23 +160,10 @@ def area_of(name: str, header: bytes, description: str) -> MapArea:
     """
     try:
         width, height, _ = _size(header)
-        resolution_m, (x, y), *_ = _described(description)
+        resolution_m, (x, y), *_ = _own_description(description)
     except ValueError as error:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
     return MapArea(resolution_m, (x, y, x + width * resolution_m, y + height * resolution_m))
-
-
-def _image(pgm: bytes, description: str) -> MapImage:
-    width, height, begin = _size(pgm)
-    if len(pgm) - begin != width * height:
-        raise ValueError(f"the image has {len(pgm) - begin} pixels, not {width} x {height}")
-    resolution_m, origin_xy, occupied_threshold, free_threshold = _described(description)
-    occupancy = (255 - np.arange(256)) / 255.0
-    known = np.full(256, Occupancy.UNKNOWN, np.uint8)
-    known[occupancy < free_threshold] = Occupancy.FREE
-    known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
-    pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
-    return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
 
 
 def _size(pgm: bytes) -> tuple[int, int, int]:
@@ -174,8 +174,23 @@ def _size(pgm: bytes) -> tuple[int, int, int]:
     return int(header[1]), int(header[2]), header.end()
 
 
-def _described(description: str) -> tuple[float, tuple[float, float], float, float]:
+def _own_description(description: str) -> tuple[float, tuple[float, float], float, float]:
     """Resolution, origin, threshold of occupied cells, threshold of free cells."""
+    content, resolution_m, (x, y, theta), occupied, free = read_description(description)
+    if not 0.0 <= free <= occupied <= 1.0:
+        raise ValueError("the description needs 0 <= `free_thresh` <= `occupied_thresh` <= 1")
+    if content.get("negate", 0) or content.get("mode", "trinary") != "trinary" or theta != 0.0:
+        raise ValueError("the description needs `negate` 0, `mode` trinary and a theta of 0 in `origin`")
+    return resolution_m, (x, y), occupied, free
+
+
+def read_description(description: str) -> tuple[dict[str, Any], float, tuple[float, float, float], float, float]:
+    """Content, resolution (m), origin (x, y in m, theta in rad) and thresholds of occupied and of free cells in the
+    YAML file of a map, of whatever program.
+
+    Raises:
+        ValueError: it is not a description, or a number is missing or out of range.
+    """
     content: Any = parse_yaml(description)
     if not isinstance(content, dict):
         raise ValueError("the description is not a YAML mapping")
@@ -185,11 +200,7 @@ def _described(description: str) -> tuple[float, tuple[float, float], float, flo
         raise ValueError("`origin` in the description must be [x, y, theta]")
     x, y, theta = (number_in({"origin": value}, "origin") for value in origin)
     check_place(resolution_m, x, y)
-    if not 0.0 <= free <= occupied <= 1.0:
-        raise ValueError("the description needs 0 <= `free_thresh` <= `occupied_thresh` <= 1")
-    if content.get("negate", 0) or content.get("mode", "trinary") != "trinary" or theta != 0.0:
-        raise ValueError("the description needs `negate` 0, `mode` trinary and a theta of 0 in `origin`")
-    return resolution_m, (x, y), occupied, free
+    return content, resolution_m, (x, y, theta), occupied, free
 
 
 def check_place(resolution_m: float, x: float, y: float) -> None:

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.config import one_line, parse_yaml
+from fcslam.config import one_line
 from fcslam.errors import EvaluationError
 from fcslam.records import frozen
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, check_place, number_in
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, number_in, read_description
 from fcslam.untrusted import check_image
 
 _MODES: Final = ("trinary", "scale", "raw")
@@ -52,17 +52,10 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
 
 
 def _map(image: bytes, description: str) -> OccupancyMap:
-    content: Any = parse_yaml(description)
-    if not isinstance(content, dict):
-        raise ValueError("the description is not a YAML mapping")
-    resolution_m, occupied, free = (number_in(content, key) for key in ("resolution", "occupied_thresh", "free_thresh"))
-    mode, origin = content.get("mode", "trinary"), content.get("origin")
+    content, resolution_m, (x, y, yaw), occupied, free = read_description(description)
+    mode = content.get("mode", "trinary")
     if mode not in _MODES:
         raise ValueError(f"`mode` is {one_line(repr(mode))}; use one of {', '.join(_MODES)}")
-    if not isinstance(origin, list) or len(origin) != 3:
-        raise ValueError("`origin` in the description must be [x, y, theta]")
-    x, y, yaw = (number_in({"origin": value}, "origin") for value in origin)
-    check_place(resolution_m, x, y)
     grey, opaque = _decoded(image)
     occupancy = _occupancy(mode, negate=number_in({"negate": 0, **content}, "negate") != 0.0)
     by_grey = np.full(256, Occupancy.UNKNOWN, np.uint8)

@@ -1,4 +1,4 @@
-"""The tables of a run folder: robots, closures, metrics."""
+"""The tables of a run folder: trajectories (TUM), robots, closures, metrics."""
 
 import csv
 import io
@@ -6,10 +6,11 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
+from fcslam.errors import EvaluationError
 from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTrajectory
 from fcslam.untrusted import read_text
@@ -23,13 +24,51 @@ _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "quality"]
 _REASON_COLUMNS = ["reason", "value", "limit", "setting"]
 _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", *_REASON_COLUMNS]
+_TUM_LINE = "%.9f %.9f %.9f 0 0 0 %.9f %.9f\n"
+
+
+def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray) -> None:
+    """Write poses (N, 3) as TUM lines ``stamp x y 0 0 0 qz qw``, nine digits after the point."""
+    half = T_map_base[:, 2] / 2.0
+    rows = np.column_stack((stamps, T_map_base[:, :2], np.sin(half), np.cos(half)))
+    text = "".join(_TUM_LINE % tuple(row) for row in rows.tolist()).encode()
+    if isinstance(path, Path):
+        path.write_bytes(text)
+    else:
+        path.write(text)
+
+
+def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
+    """Stamps (N,) and poses (N, 3) of a TUM file, in its order; ``within``: see ``untrusted.open_file``.
+
+    Raises:
+        EvaluationError: the file cannot be read or a line is not eight finite numbers.
+    """
+    try:
+        rows = [_tum_fields(line) for line in read_text(path, within).splitlines() if line.strip()]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: not a TUM trajectory ({error})") from error
+    if not np.all(np.isfinite(table)):
+        raise EvaluationError(f"{path}: not a TUM trajectory (a number that is not finite)")
+    theta = 2.0 * np.arctan2(table[:, 6], table[:, 7])
+    poses = np.column_stack((table[:, 1], table[:, 2], np.arctan2(np.sin(theta), np.cos(theta))))
+    return frozen(table[:, 0]), frozen(poses)
+
+
+def _tum_fields(line: str) -> list[float]:
+    fields = [float(text) for text in line.split()]
+    if len(fields) != 8:
+        raise ValueError(f"a line of {len(fields)} numbers, expected 8")
+    return fields
 
 
 def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
     """Write robots.csv."""
     robots = list(trajectories)
     columns = [*_ROBOT_COLUMNS, _FLOOR] if any(robot.floor for robot in robots) else _ROBOT_COLUMNS
-    _write_csv(path, columns, (_robot_fields(robot)[: len(columns)] for robot in robots))
+    fields = ([r.robot, r.map_index, f"{r.path_length_m:.3f}", len(r.stamps), r.floor] for r in robots)
+    _write_csv(path, columns, (row[: len(columns)] for row in fields))
 
 
 def read_robots(path: Path, within: Path | None = None) -> dict[str, tuple[int, str]]:
@@ -124,23 +163,16 @@ def _unique(file: str, items: Iterable[tuple[str, _Value]]) -> dict[str, _Value]
     return found
 
 
-def _robot_fields(trajectory: RobotTrajectory) -> list[Any]:
-    length_m, scans = f"{trajectory.path_length_m:.3f}", len(trajectory.stamps)
-    return [trajectory.robot, trajectory.map_index, length_m, scans, trajectory.floor]
-
-
 def _closure_fields(closure: ClosureRow) -> list[Any]:
     ends = [closure.robot_i, f"{closure.stamp_i:.9f}", closure.robot_j, f"{closure.stamp_j:.9f}"]
     numbers = [f"{number:.6f}" for number in (closure.similarity, *closure.T_i_j)]
-    return [*ends, closure.channel.value, *numbers, closure.status.value, *_reason_fields(closure.reason)]
-
-
-def _reason_fields(reason: Reason) -> list[str]:
-    numbers = ["" if number is None else f"{number:.6g}" for number in (reason.value, reason.limit)]
-    return [reason.code.value, *numbers, reason.setting]
+    reason = closure.reason
+    known = ["" if number is None else f"{number:.6g}" for number in (reason.value, reason.limit)]
+    return [*ends, closure.channel.value, *numbers, closure.status.value, reason.code.value, *known, reason.setting]
 
 
 def _read_closure(row: dict[str, str]) -> ClosureRow:
+    value, limit = (float(row[column]) if row[column] else None for column in ("value", "limit"))
     return ClosureRow(
         robot_i=row["robot_i"],
         stamp_i=float(row["stamp_i"]),
@@ -150,13 +182,8 @@ def _read_closure(row: dict[str, str]) -> ClosureRow:
         similarity=float(row["similarity"]),
         T_i_j=frozen([float(row[axis]) for axis in ("x", "y", "theta")]),
         status=ClosureStatus(row["status"]),
-        reason=_read_reason(row),
+        reason=Reason(ReasonCode(row["reason"]), value, limit, row["setting"]),
     )
-
-
-def _read_reason(row: dict[str, str]) -> Reason:
-    value, limit = (float(row[column]) if row[column] else None for column in ("value", "limit"))
-    return Reason(ReasonCode(row["reason"]), value, limit, row["setting"])
 
 
 def _write_csv(path: Path, columns: list[str], rows: Iterable[list[Any]]) -> None:

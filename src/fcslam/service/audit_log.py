@@ -4,11 +4,13 @@ import json
 import logging
 import math
 import os
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 REFUSED_EVERY_S = 60.0
 """Refused logins make one line in this time at most, so no client without a token can fill the disk."""
@@ -36,9 +38,16 @@ class AuditEntry:
     """The content of the request, without secrets."""
 
 
-class AuditPlace(Protocol):
-    """Where the lines of the log are."""
+class AuditLog(ABC):
+    """Lines that only the service appends."""
 
+    def __init__(self, wall_clock: Callable[[], float]) -> None:
+        self._wall_clock = wall_clock
+        self._refused, self._refused_from = 0, ""
+        """Refused logins that have no line yet, and where the last one came from."""
+        self._line_at = -math.inf
+
+    @abstractmethod
     def append(self, line: bytes) -> None:
         """Append a line.
 
@@ -46,60 +55,23 @@ class AuditPlace(Protocol):
             OSError: it is lost.
         """
 
-    def newest(self, limit: int) -> list[bytes]:
+    @abstractmethod
+    def lines(self, limit: int) -> list[bytes]:
         """At most ``limit`` newest lines, the oldest of them first.
 
         Raises:
             OSError: the log cannot be read.
         """
 
-
-class AuditFile:
-    """A file that is written in one thread and may be read in any."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __str__(self) -> str:
-        return str(self._path)
-
-    def append(self, line: bytes) -> None:
-        """As in AuditPlace."""
-        file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-        try:
-            os.write(file, line + b"\n")
-        finally:
-            os.close(file)
-
-    def newest(self, limit: int) -> list[bytes]:
-        """As in AuditPlace."""
-        try:
-            with self._path.open("rb") as file:
-                start = max(0, file.seek(0, os.SEEK_END) - _READ_BYTES)
-                file.seek(start)
-                return file.read().splitlines()[1 if start else 0 :][-limit:]
-        except FileNotFoundError:
-            return []
-
-
-class AuditLog:
-    """Lines that only the service appends."""
-
-    def __init__(self, place: AuditPlace, wall_clock: Callable[[], float]) -> None:
-        self._place, self._wall_clock = place, wall_clock
-        self._refused, self._refused_from = 0, ""
-        """Refused logins that have no line yet, and where the last one came from."""
-        self._line_at = -math.inf
-
     def record(self, who: str, address: str, action: str, status: int, content: Mapping[str, Any]) -> None:
         """Append what somebody did. A disk that is full loses the line, which the service's own log then says."""
-        time = datetime.fromtimestamp(self._wall_clock(), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-        entry = AuditEntry(time, who, address, action, status, content)
+        at = datetime.fromtimestamp(self._wall_clock(), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        entry = AuditEntry(at, who, address, action, status, content)
         line = json.dumps(asdict(entry), separators=(",", ":")).encode()
         try:
-            self._place.append(line)
+            self.append(line)
         except OSError as error:
-            _log.error("%s: cannot be written (%s); lost: %s", self._place, error, line.decode())
+            _log.error("%s: cannot be written (%s); lost: %s", self, error, line.decode())
 
     def refuse_login(self, address: str) -> None:
         """Count a request that no known token or certificate came with."""
@@ -114,9 +86,34 @@ class AuditLog:
             self._refused, self._line_at = 0, self._wall_clock() + REFUSED_EVERY_S
 
     def newest(self, limit: int) -> list[AuditEntry]:
-        """At most ``limit`` newest lines, the oldest of them first.
+        """The entries of ``lines``."""
+        return [AuditEntry(**json.loads(line)) for line in self.lines(limit)]
 
-        Raises:
-            OSError: the log cannot be read.
-        """
-        return [AuditEntry(**json.loads(line)) for line in self._place.newest(limit)]
+
+class AuditFile(AuditLog):
+    """A file that is written in one thread and may be read in any."""
+
+    def __init__(self, path: Path, wall_clock: Callable[[], float] = time.time) -> None:
+        super().__init__(wall_clock)
+        self._path = path
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def append(self, line: bytes) -> None:
+        """As in ``AuditLog``."""
+        file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        try:
+            os.write(file, line + b"\n")
+        finally:
+            os.close(file)
+
+    def lines(self, limit: int) -> list[bytes]:
+        """As in ``AuditLog``."""
+        try:
+            with self._path.open("rb") as file:
+                start = max(0, file.seek(0, os.SEEK_END) - _READ_BYTES)
+                file.seek(start)
+                return file.read().splitlines()[1 if start else 0 :][-limit:]
+        except FileNotFoundError:
+            return []

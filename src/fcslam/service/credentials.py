@@ -33,6 +33,18 @@ AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
 """Longest validity of a server certificate that clients accept."""
 TOKEN_BYTES = 32
 
+_USAGES = (
+    "digital_signature",
+    "content_commitment",
+    "key_encipherment",
+    "data_encipherment",
+    "key_agreement",
+    "key_cert_sign",
+    "crl_sign",
+    "encipher_only",
+    "decipher_only",
+)
+
 Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 
@@ -90,61 +102,53 @@ def _authority(folder: Path, now: datetime.datetime) -> Authority:
         if not isinstance(found, ec.EllipticCurvePrivateKey):
             raise ValueError("ca.key is not a key of ours")
         return x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes()), found
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fcslam development authority")])
-    builder = _builder(name, name, key, now, AUTHORITY_DAYS)
-    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-    usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
-    certificate = builder.add_extension(x509.KeyUsage(**usage), critical=True).sign(key, hashes.SHA256())
-    _write_pair(folder / "ca", certificate, key)
-    return certificate, key
+    return _issue(folder / "ca", "fcslam development authority", now)
 
 
 def _make_leaf(
     stem: Path,
-    common_name: str,
+    name: str,
     purposes: Sequence[x509.ObjectIdentifier],
     hosts: Sequence[x509.GeneralName],
     authority: Authority,
     now: datetime.datetime,
 ) -> None:
     """A certificate of the authority's, good for these purposes; that of a host names it."""
+    more: list[x509.ExtensionType] = [x509.ExtendedKeyUsage(purposes)]
+    more += [x509.SubjectAlternativeName(hosts)] if hosts else []
+    more.append(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority[1].public_key()))
+    _issue(stem, name, now, authority, more)
+
+
+def _issue(
+    stem: Path,
+    name: str,
+    now: datetime.datetime,
+    authority: Authority | None = None,
+    more: Sequence[x509.ExtensionType] = (),
+) -> Authority:
+    """Write a certificate and its key: of an authority, or signed by one and with more extensions."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
-    builder = _builder(name, authority[0].subject, key, now, LEAF_DAYS)
-    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-    usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
-    builder = builder.add_extension(x509.KeyUsage(**usage), critical=True)
-    builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-    if hosts:
-        builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
-    signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority[1].public_key())
-    certificate = builder.add_extension(signer, critical=False).sign(authority[1], hashes.SHA256())
-    _write_pair(stem, certificate, key)
-
-
-_USAGES = (
-    "digital_signature",
-    "content_commitment",
-    "key_encipherment",
-    "data_encipherment",
-    "key_agreement",
-    "key_cert_sign",
-    "crl_sign",
-    "encipher_only",
-    "decipher_only",
-)
-
-
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime.datetime, days: int
-) -> x509.CertificateBuilder:
-    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
-    builder = builder.serial_number(x509.random_serial_number())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    issuer, signer = (subject, key) if authority is None else (authority[0].subject, authority[1])
+    days = AUTHORITY_DAYS if authority is None else LEAF_DAYS
+    builder = x509.CertificateBuilder(issuer, subject, key.public_key(), x509.random_serial_number())
     # clocks of robots may be behind
     builder = builder.not_valid_before(now - datetime.timedelta(days=1))
     builder = builder.not_valid_after(now + datetime.timedelta(days=days))
-    return builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    builder = builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    limits = x509.BasicConstraints(ca=authority is None, path_length=0 if authority is None else None)
+    allowed = dict.fromkeys(("key_cert_sign", "crl_sign") if authority is None else ("digital_signature",), True)
+    usage = x509.KeyUsage(**dict.fromkeys(_USAGES, False) | allowed)
+    builder = builder.add_extension(limits, critical=True).add_extension(usage, critical=True)
+    for extension in more:
+        builder = builder.add_extension(extension, critical=False)
+    certificate = builder.sign(signer, hashes.SHA256())
+    form, encryption = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    secret = key.private_bytes(serialization.Encoding.PEM, form, encryption)
+    write_file(stem.with_name(f"{stem.name}.key"), secret, private=True)
+    write_file(stem.with_name(f"{stem.name}.pem"), certificate.public_bytes(serialization.Encoding.PEM))
+    return certificate, key
 
 
 def _host(host: str) -> x509.GeneralName:
@@ -175,13 +179,3 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
     if before is not None:  # the service still reads it if another user runs this
         path.chmod(stat.S_IMODE(before.st_mode))
         os.chown(path, before.st_uid, before.st_gid)
-
-
-def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
-    form, encryption = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    write_file(
-        stem.with_name(f"{stem.name}.key"),
-        key.private_bytes(serialization.Encoding.PEM, form, encryption),
-        private=True,
-    )
-    write_file(stem.with_name(f"{stem.name}.pem"), certificate.public_bytes(serialization.Encoding.PEM))

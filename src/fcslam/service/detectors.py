@@ -53,9 +53,7 @@ class DetectorStore:
         with tempfile.TemporaryDirectory(dir=self._root, prefix=STAGING) as folder:
             staging = Path(folder) / "network.onnx"
             staging.write_bytes(content)
-            file = describe_detector_file(
-                staging
-            )  # loads the network: robots that ask what is announced do not wait for that
+            file = describe_detector_file(staging)  # without the lock: it loads the network
             place = self.path(file.channel, file.version)
             place.parent.mkdir(exist_ok=True)
             with self._lock:

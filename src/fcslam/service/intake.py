@@ -235,16 +235,13 @@ class Intake:
 
     def _replies(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
         announced, newest = self._announced(), epochs[-1] if epochs else None
+        hello = self._store.newest_hello(robot, newest) if announced and newest is not None else None
         state = ReplyState(
             {epoch: self._log.next_sequence(session_name(robot, epoch)) for epoch in epochs},
             None if newest is None else self._store.correction(robot, newest),
-            self._detector_versions(robot, newest) if announced and newest is not None else None,
+            None if hello is None else hello.detector_versions,
         )
         return write_batch(encode(reply) for reply in replies(robot, state, known_correction, announced))
-
-    def _detector_versions(self, robot: str, epoch: int) -> Mapping[Channel, str] | None:
-        hello = self._store.newest_hello(robot, epoch)
-        return None if hello is None else hello.detector_versions
 
 
 def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:

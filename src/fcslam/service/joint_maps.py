@@ -57,21 +57,16 @@ class JointSession:
     """When that took effect, seconds since 1970; 0: not known."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class JointMaps:
     """The joint maps of one moment."""
 
-    def __init__(
-        self,
-        sessions: Sequence[JointSession],
-        grids: Mapping[int, OccupancyMap],
-        frames: Mapping[int, str],
-        robot_radius_m: float = 0.0,
-    ) -> None:
-        self.sessions = tuple(sessions)
-        """One for each robot: its newest session."""
-        self.grids, self.frames = grids, frames
-        """By number of the map."""
-        self.robot_radius_m = robot_radius_m
+    sessions: Sequence[JointSession]
+    """One for each robot: its newest session."""
+    grids: Mapping[int, OccupancyMap]
+    frames: Mapping[int, str]
+    """By number of the map, as the grids."""
+    robot_radius_m: float = 0.0
 
 
 def joint_maps_of(result: FleetResult, heard_s: Mapping[tuple[str, int], float], config: OccupancyConfig) -> JointMaps:
@@ -148,8 +143,7 @@ def read_joint_maps(path: Path) -> JointMaps:
     return JointMaps(sessions, grids, frames, radius_m)
 
 
-@dataclass(frozen=True, slots=True)
-class LivePose:
+class LivePose(NamedTuple):
     """A pose that a robot says it has."""
 
     map: int

@@ -14,7 +14,6 @@ lock                                 held by the service that uses the folder
 
 import os
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -22,11 +21,18 @@ from fcslam.runs import Run
 from fcslam.wire.checks import check_name
 
 
-@dataclass(frozen=True, slots=True)
 class MissionFolder:
     """One mission's files."""
 
-    path: Path
+    def __init__(self, path: Path) -> None:
+        self.path, self.name = path, path.name
+        self.store = path / "mission.sqlite"
+        self.live = path / "live"
+        """A link to a run folder, which is replaced atomically."""
+        self.joint_maps = path / "joint.maps"
+        self.snapshot = path / "worker.state"
+        self.worker_task = path / "worker.task"
+        self.worker_lock = path / "worker.lock"
 
     @classmethod
     def of(cls, root: Path, name: str) -> Self:
@@ -37,41 +43,6 @@ class MissionFolder:
         """
         check_name(name, "mission")
         return cls(root / "missions" / name)
-
-    @property
-    def name(self) -> str:
-        """Name of the mission."""
-        return self.path.name
-
-    @property
-    def store(self) -> Path:
-        """The mission store's file."""
-        return self.path / "mission.sqlite"
-
-    @property
-    def live(self) -> Path:
-        """The run folder of the current estimate: a link that is replaced atomically."""
-        return self.path / "live"
-
-    @property
-    def joint_maps(self) -> Path:
-        """The joint maps of the current estimate, for robots."""
-        return self.path / "joint.maps"
-
-    @property
-    def snapshot(self) -> Path:
-        """The worker's state, from which the next worker goes on; it may be deleted."""
-        return self.path / "worker.state"
-
-    @property
-    def worker_task(self) -> Path:
-        """The present task of the worker, for the worker after it."""
-        return self.path / "worker.task"
-
-    @property
-    def worker_lock(self) -> Path:
-        """Held by the mission's worker."""
-        return self.path / "worker.lock"
 
     def run(self, name: str) -> Path:
         """The run folder of a requested result."""

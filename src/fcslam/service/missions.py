@@ -2,7 +2,7 @@
 
 import fcntl
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
@@ -24,12 +24,12 @@ FIRST = "mission"
 IMPORT, EXPORT = ".import", ".export"
 """Prefixes of temporary folders of imported and exported missions."""
 
-Launch = Callable[[MissionFolder], RunningWorker]
-"""Starts the worker of a mission."""
-
 
 class UnknownMissionError(ServiceError):
     """There is no mission of a name."""
+
+    def __init__(self, name: str, names: Iterable[str]) -> None:
+        super().__init__(f"there is no mission '{name}'; there are {', '.join(names)}")
 
 
 class OpenMission:
@@ -127,8 +127,7 @@ def _check_file(folder: MissionFolder) -> None:
     if folder.worker_lock.exists() and not (folder.store.exists() and folder.store.stat().st_size):
         raise StoreError(
             f"{folder.store}: the mission's file is missing or empty; put its backup in its place, or move "
-            f"{folder.path} "
-            "away to begin a new mission"
+            f"{folder.path} away to begin a new mission"
         )
 
 
@@ -141,9 +140,9 @@ class Missions:
         config: CloudConfig,
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
-        launch: Launch,
+        launch: Callable[[MissionFolder], RunningWorker],
     ) -> None:
-        """Open the mission that was open last, or create the first one.
+        """Open the mission that was open last, or create the first one; ``launch`` starts the worker of a mission.
 
         Raises:
             ServiceError: the folder cannot be used, or another service uses it.
@@ -183,7 +182,7 @@ class Missions:
             ServiceError: no mission has this name.
         """
         if not MissionFolder.of(self.root, name).store.exists():
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise UnknownMissionError(name, self.names)
         self._switch(name)
 
     def result(self, name: str, number: int) -> Path | None:
@@ -206,7 +205,7 @@ class Missions:
             self.open_mission.store.export(path)
             return
         if not folder.store.exists():
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise UnknownMissionError(name, self.names)
         store = MissionStore(folder.store)
         try:
             store.export(path)

@@ -29,7 +29,7 @@ from fcslam.service.http.responses import (
     MapSummary,
     SessionSummary,
 )
-from fcslam.service.live_poses import live_pose
+from fcslam.service.keyscans import live_pose
 from fcslam.service.map_layers import layers_of
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes

@@ -6,10 +6,11 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from fcslam.cloud.stage_times import StageTotal
 
@@ -26,9 +27,6 @@ PROGRESS = "progress"
 STAGE_RUNS, STAGE_MS = "runs of ", "ms of "
 """Before the name of a stage: the events by which a worker reports how often it ran, and how many milliseconds it took
 in all. The supervisor keeps the numbers."""
-
-Listen = Callable[[str, int], None]
-"""Called with a worker's events, on a separate thread."""
 
 
 def tell(event: str, number: int) -> None:
@@ -73,9 +71,6 @@ WORKER = (sys.executable, "-m", "fcslam.service.worker")
 SPARE = "--spare"
 """The only argument of a worker that gets its other arguments later, as a line of JSON on stdin."""
 
-StartWorker = Callable[[Sequence[str]], subprocess.Popen[bytes]]
-"""Starts the process of a worker."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -91,52 +86,37 @@ class Supervisor:
     def __init__(
         self,
         folder: Path,
-        clock: Callable[[], float],
-        listen: Listen,
+        listen: Callable[[str, int], None],
         command: Sequence[str] = WORKER,
-        start: StartWorker = start_worker,
+        start: Callable[[Sequence[str]], subprocess.Popen[bytes]] = start_worker,
     ) -> None:
-        """``start`` makes a process of ``command``, to which the folder, of a mission for instance, is added."""
+        """``listen`` is called with the worker's events, on a separate thread. ``start`` makes a process of
+        ``command``, to which the folder, of a mission for instance, is added.
+        """
         self._command, self._start = (*command, str(folder)), start
-        self._clock, self._listen = clock, listen
+        self._listen = listen
         self._stopping = threading.Event()
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._starts = 0
         self._is_ready = False
-        self._applied = 0
-        self._stages: dict[str, StageTotal] = {}
+        self.starts, self.applied = 0, 0
+        self.stages: Mapping[str, StageTotal] = {}
         self._thread = threading.Thread(target=self._run, name=f"worker of {folder.name}", daemon=True)
         self._thread.start()
 
     @property
     def pid(self) -> int | None:
-        """Process id of the worker; None while no worker runs."""
+        """As in ``RunningWorker``."""
         process = self._process
         return process.pid if process is not None and process.poll() is None else None
 
     @property
-    def starts(self) -> int:
-        """How often a worker was started."""
-        return self._starts
-
-    @property
     def is_ready(self) -> bool:
-        """Whether the worker runs and reported that it is ready."""
+        """As in ``RunningWorker``."""
         return self._is_ready and self.pid is not None
 
-    @property
-    def applied(self) -> int:
-        """How many packets the present worker has applied, those of its snapshot included."""
-        return self._applied
-
-    @property
-    def stages(self) -> Mapping[str, StageTotal]:
-        """Totals of the present worker's stages, by name."""
-        return dict(self._stages)
-
     def notify(self) -> None:
-        """Notify the worker of new packets or requests."""
+        """As in ``RunningWorker``."""
         with self._lock:
             if self._process is not None and self._process.stdin is not None:
                 # One that is gone is followed by one that looks for itself, and one that has not read its rings yet
@@ -154,14 +134,14 @@ class Supervisor:
     def _run(self) -> None:
         pause_s = 0.5
         while not self._stopping.is_set():
-            began = self._clock()
+            began = time.monotonic()
             try:
                 ended = f"ended with code {self._watch_one()}"
             except Exception as error:  # no program, no memory for it: that may pass
                 ended = f"could not be run ({type(error).__name__}: {error})"
             if self._stopping.is_set():
                 return
-            pause_s = 0.5 if self._clock() - began > STEADY_S else min(2.0 * pause_s, LONGEST_PAUSE_S)
+            pause_s = 0.5 if time.monotonic() - began > STEADY_S else min(2.0 * pause_s, LONGEST_PAUSE_S)
             _log.error("the worker %s; another one starts in %.0f s", ended, pause_s)
             self._stopping.wait(pause_s)
 
@@ -172,9 +152,8 @@ class Supervisor:
             assert process.stdout is not None
             os.set_blocking(process.stdin.fileno(), False)
             with self._lock:
-                self._process, self._is_ready, self._applied = process, False, 0
-                self._starts += 1
-                self._stages = {}
+                self._process, self._is_ready = process, False
+                self.starts, self.applied, self.stages = self.starts + 1, 0, {}
                 if self._stopping.is_set():
                     self._end_input()
             try:
@@ -192,17 +171,18 @@ class Supervisor:
             if event == READY:
                 self._is_ready = True
             elif event == PROGRESS:
-                self._applied = number
+                self.applied = number
             elif event.startswith(STAGE_RUNS):
-                stage = event.removeprefix(STAGE_RUNS)
-                self._stages[stage] = self._stages.get(stage, StageTotal(0, 0.0))._replace(runs=number)
+                self._note_stage(event.removeprefix(STAGE_RUNS), runs=number)
             elif event.startswith(STAGE_MS):
-                stage = event.removeprefix(STAGE_MS)
-                self._stages[stage] = self._stages.get(stage, StageTotal(0, 0.0))._replace(seconds=1e-3 * number)
+                self._note_stage(event.removeprefix(STAGE_MS), seconds=1e-3 * number)
             else:
                 self._listen(event, number)
         except (ValueError, TypeError, KeyError):
             _log.error("unreadable event of the worker: %.200r", line)
+
+    def _note_stage(self, stage: str, **change: Any) -> None:
+        self.stages = {**self.stages, stage: self.stages.get(stage, StageTotal(0, 0.0))._replace(**change)}
 
     def _end_input(self) -> None:
         if self._process is not None and self._process.stdin is not None:

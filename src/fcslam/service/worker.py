@@ -29,7 +29,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import cv2
 
@@ -42,7 +42,6 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cluster.verifying import verifying
-from fcslam.cluster.workers import Workers
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
@@ -84,7 +83,7 @@ SNAPSHOT_SHARE = 0.05
 SNAPSHOT_EVERY_S = 5.0
 """The snapshot is not written more often than this."""
 SHARED_LOOK_S = 0.25
-"""Between two looks for packets that other instances stored."""
+"""Between two looks for packets that other instances stored: nobody rings for them."""
 LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
 QUALITY_EVERY_S = 30.0
@@ -372,9 +371,7 @@ class Worker:
             result = self._result()
             self._run(result, self._store.traffic()).save(self._folder.run(name), force=True)
             self._concluded = (self._applied, self._newest_edit), result
-        except (
-            Exception
-        ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
+        except Exception as error:  # asked for again, it would fail at the next worker too, and nothing else go on
             _log.exception("result %s failed", name)
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
@@ -517,14 +514,16 @@ def main(arguments: Sequence[str]) -> int:
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     if arguments == [SPARE] and not (arguments := _told_arguments()):
         return 0
-    chosen = _chosen(arguments)
-    folder, alone = chosen.folder, _alone(chosen.folder)
-    with verifying(chosen.workers, must_connect=False) as verify_pairs, _mission(chosen) as (store, share):
+    given = _parsed(arguments)
+    folder = MissionFolder(given.folder)
+    look_s = math.inf if given.store is None else SHARED_LOOK_S
+    alone, mission = _alone(folder), _mission(folder, given.store, given.lease)
+    with verifying(given.workers, must_connect=False) as verify_pairs, mission as (store, share):
         try:
             worker = Worker(folder, store, time.monotonic, tell, start_copy, verify_pairs, share)
             tell(READY, 0)
             while True:
-                wait_s = 0.0 if worker.step() else min(worker.wait_s(), chosen.look_s)
+                wait_s = 0.0 if worker.step() else min(worker.wait_s(), look_s)
                 if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
                     break
         except LeaseLostError as error:
@@ -548,38 +547,27 @@ def _told_arguments() -> list[str]:
 
 
 @contextmanager
-def _mission(chosen: "_Chosen") -> Iterator[tuple[MissionStore, Share]]:
+def _mission(
+    folder: MissionFolder, url: str | None, lease: Sequence[int] | None
+) -> Iterator[tuple[MissionStore, Share]]:
     """The mission of a file, or of a server to which the worker has a lease."""
-    if chosen.store is None or chosen.lease is None:
-        yield MissionStore(chosen.folder.store), lambda *_: None
+    if url is None or lease is None:
+        yield MissionStore(folder.store), lambda *_: None
         return
-    with closing(Postgres(chosen.store, f"worker of {chosen.folder.name}")) as server:
-        files = SharedFiles(server, chosen.lease)
-        files.fetch_snapshot(chosen.folder)
-        yield MissionStore(MissionTables(server, chosen.lease.mission, chosen.lease)), files.put
+    with closing(Postgres(url, f"worker of {folder.name}")) as server:
+        held = Lease(*lease)
+        files = SharedFiles(server, held)
+        files.fetch_snapshot(folder)
+        yield MissionStore(MissionTables(server, held.mission, held)), files.put
 
 
-class _Chosen(NamedTuple):
-    folder: MissionFolder
-    workers: Workers
-    store: str | None
-    lease: Lease | None
-
-    @property
-    def look_s(self) -> float:
-        """Between two looks for packets that other instances stored: nobody rings for them."""
-        return math.inf if self.store is None else SHARED_LOOK_S
-
-
-def _chosen(arguments: Sequence[str]) -> _Chosen:
+def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--store")
     parser.add_argument("--lease", type=int, nargs=2, metavar=("MISSION", "FENCE"))
-    parser.add_argument("--workers", default=Workers().where)
-    given = parser.parse_args(arguments)
-    workers = Workers(given.workers)
-    return _Chosen(MissionFolder(given.folder), workers, given.store, Lease(*given.lease) if given.lease else None)
+    parser.add_argument("--workers", default="1")
+    return parser.parse_args(arguments)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:

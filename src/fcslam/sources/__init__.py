@@ -3,7 +3,7 @@
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.faults import Fault, FaultCount, Faults
-from fcslam.sources.formats import FORMATS, Format, check_copies, open_fleet, open_source
+from fcslam.sources.formats import check_copies, open_fleet, open_source
 from fcslam.sources.logs.carmen_writer import write_carmen
 from fcslam.sources.recording.reader import Recording
 from fcslam.sources.recording.writer import RecordingWriter, write_recording
@@ -12,13 +12,11 @@ from fcslam.sources.split import split
 
 __all__ = [
     "BAG_SUFFIXES",
-    "FORMATS",
     "WHOLE",
     "BagOptions",
     "Fault",
     "FaultCount",
     "Faults",
-    "Format",
     "Recording",
     "RecordingWriter",
     "ScanRange",

@@ -71,7 +71,9 @@ class OdometryWatch:
             known.rest = seen
         moved_m, turned_rad = _motion(known.turn, seen)
         turned_without_change = turned_rad > TURN_RAD and _changed_share(known.turn.scan, scan) < UNCHANGED
-        repeated = _is_repeated(known.last.scan, scan) and not _is_still(known.last, seen)
+        is_same = known.last.scan.ranges_m.tobytes() == scan.ranges_m.tobytes()
+        has_returns = np.count_nonzero(np.isfinite(scan.ranges_m) & (scan.ranges_m > 0.0)) >= FEWEST_RETURNS
+        repeated = is_same and has_returns and not _is_still(known.last, seen)
         if turned_without_change or repeated:
             self._audit.add(Fault.FROZEN_SCAN, number)
         if turned_rad > TURN_RAD or moved_m > CHANGE_M:
@@ -90,14 +92,6 @@ def _motion(before: _Seen, after: _Seen) -> tuple[float, float]:
     return hypot(x1 - x0, y1 - y0), abs(remainder(theta1 - theta0, tau))
 
 
-def _is_repeated(before: LaserScan, after: LaserScan) -> bool:
-    """Whether the ranges are the same to the last bit, and enough of them are returns."""
-    ranges_m = after.ranges_m
-    if before.ranges_m.tobytes() != ranges_m.tobytes():
-        return False
-    return bool(np.count_nonzero(np.isfinite(ranges_m) & (ranges_m > 0.0)) >= FEWEST_RETURNS)
-
-
 def _changed_share(before: LaserScan, after: LaserScan) -> float:
     """Share of the common returns that measure something else; NaN if there are too few."""
     laser, was = after.laser, before.laser
@@ -109,11 +103,9 @@ def _changed_share(before: LaserScan, after: LaserScan) -> float:
 
 
 def changed_share(before_m: Ranges, after_m: Ranges, max_range_m: float = inf) -> float:
-    """Share of the common returns of two scans that measure something else; NaN if there are too few.
+    """Share of the common returns of the same beams that measure something else; NaN if there are too few.
 
-    Args:
-        before_m, after_m: ranges of the same beams, metres; beams that only one of them has are left out.
-        max_range_m: a range at or above it is not a return.
+    Beams that only one of the scans has are left out. A range of ``max_range_m`` or more is not a return.
     """
     count = min(len(before_m), len(after_m))
     a, b = before_m[:count], after_m[:count]

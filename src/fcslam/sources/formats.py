@@ -38,19 +38,19 @@ class Format:
     """Whether a path and its first bytes (decompressed; empty for a folder) have this format."""
     open: Callable[[Path, str, BagOptions | None], Source]
     """Opens a path with the robot's name, and options, which are for bags only."""
-    takes_options: bool = False
 
 
 def _text_format(dialect: Dialect) -> Format:
-    return Format(
-        dialect.name, lambda _, head: dialect.recognises(head), lambda path, name, _: TextLog(path, name, dialect)
-    )
+    def recognises(_: Path, head: bytes) -> bool:
+        return bool(dialect.recognises(head))
+
+    return Format(dialect.name, recognises, lambda path, name, _: TextLog(path, name, dialect))
 
 
 FORMATS: tuple[Format, ...] = (
     *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES, CSM)),
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
-    Format(_BAG, is_bag, RosBag, takes_options=True),
+    Format(_BAG, is_bag, RosBag),
 )
 """Tried in this order. To add a format, add an entry."""
 
@@ -76,7 +76,7 @@ def open_fleet(
         for each in source.robots(name) if isinstance(source, RosBag) else [source]:
             file, which = robot_in(path)[0], each.stream.robot.name if isinstance(each, RosBag) else ""
             for other_file, other_which, other in given:
-                if which == other_which and _is_same(file, other_file):
+                if which == other_which and _files(file) == _files(other_file):
                     raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")
             given.append((file, which, each))
             sources.append(each)
@@ -87,9 +87,8 @@ def open_fleet(
     return [agreed.get(id(source), source) for source in sources]
 
 
-def _is_same(a: Path, b: Path) -> bool:
-    """Whether two recordings have the same files."""
-    return [part.resolve() for part in parts_of(a)] == [part.resolve() for part in parts_of(b)]
+def _files(recording: Path) -> list[Path]:
+    return [part.resolve() for part in parts_of(recording)]
 
 
 def check_copies(sources: Sequence[Source]) -> None:
@@ -144,7 +143,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
     """
     path, robot = robot_in(Path(path))
     kind = format_of(path)
-    if (options is not None or robot is not None) and not kind.takes_options:
+    if (options is not None or robot is not None) and kind.name != _BAG:
         raise SourceError(
             f"{path}: a {kind.name} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
             "only, leave them out"

@@ -8,7 +8,8 @@ import numpy as np
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry
-from fcslam.sources.bags.contents import BagContents, bag_contents
+from fcslam.sources.bags.census import CountedBag
+from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.formats import format_of, open_source, robot_in
@@ -16,6 +17,29 @@ from fcslam.sources.source import Source
 
 GAP_S, GAP_INTERVALS = 1.0, 5.0
 """A longer time without a scan, in seconds and in usual intervals between scans, is a gap."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicContents:
+    """One topic of a bag."""
+
+    name: str
+    type: str
+    messages: int
+    rate_hz: float | None
+    """Mean, by the times of recording; None with fewer than two messages or without time between them."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagContents:
+    """The topics and frames of a bag."""
+
+    topics: tuple[TopicContents, ...]
+    """Sorted by name."""
+    transforms: tuple[tuple[str, str], ...]
+    """Parent and child of the transforms in tf, in the order in which they appear."""
+    laser_frames: dict[str, tuple[str, ...]]
+    """Frames of the scans on each topic of laser scans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +104,7 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
     """
     source = open_source(path, options)
     name = format_of(robot_in(path)[0]).name
-    bag = bag_contents(source.stream.bag) if isinstance(source, RosBag) else None
+    bag = _bag_contents(source.stream.bag) if isinstance(source, RosBag) else None
     try:
         robots = source.robots() if isinstance(source, RosBag) else []
         if len(robots) < 2:
@@ -136,6 +160,25 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
         str(source.faults) if source.faults else "",
         survey.notes,
     )
+
+
+def _bag_contents(bag: CountedBag) -> BagContents:
+    """What is in all messages; those that cannot be decoded count as the others."""
+    spans_ns: dict[Topic, tuple[int, int, int]] = {}
+    for message in bag.messages(bag.topics):
+        topic, now_ns = message.topic, message.bag_time_ns
+        count, first_ns, last_ns = spans_ns.get(topic, (0, now_ns, now_ns))
+        spans_ns[topic] = count + 1, min(first_ns, now_ns), max(last_ns, now_ns)
+    topics = (_topic_contents(topic, spans_ns.get(topic)) for topic in bag.topics)
+    edges = dict.fromkeys((parent, child) for _, parent, child in bag.census.links)
+    frames = {topic.name: tuple(seen) for topic, seen in bag.census.scan_frames.items()}
+    return BagContents(tuple(topics), tuple(edges), frames)
+
+
+def _topic_contents(topic: Topic, span_ns: tuple[int, int, int] | None) -> TopicContents:
+    count, first_ns, last_ns = span_ns or (topic.message_count, 0, 0)
+    rate_hz = (count - 1) * 1e9 / (last_ns - first_ns) if last_ns > first_ns else None
+    return TopicContents(topic.name, topic.type, count, rate_hz)
 
 
 def _rate_hz(stamps: list[float]) -> float | None:

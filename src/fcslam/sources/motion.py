@@ -149,11 +149,8 @@ class _Track(NamedTuple):
 def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Sweep:
     """The sweep with the motion by odometry: the least-squares fit of a constant acceleration, or none if it jumps.
 
-    Args:
-        sweep: the times of the beams.
-        stamp: of the scan, seconds.
-        readings: odometry up to the scan and beyond it, the newest last; those of a clock that stepped back are left
-            out.
+    ``readings`` are those up to the scan and beyond it, the newest last; those of a clock that stepped back are left
+    out.
     """
     track = _around(sweep, stamp, readings)
     if track is None:

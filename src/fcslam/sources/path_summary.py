@@ -43,16 +43,13 @@ class PathSummary:
             self.moves = True
             self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
             if not self.says_something:
-                self._judge(self._first, self._pose, pose)
+                self._sideways_m += abs(relative_pose(self._pose, pose)[1])
+                self._leaves |= hypot(pose[0] - self._first[0], pose[1] - self._first[1]) > RESOLUTION_M
+                self._turns |= abs(remainder(pose[2] - self._first[2], tau)) > RESOLUTION_RAD
         self._pose = pose
         self.count += 1
         self.earliest = min(self.earliest, stamp)
         self.latest = max(self.latest, stamp)
-
-    def _judge(self, first: Pose, before: Pose, pose: Pose) -> None:
-        self._sideways_m += abs(relative_pose(before, pose)[1])
-        self._leaves = self._leaves or hypot(pose[0] - first[0], pose[1] - first[1]) > RESOLUTION_M
-        self._turns = self._turns or abs(remainder(pose[2] - first[2], tau)) > RESOLUTION_RAD
 
     @property
     def duration_s(self) -> float:

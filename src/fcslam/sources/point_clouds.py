@@ -128,12 +128,8 @@ def scan_of_cloud(
 ) -> CloudScan:
     """The nearest returns of a cloud in a band of heights.
 
-    Args:
-        cloud: the points.
-        mounting: where the sensor is.
-        band: the heights that count.
-        motion: of ``base`` around the stamp of the scan, for a cloud whose directions are in no order; each point is
-            moved to where it is seen at the stamp.
+    If ``motion`` says how ``base`` moves around the stamp of the scan, for a cloud whose directions are in no order,
+    each point is moved to where it is seen at the stamp.
 
     Raises:
         ValueError: the height of the sensor is not known, and no floor is seen.

@@ -2,8 +2,6 @@
 
 from math import cos, nan, remainder, sin, tau
 
-import numpy as np
-
 from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
@@ -36,10 +34,3 @@ def pose_of(array: FloatArray) -> Pose:
     """The pose of an array of shape (3,)."""
     x, y, theta = array.tolist()
     return x, y, theta
-
-
-def pose_array(pose: Pose) -> FloatArray:
-    """The pose as a read-only array, shape (3,)."""
-    array = np.array(pose, dtype=np.float64)
-    array.setflags(write=False)
-    return array

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import FloatArray, Ranges
+from fcslam.records import FloatArray, Ranges, frozen
 from fcslam.sources.pose import Pose
 
 FEWEST_RETURNS = 0.02
@@ -104,7 +104,7 @@ class RangeSample:
         Args:
             path: of the recording.
             which: the laser, empty or with a blank before it.
-            remedy: what to check where nearly no beam has a return.
+            remedy: what to check if nearly no beam has a return.
 
         Raises:
             SourceError: the laser measures nothing or in another unit.
@@ -157,9 +157,8 @@ def without(values: Ranges, placeholders: Sequence[float]) -> Ranges:
     """The ranges with placeholders made invalid, NaN."""
     if not placeholders:
         return values
-    ranges: Ranges = np.where(np.isin(values, np.array(placeholders, np.float32)), np.float32(np.nan), values)
-    ranges.setflags(write=False)
-    return ranges
+    is_placeholder = np.isin(values, np.array(placeholders, np.float32))
+    return frozen(np.where(is_placeholder, np.float32(np.nan), values), np.float32)
 
 
 def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> list[str]:

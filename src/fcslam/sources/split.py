@@ -5,9 +5,9 @@ from copy import copy
 from dataclasses import replace
 
 from fcslam.errors import SourceError
-from fcslam.records import GnssFix, LaserScan, SensorRecord
+from fcslam.records import GnssFix, LaserScan, SensorRecord, frozen
 from fcslam.sources.faults import Faults
-from fcslam.sources.pose import Pose, pose_array, relative_pose
+from fcslam.sources.pose import Pose, relative_pose
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 
 
@@ -57,7 +57,7 @@ class Part:
             if origin is None and isinstance(record, LaserScan):
                 origin = pose
             if origin is not None:
-                yield record if pose is None else replace(record, T_odom_base=pose_array(relative_pose(origin, pose)))
+                yield record if pose is None else replace(record, T_odom_base=frozen(relative_pose(origin, pose)))
 
     def _within(self, scans: ScanRange) -> ScanRange:
         ends = [self._scans.end] if scans.end is None else [self._scans.end, self._scans.first + scans.end]

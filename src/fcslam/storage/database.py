@@ -3,15 +3,14 @@
 import os
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 from fcslam.errors import StoreError
-from fcslam.storage.group_commit import GroupCommit
-from fcslam.storage.row_store import Result, StoreTable
+from fcslam.storage.row_store import RowStore, StoreTable
 from fcslam.untrusted import LimitError, open_database
 
 BUSY_S = 30.0
@@ -22,10 +21,7 @@ class SealedConnection(sqlite3.Connection):
     """A connection to a database whose rows end with a ``seal``."""
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
-        """Insert rows; ``replaces``: in place of those with the same key.
-
-        Values of REAL columns must be floats: the seal is of the value as it is read again.
-        """
+        """As in ``Transaction``. The seal is of the values as they are read again."""
         marks = ", ".join(f"?{number}" for number in range(1, len(table.columns) + 1))
         verb = "INSERT OR REPLACE" if replaces else "INSERT"
         self.executemany(f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))", rows)
@@ -33,7 +29,7 @@ class SealedConnection(sqlite3.Connection):
     def update(
         self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
     ) -> None:
-        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
+        """As in ``Transaction``."""
         assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
         sealed = ", ".join(f":new_{column}" if column in changes else column for column in table.columns)
         self.execute(
@@ -42,13 +38,8 @@ class SealedConnection(sqlite3.Connection):
         )
 
 
-class Database:
-    """A file that several processes and threads may use. Within a process, writers wait for each other; readers never
-    wait.
-
-    Raises:
-        StoreError: from every method: the disk is full or broken, and nothing has changed.
-    """
+class Database(RowStore):
+    """A file that several processes and threads may use. Readers never wait."""
 
     def __init__(
         self, path: Path, schema: str, version: int, *, exclusive: bool = False, is_checked: bool = False
@@ -66,9 +57,9 @@ class Database:
         Raises:
             StoreError: the file is damaged, was made by something else, or cannot be used.
         """
+        super().__init__()
         self._path = path
         self._lock, self._reading_lock = threading.Lock(), threading.Lock()
-        self._group = GroupCommit(self.transaction)
         with translate_errors(path):
             if exclusive:
                 pragmas = ("locking_mode=EXCLUSIVE", "journal_mode=WAL", "synchronous=NORMAL")
@@ -110,28 +101,13 @@ class Database:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
 
-    def share(self, work: Callable[[SealedConnection], Result]) -> Result:
-        """Run ``work`` in a transaction that is shared by all threads that wait for the disk, so that one commit serves
-        them all. If one work fails, none of them takes effect.
-        """
-        return self._group.share(work)
-
     def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """All rows that a query finds."""
         with self._reading_lock, translate_errors(self._path):
             return self._reading.execute(statement, values).fetchall()
 
-    def value(self, statement: str, values: Sequence[object] = ()) -> Any:
-        """First column of the first row that a query finds; None if it finds none."""
-        rows = self.rows(statement, values)
-        return rows[0][0] if rows else None
-
     def export(self, path: Path) -> None:
-        """Write a snapshot of the database as one new file, atomically.
-
-        Raises:
-            StoreError: there is a file already, it cannot be written, or the database is damaged.
-        """
+        """As in ``RowStore``."""
         staging = path.with_name(f".{path.name}.partial")
         # A separate connection: in write-ahead mode a long read blocks no writer.
         with (
@@ -155,10 +131,7 @@ def check_file(path: Path, schema: str, version: int) -> None:
     Raises:
         StoreError: it is damaged, or has other tables than those of ``schema``, or anything else.
     """
-    with (
-        translate_errors(path),
-        closing(open_database(path)) as found,
-    ):
+    with translate_errors(path), closing(open_database(path)) as found:
         _check(path, found, schema, version)
 
 

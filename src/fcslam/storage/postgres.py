@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
 from fcslam.errors import StoreError
-from fcslam.storage.group_commit import GroupCommit
 from fcslam.storage.row_store import Result, StoreTable
 
 if TYPE_CHECKING:
@@ -33,8 +32,6 @@ _CONNECT_S: Final = 3
 _LOOK_EVERY_S: Final = 0.5
 _SCHEMES: Final = ("postgresql", "postgres")
 _MARK: Final = re.compile(r"\?|:([a-z_]+)")
-_LOCK: Final = 0x0FC51A  # of fcslam's, in case other programs lock as well
-"""First number of the locks of writers."""
 
 
 class Postgres:
@@ -176,60 +173,6 @@ class Postgres:
             raise StoreError(f"{self.url}: cannot be read or written ({_text(error)})") from error
 
 
-class PostgresTables:
-    """The tables of one schema of a server, as a ``RowStore``; writers to it wait for each other."""
-
-    def __init__(
-        self, server: Postgres, schema: str, lock: int, guard: Callable[["PostgresTransaction"], None]
-    ) -> None:
-        """Open a schema that exists.
-
-        Args:
-            server: the server.
-            schema: name of the schema.
-            lock: number of the lock that its writers share.
-            guard: called first in each transaction of a writer.
-        """
-        self.server, self._schema, self._guard = server, schema, guard
-        self._begin = f"BEGIN; SET LOCAL search_path TO {schema}; SELECT pg_advisory_xact_lock({_LOCK}, {lock})"
-        self._group = GroupCommit(self.transaction)
-
-    def close(self) -> None:
-        """The server's connections stay."""
-
-    @contextmanager
-    def transaction(self) -> Iterator["PostgresTransaction"]:
-        """Execute the block as one durable transaction."""
-        with self.server.connection(self._begin) as connection:
-            transaction = PostgresTransaction(connection)
-            self._guard(transaction)
-            yield transaction
-            connection.execute("COMMIT")
-
-    def share(self, work: Callable[["PostgresTransaction"], Result]) -> Result:
-        """Run ``work`` in a transaction that is shared by all threads that wait for one. If one work fails, none of
-        them takes effect.
-        """
-        return self._group.share(work)
-
-    def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        """All rows that a query finds."""
-        return self.server.rows(statement, values, self._schema)
-
-    def value(self, statement: str, values: Sequence[object] = ()) -> Any:
-        """First column of the first row that a query finds; None if it finds none."""
-        rows = self.rows(statement, values)
-        return rows[0][0] if rows else None
-
-    @contextmanager
-    def snapshot(self) -> Iterator["PostgresTransaction"]:
-        """Read several tables as they are at one moment."""
-        begin = f"BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL search_path TO {self._schema}"
-        with self.server.connection(begin) as connection:
-            yield PostgresTransaction(connection)
-            connection.execute("COMMIT")
-
-
 class PostgresTransaction:
     """A transaction that is open."""
 
@@ -243,7 +186,7 @@ class PostgresTransaction:
         return self._connection.execute(_translate(statement), _plain(values), binary=True)
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
-        """Insert rows; ``replaces``: in place of those with the same key."""
+        """As in ``Transaction``."""
         marks = ", ".join("%s" for _ in table.columns)
         statement = f"INSERT INTO {table.name} ({', '.join(table.columns)}) VALUES ({marks})"
         if replaces:
@@ -255,7 +198,7 @@ class PostgresTransaction:
     def update(
         self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
     ) -> None:
-        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
+        """As in ``Transaction``."""
         assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
         news = {f"new_{column}": value for column, value in changes.items()}
         self.execute(f"UPDATE {table.name} SET {assignments} WHERE {where}", {**values, **news})

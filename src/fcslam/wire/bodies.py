@@ -33,23 +33,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import (
-    BYTES_PER_AXIS,
-    BYTES_PER_RANGE,
-    BYTES_PER_TILE,
-    BYTES_PER_WORD,
-    FIX_VERSION,
-    FLOOR_VERSION,
-    KEYPOINT_AXES,
-    MAXIMUM_BEAMS,
-    MAXIMUM_KEYPOINTS,
-    MAXIMUM_LASERS,
-    PROTOCOL_VERSION,
-    SWEEP_NUMBERS,
-    SWEEP_VERSION,
-    TAG_VERSION,
-    WORDS_VERSION,
-)
+from fcslam.wire import limits
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind
 from fcslam.wire.quantisation import (
     dequantise,
@@ -102,7 +86,7 @@ def _write_hello(hello: Hello) -> pb.Hello:
 
 
 def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
-    _check_at_most(len(message.lasers), MAXIMUM_LASERS, "hello: lasers")
+    _check_at_most(len(message.lasers), limits.MAXIMUM_LASERS, "hello: lasers")
     lasers = tuple(map(_read_laser, message.lasers))
     codes = [detector.channel for detector in message.detectors]
     if codes != sorted(set(codes)):
@@ -145,13 +129,13 @@ def _write_keyscan(keyscan: Keyscan) -> pb.Keyscan:
 
 
 def _read_keyscan(message: pb.Keyscan, envelope: pb.Packet) -> Keyscan:
-    _check_at_most(message.count, MAXIMUM_BEAMS, "keyscan: ranges")
+    _check_at_most(message.count, limits.MAXIMUM_BEAMS, "keyscan: ranges")
     ranges = dequantise(unpack_ranges(message.ranges, message.count))
     beams = None
     if message.HasField("beams"):
         beams = Beams(message.count, message.beams.angle_min_rad, message.beams.angle_increment_rad)
-    if len(message.sweep) not in (0, SWEEP_NUMBERS):
-        raise PacketError(f"keyscan: sweep has {len(message.sweep)} numbers, not {SWEEP_NUMBERS}")
+    if len(message.sweep) not in (0, limits.SWEEP_NUMBERS):
+        raise PacketError(f"keyscan: sweep has {len(message.sweep)} numbers, not {limits.SWEEP_NUMBERS}")
     sweep = Sweep.of_steps(message.sweep) if message.sweep else None
     return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges, message.laser, beams, sweep)
 
@@ -239,9 +223,9 @@ def _read_described(
     message: pb.Place | pb.WordPlace, envelope: pb.Packet, what: str
 ) -> tuple[tuple[KeyscanId, Channel, str, int, int, NDArray[np.float32]], Channel, KeypointCodes]:
     """The fields that both kinds of places have, the channel, and the keypoints as they are sent."""
-    _check_at_most(message.count, MAXIMUM_KEYPOINTS, f"{what}: keypoints")
+    _check_at_most(message.count, limits.MAXIMUM_KEYPOINTS, f"{what}: keypoints")
     channel = read_channel(message.channel)
-    codes = unpack_keypoints(message.keypoints, message.count, KEYPOINT_AXES[channel])
+    codes = unpack_keypoints(message.keypoints, message.count, limits.KEYPOINT_AXES[channel])
     number, keypoints = KeyscanId(envelope.robot, message.number), dequantise_keypoints(codes)
     return (number, channel, message.detector_version, message.first, message.last, keypoints), channel, codes
 
@@ -370,29 +354,31 @@ def _same(body: Any) -> Any:
     return body
 
 
-_MOST_AXES = max(KEYPOINT_AXES.values())
-
-
 def _hello_version(hello: Hello) -> int:
-    return WORDS_VERSION if hello.vocabularies else FLOOR_VERSION if hello.floor else PROTOCOL_VERSION
+    floored = limits.FLOOR_VERSION if hello.floor else limits.PROTOCOL_VERSION
+    return limits.WORDS_VERSION if hello.vocabularies else floored
 
 
 def _keyscan_version(keyscan: Keyscan) -> int:
     if not len(keyscan.ranges_m):
-        return WORDS_VERSION
-    return PROTOCOL_VERSION if keyscan.sweep is None else SWEEP_VERSION
+        return limits.WORDS_VERSION
+    return limits.PROTOCOL_VERSION if keyscan.sweep is None else limits.SWEEP_VERSION
 
 
-def _keyscan_bytes(message: pb.Keyscan) -> int:
-    return BYTES_PER_RANGE * min(message.count, MAXIMUM_BEAMS)
+def _always(number: int) -> Callable[[Any], int]:
+    return lambda _: number
 
 
-def _place_bytes(message: pb.Place) -> int:
-    return (BYTES_PER_AXIS * _MOST_AXES + CODE_BYTES) * min(message.count, MAXIMUM_KEYPOINTS)
+def _for_each(size: int, most: int) -> Callable[[Any], int]:
+    """Bytes of a message's streams with ``size`` for each item; more than ``most`` are refused before."""
+    return lambda message: size * min(message.count, most)
 
 
-def _word_place_bytes(message: pb.WordPlace) -> int:
-    return (BYTES_PER_AXIS * _MOST_AXES + BYTES_PER_WORD) * min(message.count, MAXIMUM_KEYPOINTS)
+_KEYPOINT_BYTES = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values())
+_RANGES = _for_each(limits.BYTES_PER_RANGE, limits.MAXIMUM_BEAMS)
+_DESCRIBED = _for_each(_KEYPOINT_BYTES + CODE_BYTES, limits.MAXIMUM_KEYPOINTS)
+_IN_WORDS = _for_each(_KEYPOINT_BYTES + limits.BYTES_PER_WORD, limits.MAXIMUM_KEYPOINTS)
+_WORDS, _TAG, _FIX = map(_always, (limits.WORDS_VERSION, limits.TAG_VERSION, limits.FIX_VERSION))
 
 
 class Codec(NamedTuple):
@@ -403,31 +389,21 @@ class Codec(NamedTuple):
     read: Callable[[Any, pb.Packet], Any]
     round: Callable[[Any], Any] = _same
     """Return a record as it is after writing and reading, without doing either; most kinds keep every number."""
-    version: int | Callable[[Any], int] = PROTOCOL_VERSION
-    """Version of the packet, perhaps by the record."""
-    unpacked_bytes: Callable[[Any], int] = lambda _: 0
+    version: Callable[[Any], int] = _always(limits.PROTOCOL_VERSION)
+    """Version of the packet of a record."""
+    unpacked_bytes: Callable[[Any], int] = _always(0)
     """Bytes of the streams of a message, unpacked, by its counts."""
-
-    def version_of(self, body: Any) -> int:
-        """Version of the packet of a record."""
-        return self.version if isinstance(self.version, int) else self.version(body)
 
 
 CODECS = {
     PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello, version=_hello_version),
-    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _keyscan_bytes),
+    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _RANGES),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, PROTOCOL_VERSION, _place_bytes),
-    PacketKind.WORD_PLACE: Codec(
-        WordPlace, _write_word_place, _read_word_place, _round_word_place, WORDS_VERSION, _word_place_bytes
-    ),
-    PacketKind.MAP_TILE: Codec(
-        MapTile, _write_map_tile, _read_map_tile, _same, WORDS_VERSION, lambda _: BYTES_PER_TILE
-    ),
-    PacketKind.TAG_SIGHTING: Codec(
-        TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, TAG_VERSION
-    ),
-    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix, version=FIX_VERSION),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, unpacked_bytes=_DESCRIBED),
+    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place, _WORDS, _IN_WORDS),
+    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, _same, _WORDS, _always(limits.BYTES_PER_TILE)),
+    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, _TAG),
+    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix, version=_FIX),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

@@ -27,37 +27,11 @@ from fcslam.records import (
     WordPlace,
 )
 from fcslam.runs.map_files import Occupancy
-from fcslam.wire.limits import (
-    DIGEST_BYTES,
-    KEYPOINT_AXES,
-    MAXIMUM_ACCELERATION,
-    MAXIMUM_ALTITUDE_M,
-    MAXIMUM_ANTENNA_M,
-    MAXIMUM_BEAM_TIME_S,
-    MAXIMUM_BEAMS,
-    MAXIMUM_COORDINATE_M,
-    MAXIMUM_EPOCH,
-    MAXIMUM_FIX_SIGMA_M,
-    MAXIMUM_INFORMATION,
-    MAXIMUM_KEYPOINTS,
-    MAXIMUM_LASER_RANGE_M,
-    MAXIMUM_LASERS,
-    MAXIMUM_LATITUDE_DEG,
-    MAXIMUM_LONGITUDE_DEG,
-    MAXIMUM_NETWORK_BYTES,
-    MAXIMUM_NUMBER,
-    MAXIMUM_RESOLUTION_M,
-    MAXIMUM_SEQUENCE,
-    MAXIMUM_SPEED,
-    MAXIMUM_TAG,
-    MAXIMUM_TILE,
-    MINIMUM_CORRELATION_EIGENVALUE,
-    MINIMUM_INFORMATION,
-    MINIMUM_RESOLUTION_M,
-    TILE_CELLS,
-)
-from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
+from fcslam.wire import limits
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
+
+_OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
 
 
 def check(packet: Packet) -> None:
@@ -67,10 +41,11 @@ def check(packet: Packet) -> None:
         PacketError: the packet is not valid; the message says why.
     """
     check_name(packet.robot, "robot")
-    _check_count(packet.epoch, "epoch", MAXIMUM_EPOCH)
-    _check_count(packet.sequence, "sequence", MAXIMUM_SEQUENCE)
+    _check_count(packet.epoch, "epoch", limits.MAXIMUM_EPOCH)
+    _check_count(packet.sequence, "sequence", limits.MAXIMUM_SEQUENCE)
     _require(math.isfinite(packet.time), "time is not finite")
-    if (robot := _robot_of(packet.body)) != packet.robot:
+    robot = packet.body.id.robot if isinstance(packet.body, _OF_KEYSCANS) else packet.body.robot
+    if robot != packet.robot:
         raise PacketError(f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
     _CHECKS[type(packet.body)](packet.body, packet)
 
@@ -85,17 +60,10 @@ def check_name(name: str, what: str) -> None:
         raise PacketError(f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
 
 
-_OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
-
-
-def _robot_of(body: Body) -> str:
-    return body.id.robot if isinstance(body, _OF_KEYSCANS) else body.robot
-
-
 def _check_hello(hello: Hello, packet: Packet) -> None:
     _require(hello.epoch == packet.epoch, f"hello: epoch {hello.epoch} in a packet of epoch {packet.epoch}")
     count = len(hello.lasers)
-    _require(0 < count <= MAXIMUM_LASERS, f"hello: {count} lasers, not in 1..{MAXIMUM_LASERS}")
+    _require(0 < count <= limits.MAXIMUM_LASERS, f"hello: {count} lasers, not in 1..{limits.MAXIMUM_LASERS}")
     for laser in hello.lasers:
         _check_laser(laser)
     for channel, version in hello.detector_versions.items():
@@ -104,8 +72,7 @@ def _check_hello(hello: Hello, packet: Packet) -> None:
         check_floor(hello.floor)
     for channel, digest in hello.vocabularies.items():
         _require(channel in hello.detector_versions, f"hello: a vocabulary of {channel}, which has no detector")
-        sized = len(digest) == DIGEST_BYTES
-        _require(sized, f"hello: vocabulary of {channel} has {len(digest)} bytes, not {DIGEST_BYTES}")
+        _check_digest(digest, f"hello: vocabulary of {channel}")
 
 
 def check_floor(floor: str) -> None:
@@ -119,13 +86,13 @@ def check_floor(floor: str) -> None:
 
 def _check_laser(laser: LaserModel) -> None:
     _check_beams(laser.beams, "laser")
-    _require(0.0 < laser.max_range_m <= MAXIMUM_LASER_RANGE_M, "laser: maximum range is not in (0, 1000] m")
+    _require(0.0 < laser.max_range_m <= limits.MAXIMUM_LASER_RANGE_M, "laser: maximum range is not in (0, 1000] m")
     _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
 
 
 def _check_beams(beams: Beams, what: str) -> None:
     count, first, increment = beams
-    _require(0 < count <= MAXIMUM_BEAMS, f"{what}: {count} beams, not in 1..{MAXIMUM_BEAMS}")
+    _require(0 < count <= limits.MAXIMUM_BEAMS, f"{what}: {count} beams, not in 1..{limits.MAXIMUM_BEAMS}")
     _require(abs(first) <= FULL_TURN_RAD, f"{what}: first beam is not within a full turn")
     turns = 0.0 < abs(increment) <= FULL_TURN_RAD
     _require(turns, f"{what}: beams do not turn, or by more than a full turn")
@@ -134,15 +101,15 @@ def _check_beams(beams: Beams, what: str) -> None:
 
 
 def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
-    _check_count(keyscan.id.number, "keyscan: number", MAXIMUM_NUMBER)
+    _check_count(keyscan.id.number, "keyscan: number")
     _require(math.isfinite(keyscan.stamp), "keyscan: stamp is not finite")
     _require(keyscan.stamp <= packet.time, "keyscan: stamp is later than the packet's time")
     ranges = keyscan.ranges_m
     _require(ranges.ndim == 1, f"keyscan: ranges have shape {ranges.shape}, not (N,)")
-    _require(len(ranges) <= MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, at most {MAXIMUM_BEAMS}")
+    _require(len(ranges) <= limits.MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, at most {limits.MAXIMUM_BEAMS}")
     if not np.array_equal(ranges, dequantise(quantise(ranges))):
         raise PacketError("keyscan: ranges are not quantised; work with dequantise(quantise(ranges_m))")
-    _check_count(keyscan.laser, "keyscan: laser", MAXIMUM_LASERS - 1)
+    _check_count(keyscan.laser, "keyscan: laser", limits.MAXIMUM_LASERS - 1)
     if keyscan.beams is not None:
         _check_beams(keyscan.beams, "keyscan")
         count = keyscan.beams.beam_count
@@ -153,18 +120,18 @@ def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
 
 def _check_sweep(sweep: Sweep) -> None:
     times = sweep.first_s, sweep.last_s
-    within = all(abs(t) <= MAXIMUM_BEAM_TIME_S for t in times) and sweep.first_s != sweep.last_s
-    _require(within, f"keyscan: beams at {times} s, not two times within {MAXIMUM_BEAM_TIME_S:g} s of the stamp")
-    slow = all(abs(number) <= MAXIMUM_SPEED for number in sweep.velocity)
-    _require(slow, f"keyscan: the velocity in the sweep exceeds {MAXIMUM_SPEED:g} m/s or rad/s")
-    steady = all(abs(number) <= MAXIMUM_ACCELERATION for number in sweep.acceleration)
-    _require(steady, f"keyscan: the acceleration in the sweep exceeds {MAXIMUM_ACCELERATION:g} m/s^2 or rad/s^2")
+    within = all(abs(t) <= limits.MAXIMUM_BEAM_TIME_S for t in times) and sweep.first_s != sweep.last_s
+    _require(within, f"keyscan: beams at {times} s, not two times within {limits.MAXIMUM_BEAM_TIME_S:g} s of the stamp")
+    slow = all(abs(number) <= limits.MAXIMUM_SPEED for number in sweep.velocity)
+    _require(slow, f"keyscan: the velocity in the sweep exceeds {limits.MAXIMUM_SPEED:g} m/s or rad/s")
+    steady = all(abs(number) <= limits.MAXIMUM_ACCELERATION for number in sweep.acceleration)
+    _require(steady, f"keyscan: the acceleration in the sweep exceeds {limits.MAXIMUM_ACCELERATION:g} m/s^2 or rad/s^2")
     _require(sweep == sweep.rounded(), "keyscan: the sweep is not in steps of the wire; work with Sweep.rounded()")
 
 
 def _check_constraint(constraint: Constraint, _: Packet) -> None:
-    _check_count(constraint.i, "constraint: i", MAXIMUM_NUMBER)
-    _check_count(constraint.j, "constraint: j", MAXIMUM_NUMBER)
+    _check_count(constraint.i, "constraint: i")
+    _check_count(constraint.j, "constraint: j")
     _require(constraint.i < constraint.j, f"constraint: i = {constraint.i} is not below j = {constraint.j}")
     _check_pose(constraint.T_i_j, "constraint: T_i_j", math.pi)
     _check_information(constraint.information, "constraint")
@@ -175,14 +142,14 @@ def _check_information(information: FloatArray, what: str) -> None:
     _check_shape(information, (3, 3), f"{what}: information")
     xx, xy, xt, yy, yt, tt = sent = pack_information(information)
     _require(all(map(math.isfinite, sent)), f"{what}: information is not finite")
-    bounded = all(MINIMUM_INFORMATION <= diagonal <= MAXIMUM_INFORMATION for diagonal in (xx, yy, tt))
+    bounded = all(limits.MINIMUM_INFORMATION <= diagonal <= limits.MAXIMUM_INFORMATION for diagonal in (xx, yy, tt))
     _require(bounded, f"{what}: a diagonal element of information is not in [2^-20, 2^40]")
     x, y, t = 1.0 / math.sqrt(xx), 1.0 / math.sqrt(yy), 1.0 / math.sqrt(tt)
     scale = (x * x, x * y, x * t, y * x, y * y, y * t, t * x, t * y, t * t)
     given = zip(information.ravel().tolist(), (xx, xy, xt, xy, yy, yt, xt, yt, tt), scale, strict=True)
     symmetric = all(abs(number - rounded) * factor <= 1e-6 for number, rounded, factor in given)
     _require(symmetric, f"{what}: information is not symmetric")
-    definite = _exceeds(MINIMUM_CORRELATION_EIGENVALUE, xy * x * y, xt * x * t, yt * y * t)
+    definite = _exceeds(limits.MINIMUM_CORRELATION_EIGENVALUE, xy * x * y, xt * x * t, yt * y * t)
     _require(definite, f"{what}: information is not clearly positive definite")
 
 
@@ -208,71 +175,70 @@ def _check_word_place(place: WordPlace, _: Packet) -> None:
 
 
 def _check_map_tile(tile: MapTile, _: Packet) -> None:
-    sized = MINIMUM_RESOLUTION_M <= tile.resolution_m <= MAXIMUM_RESOLUTION_M
-    bounds = f"{MINIMUM_RESOLUTION_M:g}..{MAXIMUM_RESOLUTION_M:g}"
+    sized = limits.MINIMUM_RESOLUTION_M <= tile.resolution_m <= limits.MAXIMUM_RESOLUTION_M
+    bounds = f"{limits.MINIMUM_RESOLUTION_M:g}..{limits.MAXIMUM_RESOLUTION_M:g}"
     _require(sized, f"map tile: a resolution of {tile.resolution_m} m, not in {bounds}")
-    within = abs(tile.column) <= MAXIMUM_TILE and abs(tile.row) <= MAXIMUM_TILE
-    _require(within, f"map tile: ({tile.column}, {tile.row}) is not within {MAXIMUM_TILE} tiles")
-    _check_shape(tile.cells, (TILE_CELLS, TILE_CELLS), "map tile: cells")
+    within = abs(tile.column) <= limits.MAXIMUM_TILE and abs(tile.row) <= limits.MAXIMUM_TILE
+    _require(within, f"map tile: ({tile.column}, {tile.row}) is not within {limits.MAXIMUM_TILE} tiles")
+    _check_shape(tile.cells, (limits.TILE_CELLS, limits.TILE_CELLS), "map tile: cells")
     _require(tile.cells.dtype == np.uint8, f"map tile: cells are {tile.cells.dtype}, not bytes")
     _require(int(tile.cells.max()) <= Occupancy.OCCUPIED, "map tile: a cell is neither unknown, free nor occupied")
 
 
 def _check_tag_sighting(sighting: TagSighting, _: Packet) -> None:
-    _check_count(sighting.id.number, "tag sighting: number", MAXIMUM_NUMBER)
-    _check_count(sighting.tag.number, "tag sighting: tag", MAXIMUM_TAG)
+    _check_count(sighting.id.number, "tag sighting: number")
+    _check_count(sighting.tag.number, "tag sighting: tag", limits.MAXIMUM_TAG)
     _check_pose(sighting.T_base_tag, "tag sighting: T_base_tag", math.pi)
     _check_information(sighting.information, "tag sighting")
 
 
 def _check_fix(fix: KeyscanFix, _: Packet) -> None:
-    _check_count(fix.id.number, "fix: number", MAXIMUM_NUMBER)
+    _check_count(fix.id.number, "fix: number")
     # false for NaN
-    is_on_earth = abs(fix.latitude_deg) <= MAXIMUM_LATITUDE_DEG and abs(fix.longitude_deg) <= MAXIMUM_LONGITUDE_DEG
-    _require(is_on_earth, f"fix: latitude {fix.latitude_deg:g}, longitude {fix.longitude_deg:g} are not on the earth")
-    _require(abs(fix.altitude_m) <= MAXIMUM_ALTITUDE_M, f"fix: an altitude of {fix.altitude_m:g} m")
-    is_known = 0.0 < fix.sigma_m <= MAXIMUM_FIX_SIGMA_M
-    _require(is_known, f"fix: a standard deviation of {fix.sigma_m:g} m, not in 0..{MAXIMUM_FIX_SIGMA_M:g}")
-    is_near = math.hypot(*fix.antenna_xy) <= MAXIMUM_ANTENNA_M
-    _require(is_near, f"fix: the antenna is not within {MAXIMUM_ANTENNA_M:g} m of the robot")
+    latitude, longitude = fix.latitude_deg, fix.longitude_deg
+    is_on_earth = abs(latitude) <= limits.MAXIMUM_LATITUDE_DEG and abs(longitude) <= limits.MAXIMUM_LONGITUDE_DEG
+    _require(is_on_earth, f"fix: latitude {latitude:g}, longitude {longitude:g} are not on the earth")
+    _require(abs(fix.altitude_m) <= limits.MAXIMUM_ALTITUDE_M, f"fix: an altitude of {fix.altitude_m:g} m")
+    is_known = 0.0 < fix.sigma_m <= limits.MAXIMUM_FIX_SIGMA_M
+    _require(is_known, f"fix: a standard deviation of {fix.sigma_m:g} m, not in 0..{limits.MAXIMUM_FIX_SIGMA_M:g}")
+    is_near = math.hypot(*fix.antenna_xy) <= limits.MAXIMUM_ANTENNA_M
+    _require(is_near, f"fix: the antenna is not within {limits.MAXIMUM_ANTENNA_M:g} m of the robot")
 
 
 def _check_described(place: Place | WordPlace) -> None:
-    _check_count(place.id.number, "place: number", MAXIMUM_NUMBER)
-    _check_count(place.first, "place: first", MAXIMUM_NUMBER)
-    _check_count(place.last, "place: last", MAXIMUM_NUMBER)
+    _check_count(place.id.number, "place: number")
+    _check_count(place.first, "place: first")
+    _check_count(place.last, "place: last")
     _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
     within = place.first <= place.id.number <= place.last
     _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
     check_name(place.detector_version, "place: detector version")
     count = len(place.keypoints)
-    _require(count <= MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {MAXIMUM_KEYPOINTS}")
-    _check_shape(place.keypoints, (count, KEYPOINT_AXES[place.channel]), "place: keypoints")
+    _require(count <= limits.MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {limits.MAXIMUM_KEYPOINTS}")
+    _check_shape(place.keypoints, (count, limits.KEYPOINT_AXES[place.channel]), "place: keypoints")
     within = bool((np.abs(place.keypoints) <= MAXIMUM_KEYPOINT_M).all())
     _require(within, f"place: a keypoint is not within {MAXIMUM_KEYPOINT_M:g} m")
 
 
 def _check_correction(correction: Correction, _: Packet) -> None:
-    _check_count(correction.version, "correction: version", MAXIMUM_NUMBER)
-    _check_count(correction.map_index, "correction: map index", MAXIMUM_NUMBER)
+    _check_count(correction.version, "correction: version")
+    _check_count(correction.map_index, "correction: map index")
     _check_pose(correction.T_map_odom, "correction: T_map_odom", math.pi)
     _require(0.0 <= correction.quality <= 1.0, f"correction: quality {correction.quality} is not within 0 and 1")
 
 
 def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:
-    _check_count(acknowledgement.epoch, "acknowledgement: epoch", MAXIMUM_EPOCH)
-    _check_count(acknowledgement.sequence, "acknowledgement: sequence", MAXIMUM_SEQUENCE)
+    _check_count(acknowledgement.epoch, "acknowledgement: epoch", limits.MAXIMUM_EPOCH)
+    _check_count(acknowledgement.sequence, "acknowledgement: sequence", limits.MAXIMUM_SEQUENCE)
 
 
 def _check_detector_update(update: DetectorUpdate, _: Packet) -> None:
     file = update.file
     check_name(file.version, "detector update: detector version")
-    _check_count(file.format, "detector update: format", MAXIMUM_NUMBER)
-    within = 0 < file.size <= MAXIMUM_NETWORK_BYTES
-    _require(within, f"detector update: a file of {file.size} bytes, not of 1..{MAXIMUM_NETWORK_BYTES}")
-    _require(
-        len(file.sha256) == DIGEST_BYTES, f"detector update: sha256 has {len(file.sha256)} bytes, not {DIGEST_BYTES}"
-    )
+    _check_count(file.format, "detector update: format")
+    within = 0 < file.size <= limits.MAXIMUM_NETWORK_BYTES
+    _require(within, f"detector update: a file of {file.size} bytes, not of 1..{limits.MAXIMUM_NETWORK_BYTES}")
+    _check_digest(file.sha256, "detector update: sha256")
 
 
 _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
@@ -293,9 +259,14 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
 def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TURN_RAD) -> None:
     _check_shape(pose, (3,), what)
     x, y, theta = pose.tolist()
-    within = abs(x) <= MAXIMUM_COORDINATE_M and abs(y) <= MAXIMUM_COORDINATE_M
-    _require(within, f"{what}: not within {MAXIMUM_COORDINATE_M:g} m")
+    within = abs(x) <= limits.MAXIMUM_COORDINATE_M and abs(y) <= limits.MAXIMUM_COORDINATE_M
+    _require(within, f"{what}: not within {limits.MAXIMUM_COORDINATE_M:g} m")
     _require(abs(theta) <= maximum_angle_rad, f"{what}: the angle is beyond {maximum_angle_rad:.4f} rad")
+
+
+def _check_digest(digest: bytes, what: str) -> None:
+    sized = len(digest) == limits.DIGEST_BYTES
+    _require(sized, f"{what} has {len(digest)} bytes, not {limits.DIGEST_BYTES}")
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None:
@@ -303,7 +274,7 @@ def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None
         raise PacketError(f"{what} have shape {array.shape}, not {shape}")
 
 
-def _check_count(value: int, what: str, maximum: int) -> None:
+def _check_count(value: int, what: str, maximum: int = limits.MAXIMUM_NUMBER) -> None:
     if not 0 <= value <= maximum:
         raise PacketError(f"{what} is {value}, not in 0..{maximum}")
 

@@ -1,12 +1,16 @@
-"""HTTP client of a robot that follows its fleet: the joint map in tiles, and where all robots are."""
+"""HTTP clients of a robot that follows its fleet (the joint map in tiles, all robots), or reads the maps of a cloud."""
 
 import json
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 from pydantic import TypeAdapter
 
 from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
 from fcslam.wire.http_transport import HttpClient
+
+if TYPE_CHECKING:
+    import httpx
 
 _FRONTIERS, _QUALITY = TypeAdapter(tuple[MapFrontiers, ...]), TypeAdapter(tuple[QualityReply, ...])
 
@@ -17,32 +21,31 @@ class FleetClient(HttpClient):
     received_bytes = 0
     """Bytes of the replies' bodies so far."""
 
+    def _ask(self, *request: Any, **options: Any) -> "httpx.Response":
+        response = super()._ask(*request, **options)
+        if response.status_code == 200:
+            self.received_bytes += len(response.content)
+        return response
+
     def exchange(self, robot: str, map_index: int | None, pose: tuple[float, ...] | None) -> FleetReply:
         """Say where the robot is in its map, if it knows, and read where all robots are."""
         content = json.dumps({"map": map_index, "pose": pose} if pose and map_index is not None else {})
-        response = self._ask(
-            "POST", f"robots/{robot}/fleet", content.encode(), {"Content-Type": "application/json"}, "application/json"
-        )
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
+        headers = {"Content-Type": "application/json"}
+        response = self._ask("POST", f"robots/{robot}/fleet", content.encode(), headers)
         with self._reading():
             return FleetReply.model_validate_json(response.content)
 
     def frontiers(self, robot: str) -> tuple[MapFrontiers, ...]:
         """The frontiers of the map that a robot is in; none if it is in no map."""
-        response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}", accept="application/json")
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
+        response = self._ask("GET", f"frontiers?robot={quote(robot, safe='')}")
         with self._reading():
             return _FRONTIERS.validate_json(response.content)
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
-        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", accept="application/json")
+        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", passes=(404,))
         if response.status_code == 404:  # a cloud of an older version
             return ()
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
         with self._reading():
             return _QUALITY.validate_json(response.content)
 
@@ -52,9 +55,45 @@ class FleetClient(HttpClient):
         None: nothing changed since the ETag ``known``, or the robot is in no map yet.
         """
         headers = {"If-None-Match": known} if known else {}
-        response = self._ask("GET", f"robots/{robot}/map?limit={limit_bytes}", headers=headers, accept="*/*")
-        if response.status_code in (304, 404):
+        path, nothing = f"robots/{robot}/map?limit={limit_bytes}", (304, 404)
+        response = self._ask("GET", path, headers=headers, passes=nothing)
+        if response.status_code in nothing:
             return None
-        self._require(response, 200)
-        self.received_bytes += len(response.content)
         return response.content, response.headers.get("ETag", "")
+
+
+class ServedMap(NamedTuple):
+    """One of the maps of a cloud."""
+
+    number: int
+    floor: str
+    """Floor of its robots; empty: none."""
+    robots: tuple[str, ...]
+    extent_m: tuple[float, ...]
+    """Lowest x and y, highest x and y, metres; empty before there is a map."""
+
+
+class MapClient(HttpClient):
+    """Reads the maps of one cloud; it needs the rights of a viewer. Each method raises as ``BatchTransport.state``."""
+
+    def maps(self) -> list[ServedMap]:
+        """The maps of the cloud now."""
+        response = self._ask("GET", "maps")
+        with self._reading():
+            return [
+                ServedMap(
+                    int(one["map"]),
+                    str(one["floor"]),
+                    tuple(map(str, one["robots"])),
+                    tuple(map(float, one["extent"] or ())),
+                )
+                for one in response.json()
+            ]
+
+    def image(self, number: int) -> bytes:
+        """The PGM file of a map."""
+        return self._ask("GET", f"maps/{number}.pgm").content
+
+    def description(self, number: int) -> bytes:
+        """The YAML file of a map."""
+        return self._ask("GET", f"maps/{number}.yaml").content

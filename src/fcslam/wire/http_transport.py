@@ -2,7 +2,7 @@
 
 import ipaddress
 import ssl
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -19,7 +19,7 @@ from fcslam.wire.batches import (
     read_batch,
     write_batch,
 )
-from fcslam.wire.keys import no_passphrase
+from fcslam.wire.keys import NO_CREDENTIALS, Credentials, no_passphrase
 
 if TYPE_CHECKING:
     import httpx
@@ -120,36 +120,23 @@ class BatchTransport(Protocol):
 class HttpClient:
     """Connection to one cloud."""
 
-    def __init__(
-        self,
-        url: str,
-        token: str | None = None,
-        ca: StrPath | None = None,
-        own: tuple[StrPath, StrPath] | None = None,
-        headers: Mapping[str, str] | None = None,
-    ) -> None:
-        """Open a client.
-
-        Args:
-            url: address of the cloud.
-            token: bearer token, if the cloud asks for one.
-            ca: PEM file of certificate authorities; None: the authorities of the system.
-            own: PEM files of the own certificate and its key, in place of a token.
-            headers: of every request.
+    def __init__(self, url: str, shown: Credentials = NO_CREDENTIALS, headers: Mapping[str, str] | None = None) -> None:
+        """Open a client; every request has the ``headers``.
 
         Raises:
-            CloudError: ``url`` is not an address or would send the token unencrypted; ``ca`` or ``own`` cannot be read.
+            CloudError: ``url`` is not an address or would send the token unencrypted; a file of ``shown`` cannot be
+                read.
         """
         import httpx
 
-        _check_url(url, token, own)
+        _check_url(url, shown)
         self._url = url.rstrip("/")
-        self._has_own = own is not None
+        self._has_own = shown.own is not None
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
-            headers=dict(headers or {}) | ({"Authorization": f"Bearer {token}"} if token else {}),
+            headers=dict(headers or {}) | ({"Authorization": f"Bearer {shown.token}"} if shown.token else {}),
             timeout=httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S),
-            verify=_trust(ca, own),
+            verify=_trust(shown),
             trust_env=False,
         )
 
@@ -175,10 +162,20 @@ class HttpClient:
         path: str,
         content: bytes | None = None,
         headers: Mapping[str, str] | None = None,
-        accept: str = MEDIA_TYPE,
+        passes: Collection[int] = (),
     ) -> "httpx.Response":
+        """The response, if its status is 200 or one of ``passes``; raises as ``BatchTransport.state``."""
         with self._explained():
-            return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
+            response = self._client.request(method, path, content=content, headers=headers)
+        code = response.status_code
+        if code == 200 or code in passes:
+            return response
+        after = response.headers.get("Retry-After", "")
+        wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
+        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
+        if code in _LATER or is_other_agent:
+            raise UnavailableError(self._reason(response), wait_s)
+        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -208,18 +205,6 @@ class HttpClient:
         # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
         return "; if that stays, it does not trust this robot's certificate" if self._has_own else ""
 
-    def _require(self, response: "httpx.Response", status: int) -> None:
-        """Raise an error for any other status."""
-        code = response.status_code
-        if code == status:
-            return
-        after = response.headers.get("Retry-After", "")
-        wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
-        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
-        if code in _LATER or is_other_agent:
-            raise UnavailableError(self._reason(response), wait_s)
-        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
-
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase
         remedy = "; give a valid token in --credentials" if response.status_code == 401 else ""
@@ -229,29 +214,14 @@ class HttpClient:
 class HttpTransport(HttpClient):
     """Connection of one robot to one cloud; docs/howto/robot.md lists how it handles status codes."""
 
-    def __init__(
-        self,
-        url: str,
-        robot: str,
-        agent: str,
-        token: str | None = None,
-        ca: StrPath | None = None,
-        own: tuple[StrPath, StrPath] | None = None,
-    ) -> None:
-        """Open a client; raises as ``HttpClient``.
-
-        Args:
-            url, token, ca, own: as in ``HttpClient``.
-            robot: name of the robot.
-            agent: random identifier that distinguishes two processes of the same name.
-        """
-        super().__init__(url, token, ca, own, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE})
+    def __init__(self, url: str, robot: str, agent: str, shown: Credentials = NO_CREDENTIALS) -> None:
+        """Open a client; raises as ``HttpClient``. ``agent``: random, to distinguish two processes of one robot."""
+        super().__init__(url, shown, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE})
         self._robot = quote(robot, safe="")
 
     def state(self) -> CloudState:
         """As in BatchTransport."""
-        response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
-        self._require(response, 200)
+        response = self._ask("GET", f"robots/{self._robot}/state")
         with self._reading():
             state = response.json()
             expected = {int(epoch): int(sequence) for epoch, sequence in state["next"].items()}
@@ -265,13 +235,13 @@ class HttpTransport(HttpClient):
             f"robots/{self._robot}/packets",
             content=write_batch(packets),
             headers={CORRECTION_HEADER: str(correction)},
+            passes=(400,),
         )
         if response.status_code == 400:
             index = _detail(response).get("index")
             if isinstance(index, int) and 0 <= index < len(packets):
                 return HttpResponse(refusal=Refusal(index, self._reason(response)))
             raise UnavailableError(self._reason(response))  # the batch was corrupted on its way
-        self._require(response, 200)
         try:
             return HttpResponse(
                 tuple(read_batch(response.content)),
@@ -283,9 +253,7 @@ class HttpTransport(HttpClient):
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """As in BatchTransport."""
-        response = self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*")
-        self._require(response, 200)
-        return response.content
+        return self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}").content
 
 
 class InstancesTransport:
@@ -333,7 +301,7 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _check_url(url: str, token: str | None, own: tuple[StrPath, StrPath] | None) -> None:
+def _check_url(url: str, shown: Credentials) -> None:
     try:
         parts = urlsplit(url)
         has_place = parts.hostname and parts.port != 0 and not any(map(str.isspace, url))
@@ -342,9 +310,9 @@ def _check_url(url: str, token: str | None, own: tuple[StrPath, StrPath] | None)
         is_address = False
     if not is_address or not parts.hostname:
         raise CloudError(f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443")
-    if token and parts.scheme == "http" and not is_loopback(parts.hostname):
+    if shown.token and parts.scheme == "http" and not is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be sent unencrypted; use https")
-    if own and parts.scheme == "http":
+    if shown.own and parts.scheme == "http":
         raise CloudError(f"{url}: certificates need https")
 
 
@@ -356,7 +324,8 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _trust(ca: StrPath | None, own: tuple[StrPath, StrPath] | None) -> ssl.SSLContext:
+def _trust(shown: Credentials) -> ssl.SSLContext:
+    ca, own = shown.ca, shown.own
     try:
         context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except (OSError, ssl.SSLError) as error:

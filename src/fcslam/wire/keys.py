@@ -2,10 +2,12 @@
 
 import os
 import ssl
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from fcslam.errors import InputError
+from fcslam.records import StrPath
 
 TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "client.pem", "client.key"
 """Files in a robot's folder of credentials."""
@@ -15,11 +17,15 @@ TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "client.pem", "client.ke
 class Credentials:
     """What a robot shows a service, and how it knows the service."""
 
-    token: str | None = None
-    ca: Path | None = None
+    token: str | None = field(default=None, repr=False)
+    ca: StrPath | None = None
     """PEM file of the authority that signed the service's certificate; None: the authorities of this system."""
-    own: tuple[Path, Path] | None = None
-    """PEM files of the robot's certificate and its key."""
+    own: tuple[StrPath, StrPath] | None = None
+    """PEM files of the robot's certificate and its key, in place of a token."""
+
+
+NO_CREDENTIALS: Final = Credentials()
+"""For a service that asks for none."""
 
 
 def read_credentials(folder: Path) -> Credentials:

@@ -13,6 +13,7 @@ TAG_VERSION = 7
 """Version of a tag sighting."""
 FIX_VERSION = 8
 """Version of a fix of satellite navigation."""
+VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION)
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""

@@ -8,22 +8,10 @@ from google.protobuf.message import DecodeError
 from fcslam.errors import PacketError
 from fcslam.records import Channel, Place, WordPlace
 from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire import limits
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
-from fcslam.wire.limits import (
-    FIX_VERSION,
-    FLOOR_VERSION,
-    MAXIMUM_EPOCH,
-    MAXIMUM_PACKET_BYTES,
-    MAXIMUM_SEQUENCE,
-    PROTOCOL_VERSION,
-    SWEEP_VERSION,
-    TAG_VERSION,
-    WORDS_VERSION,
-)
 from fcslam.wire.messages import Packet, PacketKind
-
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION)
 
 
 class Label(NamedTuple):
@@ -45,7 +33,7 @@ def encode(packet: Packet) -> bytes:
     kind, codec = CODEC_OF_TYPE[type(packet.body)]
     body: dict[str, Any] = {kind: codec.write(packet.body)}
     message = pb.Packet(
-        version=codec.version_of(packet.body),
+        version=codec.version(packet.body),
         robot=packet.robot,
         epoch=packet.epoch,
         sequence=packet.sequence,
@@ -96,7 +84,7 @@ def decode(data: bytes) -> Packet:
     body = codec.read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
     check(packet)
-    if message.version != (version := codec.version_of(body)):
+    if message.version != (version := codec.version(body)):
         raise PacketError(f"version {message.version} of a packet of version {version}")
     return packet
 
@@ -145,21 +133,21 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
         check_name(message.robot, "robot")
     except (DecodeError, PacketError):
         return None
-    numbered = message.epoch <= MAXIMUM_EPOCH and message.sequence <= MAXIMUM_SEQUENCE
-    known = message.version in _VERSIONS and numbered
+    numbered = message.epoch <= limits.MAXIMUM_EPOCH and message.sequence <= limits.MAXIMUM_SEQUENCE
+    known = message.version in limits.VERSIONS and numbered
     return (message.robot, message.epoch, message.sequence) if known else None
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
-    if len(data) > MAXIMUM_PACKET_BYTES:
-        raise PacketError(f"{len(data)} bytes, at most {MAXIMUM_PACKET_BYTES}")
+    if len(data) > limits.MAXIMUM_PACKET_BYTES:
+        raise PacketError(f"{len(data)} bytes, at most {limits.MAXIMUM_PACKET_BYTES}")
     message = pb.Packet()
     try:
         message.ParseFromString(data)
     except DecodeError as error:
         raise PacketError("not a protobuf message of a packet") from error
-    if message.version not in _VERSIONS:
-        known = f"{_VERSIONS[0]} to {_VERSIONS[-1]}"
+    if message.version not in limits.VERSIONS:
+        known = f"{limits.VERSIONS[0]} to {limits.VERSIONS[-1]}"
         raise PacketError(f"version {message.version} is unknown, this side speaks versions {known}")
     message.DiscardUnknownFields()
     if message.ByteSize() != len(data):

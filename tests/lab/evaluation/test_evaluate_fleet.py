@@ -11,8 +11,7 @@ from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.closures import ClosureScope
 from fcslam.lab.evaluation.fleet.ground_truth import read_grid
-from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
-from fcslam.lab.evaluation.fleet.report import Join, evaluate_fleet
+from fcslam.lab.evaluation.fleet.report import Join, evaluate_fleet, fleet_metrics
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 
@@ -291,7 +290,7 @@ def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
     for arguments, message in (
         ([str(tmp_path / "nothing")], "not a run folder"),
         ([str(folder), "--truth", str(tmp_path / "nowhere")], "nowhere: no folder with the truth"),
-        ([str(folder), "--csv", str(tmp_path / "missing" / "table.csv")], "cannot write the table"),
+        ([str(folder), "--csv", str(tmp_path / "missing" / "table.csv")], "cannot be written"),
     ):
         assert main(["evaluate", "fleet", *arguments]) == 2
         error = capsys.readouterr().err

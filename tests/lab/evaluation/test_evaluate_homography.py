@@ -15,8 +15,7 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.lab.evaluation.detectors.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
 from fcslam.lab.evaluation.detectors.measures import column, difference, mean
 from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.metrics.framing import HomographyGroundTruth, framed_homography
-from fcslam.metrics.homography import warp
+from fcslam.metrics.homography import HomographyGroundTruth, framed_homography, warp
 from tests.features.networks import tiny_network
 
 pytestmark = pytest.mark.slow
@@ -231,7 +230,7 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
         (["{scenes}", "--detector", "{empty}/none"], "no such folder"),
         (["{scenes}", "--detector", "{empty}"], "cannot read the features"),
         (["{scenes}", "--detector", "onnx", "--detector", "{empty}/n.onnx"], "cannot read the network weights"),
-        (["{scenes}", "--detector", "orb", "--csv", "{empty}/none/t.csv"], "cannot write the table"),
+        (["{scenes}", "--detector", "orb", "--csv", "{empty}/none/t.csv"], "cannot be written"),
     ],
 )
 def test_mistakes_are_told_in_one_line(scenes, tmp_path, capsys, arguments, message):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fcslam.lab.simulation.options import Building
-from fcslam.lab.simulation.route import draw_goals, plan_route
+from fcslam.lab.simulation.route import draw_goals, plan_route, schedule
 
 INDOORS = [building for building in Building if not building.is_outdoors]
 
@@ -11,6 +11,13 @@ INDOORS = [building for building in Building if not building.is_outdoors]
 def route(plan, length_m, rng):
     """Waypoints of one robot."""
     return plan_route(plan, draw_goals(plan, 1, length_m, rng)[0], length_m, rng)
+
+
+def drive(waypoints, period_s):
+    """Sample a drive along waypoints (K, 2) every ``period_s``: times (N,) from zero and poses (N, 3)."""
+    plan = schedule(waypoints)
+    stamps = np.arange(0.0, plan.duration_s, period_s)
+    return stamps, plan.at(stamps)
 
 
 def distances(points, segments):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.lab.simulation.decoration import light_of
 from fcslam.lab.simulation.floorplan import (
     DOOR_M,
     PieceKind,
@@ -14,10 +15,9 @@ from fcslam.lab.simulation.floorplan import (
     move_furniture,
     with_closed_doors,
 )
-from fcslam.lab.simulation.lighting import light_of
 from fcslam.lab.simulation.options import Building, Lighting
-from fcslam.lab.simulation.route import drive, schedule
-from tests.lab.simulation.driving import INDOORS, distances, route
+from fcslam.lab.simulation.route import schedule
+from tests.lab.simulation.driving import INDOORS, distances, drive, route
 
 every_building = pytest.mark.parametrize("building", INDOORS)
 

@@ -10,18 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.lab.simulation.decoration import WallPicture, decorate
+from fcslam.lab.simulation.decoration import WallPicture, decorate, light_of
 from fcslam.lab.simulation.engine import mujoco
 from fcslam.lab.simulation.floorplan import draw_floor_plan
-from fcslam.lab.simulation.lighting import light_of
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building, Lighting
-from fcslam.lab.simulation.route import drive
 from fcslam.lab.simulation.scene import furnished_model
 from fcslam.lab.simulation.sensors import Camera
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.records import CameraImage, LaserScan
-from tests.lab.simulation.driving import route
+from tests.lab.simulation.driving import drive, route
 from tests.lab.simulation.gl import require_gl
 
 pytestmark = pytest.mark.system

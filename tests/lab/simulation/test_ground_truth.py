@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from fcslam.lab.simulation.floorplan import PieceKind
-from fcslam.lab.simulation.ground_truth import true_map, true_relations, write_ground_truth
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building
+from fcslam.lab.simulation.recording import true_map, true_relations, write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
 from fcslam.runs.map_files import Occupancy

@@ -10,8 +10,8 @@ from fcslam.errors import SimulationError
 from fcslam.lab.simulation.drivable_space import ROBOT_RADIUS_M, DrivableSpace
 from fcslam.lab.simulation.floorplan import FloorPlan, Piece, PieceKind, Room, draw_floor_plan, move_furniture
 from fcslam.lab.simulation.options import Building
-from fcslam.lab.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, draw_goals, drive, plan_route, schedule
-from tests.lab.simulation.driving import INDOORS, distances, route
+from fcslam.lab.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, draw_goals, plan_route, schedule
+from tests.lab.simulation.driving import INDOORS, distances, drive, route
 
 
 def box(west, south, east, north):

@@ -16,10 +16,9 @@ from fcslam.lab.simulation.odometry import (
     simulate_odometry,
 )
 from fcslam.lab.simulation.options import OdometryKind
-from fcslam.lab.simulation.route import drive
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings
 from fcslam.records import LaserModel
-from tests.lab.simulation.driving import route
+from tests.lab.simulation.driving import drive, route
 
 NO_DRIFT = OdometryNoiseSettings(
     travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0

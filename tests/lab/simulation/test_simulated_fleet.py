@@ -13,12 +13,11 @@ from fcslam.lab.simulation import engine, textures
 from fcslam.lab.simulation.floorplan import PieceKind, draw_floor_plan
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building
-from fcslam.lab.simulation.route import drive
 from fcslam.lab.simulation.scene import bare_model
 from fcslam.lab.simulation.sensors import RayCaster
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.records import GroundTruth, LaserModel, LaserScan
-from tests.lab.simulation.driving import route
+from tests.lab.simulation.driving import drive, route
 
 TINY = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=4.0, camera=None, lidar=LidarSettings(beams=60, rate_hz=4.0)

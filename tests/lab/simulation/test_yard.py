@@ -12,13 +12,12 @@ from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.odometry import KINDS, simulate_odometry
 from fcslam.lab.simulation.options import Building, OdometryKind
 from fcslam.lab.simulation.outdoor_rays import LASER_HEIGHT_M, OutdoorRayCaster
-from fcslam.lab.simulation.route import drive
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.lab.simulation.terrain import CELL_M, Terrain
 from fcslam.lab.simulation.walk import draw_starts, plan_walk
 from fcslam.lab.simulation.yard import draw_yard, move_cars
 from fcslam.records import LaserModel
-from tests.lab.simulation.driving import distances
+from tests.lab.simulation.driving import distances, drive
 
 SICK = LidarSettings(beams=181, field_of_view_rad=np.pi, max_range_m=81.9, rate_hz=0.5)
 TINY = SimulationSettings(building=Building.YARD, robots=2, path_length_m=60.0, camera=None, lidar=SICK)

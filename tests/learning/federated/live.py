@@ -11,10 +11,11 @@ import numpy as np
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
+from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.authentication import Authenticator, Role, read_tokens
+from fcslam.wire.keys import Credentials
 from tests.learning.federated.fakes import version
 
 LIMIT_S = 120.0
@@ -67,14 +68,14 @@ class LiveFleet:
 
     def link(self, robot, owner=None):
         """The link of a robot that shows the token of ``owner``."""
-        return RobotLink(f"https://{self.address}", robot, self.token(owner or robot), self.ca)
+        return RobotLink(f"https://{self.address}", robot, Credentials(self.token(owner or robot), self.ca))
 
     def start(self, client, app=None):
         """Let a robot answer requests until the server ends."""
 
         def work():
             with contextlib.suppress(_EndedError), self.link(client.name) as link:
-                serve_requests(link, app or build_client_app(client), robot_context(), self._end, _end)
+                serve_requests(link, app or build_client_app(client), self._end, _end)
 
         threading.Thread(target=work, daemon=True).start()
 

@@ -149,7 +149,7 @@ def test_a_poisoned_update_changes_nothing(poison, fleet, undisturbed, tmp_path)
 
 
 def wait_for_all(grid):
-    wait_until(lambda: len(grid.get_node_ids()) == len(HONEST) + 1)
+    wait_until(lambda: len(grid.nodes()) == len(HONEST) + 1)
 
 
 def wait_until(happened):

@@ -14,13 +14,13 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.learning.arrays import write_arrays  # noqa: E402
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.federated.client import RobotClient, robot_seed  # noqa: E402
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network, weights_version  # noqa: E402
 from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.federated.weights import trained_names  # noqa: E402
 from fcslam.learning.local_training import layer_names, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.untrusted import read_arrays  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -247,7 +247,7 @@ def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path):
     changed = {name for name, array in found.items() if not np.array_equal(array, start[name])}
     assert changed
     network = KeypointNetwork("light")
-    assert changed <= layer_names(network, network.code_layers)
+    assert changed <= layer_names(network, network.body.code_layers)
     assert not same(found, update("b", RevisitExamples(images[::-1], [pair])))
     with pytest.raises(TrainingError, match="no place was"):
         update("c", RevisitExamples(images))

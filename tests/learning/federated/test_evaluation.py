@@ -8,10 +8,10 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.cli.federate.rounds import round_line
+from fcslam.cli.federate import round_line
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client_app import build_client_app
-from fcslam.learning.federated.evaluation import PublicImages, VersionComparison, valid_metrics
+from fcslam.learning.federated.evaluation import PUBLIC_IMAGES, VersionComparison, valid_metrics
 from fcslam.learning.federated.flower import InProcessGrid
 from tests.learning.federated.fakes import START, Fake, run, settings, shifted
 
@@ -38,9 +38,11 @@ class Coming(InProcessGrid):
         super().__init__({robot.name: build_client_app(robot) for robot in robots})
         self._first, self._since = robots[0], since
 
-    def get_node_ids(self):
+    def nodes(self):
         begun = len(self._first.asked)
-        return [node for node, since in zip(self._contexts, self._since, strict=True) if begun >= since]
+        return {
+            name: node for (name, node), since in zip(self._nodes.items(), self._since, strict=True) if begun >= since
+        }
 
 
 def run_coming(robots, since, folder, **given):
@@ -113,7 +115,7 @@ def test_a_run_that_robots_judged_goes_on_with_public_images(tmp_path):
 
     state, reports = run([Judging("a")], tmp_path, settings(rounds=4), evaluate_fn=judge)
     assert [report.released for report in reports] == [True, True]
-    assert state.best_scores == {PublicImages(): pytest.approx(0.94)}
+    assert state.best_scores == {PUBLIC_IMAGES: pytest.approx(0.94)}
 
 
 def test_a_robot_that_only_fails_to_judge_the_best_is_named(tmp_path):

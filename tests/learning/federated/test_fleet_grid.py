@@ -100,13 +100,13 @@ def test_a_reply_beyond_the_limit_is_read_no_further(grid):
 
 
 def test_a_robot_is_online_for_a_while(grid, clock):
-    assert grid.get_node_ids() == []
+    assert grid.nodes() == {}
     assert grid.admits("two")
-    assert grid.get_node_ids() == []
+    assert grid.nodes() == {}
     grid.mark_online("two")
-    assert grid.get_node_ids() == [3]
+    assert grid.nodes() == {"two": 3}
     clock.now = ONLINE_S + 0.1
-    assert grid.get_node_ids() == []
+    assert grid.nodes() == {}
 
 
 def test_nobody_waits_for_a_robot_that_is_gone(grid, clock):

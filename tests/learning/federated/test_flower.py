@@ -12,7 +12,6 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated import flower
-from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.strategies import create_strategy
@@ -39,12 +38,6 @@ def test_a_message_asks_the_task_identity_who_sends_it():
     message = flower.Message(flower.RecordDict({}), flower.FIRST_NODE, flower.MessageType.TRAIN)
     assert message.metadata.src_node_id == flower.RUN_ID
     assert message.metadata.dst_node_id == flower.FIRST_NODE
-
-
-@pytest.mark.parametrize("grid", [flower.InProcessGrid, FleetGrid])
-def test_our_grids_implement_all_of_flowers_grid(grid):
-    assert flower.Grid.__abstractmethods__ <= vars(grid).keys() | vars(flower.RobotGrid).keys()
-    assert not grid.__abstractmethods__
 
 
 @pytest.mark.parametrize("strategy", ["fedavg", "fedmedian"])

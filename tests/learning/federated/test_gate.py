@@ -5,9 +5,9 @@ import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from fcslam.learning.federated.gate import decide
+from fcslam.learning.federated.evaluation import decide
 from fcslam.learning.federated.held_out import COLUMNS, MOST_PAIRS, check_judgement
-from fcslam.learning.federated.live_settings import GateSettings
+from fcslam.learning.federated.settings import GateSettings
 
 PAIRS = 80
 """Of each of three robots: 240 in all."""

@@ -9,7 +9,7 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.config import changed
-from fcslam.learning.federated.live_settings import FleetLearningSettings, GateSettings
+from fcslam.learning.federated.settings import FleetLearningSettings, GateSettings
 from tests.learning.federated.fakes import START, Fake, run, settings, version
 
 CODES = {"trained": "codes", "normalisation": "frozen"}

@@ -12,7 +12,6 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
 from fcslam.learning.federated.held_out import judge  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
-from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
 from fcslam.learning.federated.own_examples import SPLIT_FILE, own_examples  # noqa: E402
 from fcslam.learning.federated.robot_learning import (  # noqa: E402
@@ -20,6 +19,7 @@ from fcslam.learning.federated.robot_learning import (  # noqa: E402
     LearningEndError,
     LearningRobot,
 )
+from fcslam.learning.federated.settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
 from fcslam.records import Channel, Place  # noqa: E402
 from fcslam.robot.backend import RobotBackend  # noqa: E402
 from fcslam.robot.backend_runner import InlineBackend  # noqa: E402
@@ -56,7 +56,7 @@ def test_keyframes_come_back_with_the_poses_of_the_robots_own_map(driven):
 @pytest.mark.slow
 def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
     (driven[0] / SPLIT_FILE).unlink(missing_ok=True)
-    held_out = own_examples(driven[0], SETTINGS).held_out
+    _, held_out = own_examples(driven[0], SETTINGS)
     start = read_detector_weights(BUNDLED_NETWORK, "light")
     scale = np.random.default_rng(1).standard_normal(start[CODE_LAYER].shape) * start[CODE_LAYER].std()
     others = {"noisy": {CODE_LAYER: start[CODE_LAYER] + np.float32(2.0) * scale.astype(np.float32)},
@@ -77,15 +77,15 @@ def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
 def test_a_keyframe_that_is_held_out_is_never_trained_on(driven):
     folder, _ = driven
     (folder / SPLIT_FILE).unlink(missing_ok=True)
-    examples = own_examples(folder, SETTINGS)
-    trained = {image.tobytes() for image in examples.revisits.images}
-    judged = {frame.image.tobytes() for frame in examples.held_out.frames}
+    revisits, held_out = own_examples(folder, SETTINGS)
+    trained = {image.tobytes() for image in revisits.images}
+    judged = {frame.image.tobytes() for frame in held_out.frames}
     assert trained
     assert judged
     assert not trained & judged
     moved = RobotLearningSettings(held_out=HeldOutSettings(side_m=1.0))  # as if the map had moved to other squares
-    again = own_examples(folder, moved)
-    assert {frame.image.tobytes() for frame in again.held_out.frames} == judged
+    _, again = own_examples(folder, moved)
+    assert {frame.image.tobytes() for frame in again.frames} == judged
 
 
 def test_a_damaged_keyframe_is_left_out(driven, tmp_path):

@@ -9,11 +9,15 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.codec import record_to_weights, weights_to_record
 from fcslam.learning.federated.flower import Array, ArrayRecord, Error, Message, MessageType, MetricRecord
 from fcslam.learning.federated.history import ROUNDS_FILE, read_rows
-from fcslam.learning.federated.messages import ARRAYS_KEY
-from fcslam.learning.federated.replies import MAX_REASON_LENGTH, RoundReplies
+from fcslam.learning.federated.messages import (
+    ARRAYS_KEY,
+    MAX_REASON_LENGTH,
+    RoundReplies,
+    record_to_weights,
+    weights_to_record,
+)
 from tests.learning.federated.fakes import START, Fake, grid_of, run, settings, shifted
 
 

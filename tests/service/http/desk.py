@@ -14,7 +14,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.stage_times import StageTotal
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel
-from fcslam.service.audit_log import AuditFile, AuditLog
+from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.app import create_app
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 from fcslam.service.http.events import EventStream
@@ -83,7 +83,7 @@ class Desk:
             Authenticator(tokens),
             RateLimit(lambda: self.now, burst=2.0**21),
             EventStream(),
-            AuditLog(AuditFile(root / "audit.jsonl"), lambda: 1e9 + self.now),
+            AuditFile(root / "audit.jsonl", lambda: 1e9 + self.now),
         )
         self.app = create_app(self.state)
         self._listening = socket.create_server(("127.0.0.1", 0))

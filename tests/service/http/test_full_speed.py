@@ -7,6 +7,7 @@ from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import Sender
 from fcslam.service.token_buckets import TokenBuckets
 from fcslam.wire.http_transport import HttpTransport
+from fcslam.wire.keys import Credentials
 from fcslam.wire.packets import decode
 from tests.service.http.desk import A
 
@@ -21,7 +22,7 @@ def test_a_recording_at_full_speed_is_slowed_and_not_refused(desk, tmp_path, mon
     outbox.begin("r", resume=False)
     outbox.put([decode(data) for data in A])
     refused, slowed = [], []
-    transport = HttpTransport(str(desk.client.base_url), "a", outbox.agent, token="token of a")
+    transport = HttpTransport(str(desk.client.base_url), "a", outbox.agent, Credentials("token of a"))
     sender = Sender(
         outbox, transport, np.random.default_rng(0), lambda: desk.now,
         lambda *_: None, lambda *_: None, lambda *packet: refused.append(packet),

@@ -277,7 +277,7 @@ def test_the_audit_log_has_the_lines_of_all_instances(registry, postgres):
     tables = [AuditTable(postgres, name) for name in ("one", "two")]
     for k in range(4):
         tables[k % 2].append(f'{{"line": {k}}}'.encode())
-        until(lambda k=k: tables[0].newest(1) == [f'{{"line": {k}}}'.encode()])
-    assert [line[-2:] for line in tables[1].newest(3)] == [b"1}", b"2}", b"3}"]
+        until(lambda k=k: tables[0].lines(1) == [f'{{"line": {k}}}'.encode()])
+    assert [line[-2:] for line in tables[1].lines(3)] == [b"1}", b"2}", b"3}"]
     for table in tables:
         table.close()

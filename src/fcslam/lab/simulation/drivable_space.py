@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from fcslam.errors import SimulationError
+from fcslam.geometry.cell_graph import cell_graph
 from fcslam.lab.simulation.floorplan import FloorPlan, PieceKind
 from fcslam.records import FloatArray, frozen
 
@@ -105,20 +106,7 @@ class DrivableSpace:
     @cached_property
     def _graph(self) -> csr_array:
         """Costs (N, N) of the steps between neighbouring grid points, diagonal steps included."""
-        inside = self._inside
-        numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
-        price = _price(self._clearance_m[::_STEP, ::_STEP])
-        starts, ends, costs = [], [], []
-        for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            here = (slice(0, inside.shape[0] - row), slice(max(0, -column), inside.shape[1] - max(0, column)))
-            there = (slice(row, None), slice(max(0, column), inside.shape[1] + min(0, column)))
-            both = inside[here] & inside[there]
-            starts.append(numbers[here][both])
-            ends.append(numbers[there][both])
-            length_m = _STEP * _CELL_M * float(np.hypot(row, column))
-            costs.append(0.5 * length_m * (price[here][both] + price[there][both]))
-        ways = (np.concatenate(starts + ends), np.concatenate(ends + starts))
-        return csr_array((np.concatenate(costs + costs), ways), shape=(len(self.points),) * 2)
+        return cell_graph(self._inside, _STEP * _CELL_M, _price(self._clearance_m[::_STEP, ::_STEP]))
 
 
 def _price(clearance_m: FloatArray) -> FloatArray:

@@ -159,14 +159,7 @@ def doors_after(
     """Which doors are closed while a robot drives, by their number in ``doors_of``.
 
     The doors that it drives through are open. Of those that it drives by, a ``share`` is closed; the others stay as
-    they were.
-
-    Args:
-        plan: the building.
-        closed: doors that were closed before.
-        share: in [0, 1].
-        route: positions of the robot, shape (N, 2).
-        rng: random generator.
+    they were. ``closed``: doors that were closed before; ``route``: positions of the robot, shape (N, 2).
     """
     after: set[int] = set()
     for number, door in enumerate(doors_of(plan)):

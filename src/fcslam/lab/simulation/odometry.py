@@ -127,11 +127,7 @@ def read_odometry(
 def simulate_odometry(
     T_building_base: FloatArray, settings: OdometryNoiseSettings, rng: np.random.Generator
 ) -> FloatArray:
-    """Simulate the odometry of a robot along true poses (N, 3), metres and radians.
-
-    Returns:
-        ``T_odom_base``, shape (N, 3); the first is zero.
-    """
+    """``T_odom_base`` (N, 3) of a robot along true poses (N, 3), metres and radians; the first is zero."""
     twists = se2.log(se2.relative(T_building_base))
     travel, turn = np.abs(twists[:, 0]), np.abs(twists[:, 2])
     scale_travel, scale_turn = 1.0 + rng.normal(0.0, settings.scale_bias, 2)

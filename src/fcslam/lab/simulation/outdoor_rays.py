@@ -97,9 +97,7 @@ class OutdoorRayCaster:
     def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
         """Ranges (beam_count,) in metres on level ground, as if everything returned every beam.
 
-        Args:
-            T_building_base: pose of the robot, shape (3,), or its poses at each beam, shape (beam_count, 3).
-            laser: the laser.
+        The pose (3,) of the robot, or its poses at each beam, shape (beam_count, 3).
         """
         return self._cast(T_building_base, laser, np.zeros(2), None)
 

@@ -1,15 +1,21 @@
-"""Writes the recordings of a simulated fleet."""
+"""Writes the recordings of a simulated fleet, and its ground truth: relations between scans, and the true map."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
+
+import numpy as np
 
 import fcslam
 from fcslam.config import dump
-from fcslam.errors import OutputError
-from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings
-from fcslam.records import RecordedItem
+from fcslam.errors import OutputError, writing
+from fcslam.geometry import se2
+from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, ray_caster
+from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
+from fcslam.records import FloatArray, LaserModel, RecordedItem, frozen
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.sources import RecordingWriter
 from fcslam.storage.files import write_file
 
@@ -17,6 +23,18 @@ SETTINGS: Final = "simulation.yaml"
 """File with the settings of the fleet in a folder, which determine all its recordings."""
 
 Watch = Callable[[Iterator[RecordedItem]], Iterator[RecordedItem]]
+
+RESOLUTION_M = 0.05
+
+_STEP_M, _TURN_RAD = 0.2, 0.2
+"""Distance and turn between the scans that are drawn; closer scans add almost nothing to the map."""
+_REACH_M = 5.0
+_INTO_M = 1e-3
+"""A beam is extended by this, so that its end falls into the cell of the wall, not of the free space before it."""
+_MARGIN = 2
+"""Unknown cells around the building."""
+_FRACTION_BITS = 8
+"""Fractional bits of OpenCV's fixed-point coordinates, when beams are drawn."""
 
 
 def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int) -> None:
@@ -26,13 +44,11 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int) 
         OutputError: the folder holds something else, or cannot be written.
     """
     text = f"# What fcslam simulated here.\nfcslam: {fcslam.__version__}\nseed: {seed}\n{dump(settings)}"
-    try:
+    with writing(folder, "choose another output folder"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise OutputError(f"{folder}: is not empty; choose another place")
         write_file(folder / SETTINGS, text)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
 
 
 def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> None:
@@ -47,3 +63,95 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> No
     with RecordingWriter.create(folder, robot.lasers, robot.camera) as writer, closing(robot.items()) as items:
         for item in watch(items):
             writer.write(item)
+
+
+class HasTruePoses(Protocol):
+    """A robot whose true poses are known."""
+
+    @property
+    def stamps(self) -> FloatArray:
+        """Stamps of its scans, shape (N,), seconds."""
+
+    @property
+    def T_building_base(self) -> FloatArray:
+        """True poses at these stamps, shape (N, 3)."""
+
+
+def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
+    """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``.
+
+    True poses are in each robot's recording. The relations measure a map without a common coordinate frame.
+
+    Raises:
+        SimulationError: MuJoCo is missing.
+    """
+    place = folder / "ground_truth"
+    place.mkdir(parents=True, exist_ok=True)
+    write_relations(place / "relations", true_relations(fleet.robots, rng))
+    seen = true_map(fleet)
+    write_file(place / "map.pgm", pgm_bytes(seen))
+    write_file(place / "map.yaml", map_yaml(seen, "map.pgm"))
+
+
+def true_relations(robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000) -> Relations:
+    """Draw up to ``count`` true relations between scans of any robots, within 5 m and more than 20 s apart."""
+    stamps = np.concatenate([robot.stamps for robot in robots])
+    poses = np.concatenate([robot.T_building_base for robot in robots])
+    first, second = rng.integers(0, len(stamps), (2, 50 * count))
+    near = np.hypot(*(poses[first, :2] - poses[second, :2]).T) < _REACH_M
+    apart = np.abs(stamps[first] - stamps[second]) > ACROSS_ROBOTS_GAP_S
+    chosen = np.flatnonzero(near & apart)[:count]
+    first, second = first[chosen], second[chosen]
+    return Relations(
+        frozen(np.column_stack((stamps[first], stamps[second]))), frozen(se2.between(poses[first], poses[second]))
+    )
+
+
+def true_map(fleet: SimulatedFleet) -> OccupancyMap:
+    """The map of the robots' beams without noise, from their true poses: surfaces, and free space before them.
+
+    The coordinate frame is the building's. A beam that returns nothing leaves its cells unknown. Where furniture moved,
+    every surface that a robot saw is occupied.
+
+    Raises:
+        SimulationError: MuJoCo is missing.
+    """
+    width, height = (int(np.ceil(size / RESOLUTION_M)) + 2 * _MARGIN for size in fleet.plan.size_m)
+    passed, hit = (np.zeros((height, width), dtype=np.uint8) for _ in range(2))
+    for robot in fleet.robots:
+        _draw_beams(robot, passed, hit)
+    cells = np.full((height, width), Occupancy.UNKNOWN, dtype=np.uint8)
+    cells[passed > 0] = Occupancy.FREE
+    cells[hit > 0] = Occupancy.OCCUPIED
+    return OccupancyMap(cells, RESOLUTION_M, (-_MARGIN * RESOLUTION_M,) * 2)
+
+
+def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:
+    import cv2
+
+    caster = ray_caster(robot.plan)
+    for pose, laser in product(_spaced(robot.T_building_base), robot.lasers):
+        start, ends = _beams(caster.cast(pose, laser), laser, pose)
+        columns, rows = np.floor(ends).astype(int).T
+        hit[rows, columns] = 1
+        # OpenCV counts from the middle of the first cell.
+        lines = np.stack((np.broadcast_to(start, ends.shape), ends), axis=1) - 0.5
+        drawn = np.round(lines * 2**_FRACTION_BITS).astype(np.int32)
+        cv2.polylines(passed, list(drawn), False, 1, shift=_FRACTION_BITS)
+
+
+def _spaced(poses: FloatArray) -> FloatArray:
+    """Select poses (N, 3) with at least a step of distance or turn between them."""
+    x, y, turn = se2.relative(poses).T
+    steps = np.insert(np.cumsum(np.hypot(x, y) / _STEP_M + np.abs(turn) / _TURN_RAD), 0, 0.0)
+    return poses[np.unique(np.floor(steps), return_index=True)[1]]
+
+
+def _beams(ranges_m: FloatArray, laser: LaserModel, T_building_base: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Start (2,) and ends (N, 2) of the beams that hit a surface, in cells."""
+    x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser))
+    returned = ranges_m < laser.max_range_m
+    angles = heading + laser.angles_rad()[returned]
+    start = np.array([x, y])
+    ends = start + (ranges_m[returned] + _INTO_M)[:, None] * np.column_stack((np.cos(angles), np.sin(angles)))
+    return start / RESOLUTION_M + _MARGIN, ends / RESOLUTION_M + _MARGIN

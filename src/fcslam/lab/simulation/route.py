@@ -32,13 +32,7 @@ _LEAST_SPREAD_M = 1.0
 def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
     """Draw goals (G, 2) for each robot: overlapping parts of one walk through rooms and corridors.
 
-    Another robot changes nothing for those before it.
-
-    Args:
-        plan: the building.
-        robots: number of robots.
-        length_m: path length of each robot.
-        rng: random generator.
+    Another robot changes nothing for those before it. ``length_m``: path length of each robot.
 
     Raises:
         SimulationError: the building has no drivable space, or too little of it.
@@ -128,13 +122,6 @@ def schedule(waypoints: FloatArray, turn_rate_rad_s: float = TURN_RATE_RAD_S) ->
     positions = np.vstack((np.repeat(corners[:-1], 2, axis=0), corners[-1:]))
     angles = np.append(headings[:1], np.repeat(headings, 2))
     return Schedule(frozen(times), frozen(np.column_stack((positions, angles))))
-
-
-def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
-    """Sample a drive along waypoints (K, 2) every ``period_s``: times (N,) from zero and poses (N, 3)."""
-    plan = schedule(waypoints)
-    stamps = np.arange(0.0, plan.duration_s, period_s)
-    return stamps, plan.at(stamps)
 
 
 def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from fcslam.lab.simulation.decoration import DOOR_HEIGHT_M, WALL_HEIGHT_M, Decoration
+from fcslam.lab.simulation.decoration import DOOR_HEIGHT_M, LAMP_HEIGHT_M, WALL_HEIGHT_M, Decoration, Light
 from fcslam.lab.simulation.engine import mujoco
 from fcslam.lab.simulation.floorplan import FloorPlan, Piece, PieceKind
-from fcslam.lab.simulation.lighting import LAMP_HEIGHT_M, Light
 from fcslam.lab.simulation.textures import Image
 from fcslam.records import FloatArray
 

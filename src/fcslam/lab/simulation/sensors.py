@@ -8,8 +8,8 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.geometry.rotations import rotation_matrix
+from fcslam.lab.simulation.decoration import Light
 from fcslam.lab.simulation.engine import GL_LOCK, gl_context, mujoco
-from fcslam.lab.simulation.lighting import Light
 from fcslam.lab.simulation.scene import SEEN, SOLID
 from fcslam.lab.simulation.textures import Image
 from fcslam.records import CameraModel, FloatArray, LaserModel
@@ -33,9 +33,7 @@ class RayCaster:
     def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
         """Ranges (beam_count,) in metres without noise; ``max_range_m`` without a hit.
 
-        Args:
-            T_building_base: pose of the robot, shape (3,), or its poses at each beam, shape (beam_count, 3).
-            laser: the laser.
+        The pose (3,) of the robot, or its poses at each beam, shape (beam_count, 3).
         """
         x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser)).T
         angles = heading + laser.angles_rad()

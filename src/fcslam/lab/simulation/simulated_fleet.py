@@ -16,9 +16,8 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.errors import SimulationError
-from fcslam.lab.simulation.decoration import Decoration, decorate
+from fcslam.lab.simulation.decoration import Decoration, decorate, light_of
 from fcslam.lab.simulation.floorplan import FloorPlan, doors_after, draw_floor_plan, move_furniture, with_closed_doors
-from fcslam.lab.simulation.lighting import light_of
 from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, simulate_ranges
 from fcslam.lab.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner

@@ -39,10 +39,7 @@ class Terrain:
 def draw_terrain(size_m: tuple[float, float], rng: np.random.Generator, slope: float = SLOPE) -> Terrain:
     """Draw hills for an area from west to east and from south to north.
 
-    Args:
-        size_m: size of the area.
-        rng: source of the hills.
-        slope: root mean square slope in each direction; most slopes are below twice this.
+    ``slope`` is the root mean square in each direction; most slopes are below twice this.
     """
     x = np.arange(0.0, size_m[0] + 2.0 * CELL_M, CELL_M)
     y = np.arange(0.0, size_m[1] + 2.0 * CELL_M, CELL_M)[:, None]

@@ -1,15 +1,14 @@
 """The files of a finished federated run: the detector as an ONNX file, its model card, and a picture of the rounds."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from fcslam.config import dump
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import writing
+from fcslam.learning.artifacts import model_card
 from fcslam.learning.export import detector_version, export_onnx
 from fcslam.learning.federated.checkpoint import CoordinatorState
-from fcslam.learning.federated.history import LOSS, ROUNDS_FILE, Row
+from fcslam.learning.federated.history import LOSS, ROUNDS_FILE, Row, read_rows
 from fcslam.learning.federated.networks import weights_to_network
 from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 
@@ -29,11 +28,7 @@ def write_federated_artifacts(
 ) -> list[Path]:
     """Write the detector, the picture and the card; returns their paths.
 
-    Args:
-        state: its best weights are exported.
-        folder: of the run; contains the table of rounds.
-        settings: of the run.
-        judged_on: the images on which versions were evaluated, in words.
+    ``folder`` contains the table of rounds; ``judged_on`` names the images on which versions were evaluated.
 
     Raises:
         OutputError: a file cannot be written.
@@ -41,14 +36,21 @@ def write_federated_artifacts(
     """
     network = weights_to_network(state.best, settings.training.encoder)
     export_onnx(network, folder / DETECTOR)
-    rows = _rows(folder / ROUNDS_FILE)
-    try:
+    rows = read_rows(folder / ROUNDS_FILE, state.rounds_done)
+    best = next((row for row in rows if int(row["round"]) == state.best_round), {})
+    figures = {text: float(best[name]) for name, text in SHOWN_METRICS.items() if best.get(name)}
+    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
+    sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
+    facts = [
+        f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
+        f"{state.best_round}. How often each was asked: {asked or 'never'}.",
+        "",
+        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB.",
+    ]
+    with writing(folder):
         draw_rounds(rows, folder / PICTURE)
-        (folder / CARD).write_text(_card(detector_version(network), state, settings, rows, judged_on), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be written ({error}); free disk space and run the command again"
-        ) from error
+        card = model_card(detector_version(network), facts, judged_on, figures, settings)
+        (folder / CARD).write_text(card, encoding="utf-8")
     return [folder / name for name in (DETECTOR, PICTURE, CARD)]
 
 
@@ -79,38 +81,5 @@ def draw_rounds(rows: Sequence[Row], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _rows(path: Path) -> list[Row]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
-    except (OSError, csv.Error) as error:
-        raise TrainingError(f"{path}: is not a table of rounds ({error})") from error
-
-
 def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
     return [float(row.get(name) or "nan") for row in rows]
-
-
-def _card(
-    version: str, state: CoordinatorState, settings: FederatedSettings, rows: Sequence[Row], judged_on: str
-) -> str:
-    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
-    best = next((row for row in rows if int(row["round"]) == state.best_round), {})
-    sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
-    lines = [
-        f"# Detector {version}",
-        "",
-        f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
-        f"{state.best_round}. How often each was asked: {asked or 'never'}.",
-        "",
-        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB.",
-        "",
-        f"| {judged_on} | |",
-        "|---|---|",
-        *(f"| {text} | {float(best[name]):.3f} |" for name, text in SHOWN_METRICS.items() if best.get(name)),
-        "",
-        "Settings:",
-        "",
-        *(f"    {line}" for line in dump(settings).splitlines()),
-    ]
-    return "\n".join(lines) + "\n"

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from fcslam.learning.federated.evaluation import Evaluator, PublicImages
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, weights_error
 
@@ -21,8 +20,6 @@ CHECKPOINT_FILE: Final = "checkpoint.npz"
 STAGE: Final = "federated"
 CHANGEABLE: Final = frozenset({"rounds", "deadline_s", "minimum_robots"})
 """Settings whose values may differ when a run is continued: they do not change the rounds that are done."""
-_PUBLIC_IMAGES_KEY: Final = ""
-"""Stands for ``PublicImages`` among the robots' names in the file; no robot's name is empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +33,8 @@ class CoordinatorState:
     """Moving average of the rounds' weights; it is evaluated and released."""
     best: Weights
     """The released weights."""
-    best_scores: Mapping[Evaluator, float]
-    """Scores of the released weights in [0, 1], by everyone who evaluated them."""
+    best_scores: Mapping[str, float]
+    """Scores of the released weights in [0, 1], by everyone who evaluated them (``PUBLIC_IMAGES`` or a robot)."""
     best_round: int
     """The round that made them; 0 if they are the initial weights."""
     strategy_state: Mapping[str, NDArray[Any]]
@@ -50,7 +47,7 @@ class CoordinatorState:
     """Median norm of the updates of the last round, by which those of the next one are screened; 0 before the first."""
 
     @classmethod
-    def at_start(cls, initial: Weights, version: str, scores: Mapping[Evaluator, float]) -> Self:
+    def at_start(cls, initial: Weights, version: str, scores: Mapping[str, float]) -> Self:
         """The state before the first round, from the initial weights, their version and their scores."""
         return cls(0, initial, initial, initial, scores, 0, {}, {}, version)
 
@@ -70,7 +67,7 @@ def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings
         OutputError: the file cannot be written; the last checkpoint stays.
     """
     numbers = {
-        "best_scores": {_key(evaluator): score for evaluator, score in state.best_scores.items()},
+        "best_scores": dict(state.best_scores),
         "best_round": state.best_round,
         "asked": dict(state.times_asked),
         "origin": state.origin,
@@ -91,16 +88,9 @@ def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings
 
 
 def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin: str) -> CoordinatorState | None:
-    """Read a checkpoint of this run.
+    """The state in a checkpoint of this run; None if there is no file.
 
-    Args:
-        path: file of the checkpoint.
-        settings: of this run.
-        initial: weights that this run starts from.
-        origin: detector version of ``initial``.
-
-    Returns:
-        The state, or None if there is no file.
+    ``initial`` and ``origin``: the weights that the run starts from, and their detector version.
 
     Raises:
         TrainingError: the file is broken, or belongs to a run with other settings, weights or network.
@@ -122,7 +112,7 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
             groups["weights"],
             groups["average"],
             groups["best"],
-            {_evaluator(key): float(score) for key, score in header["best_scores"].items()},
+            {str(evaluator): float(score) for evaluator, score in header["best_scores"].items()},
             int(header["best_round"]),
             groups["memory"],
             {str(robot): int(rounds) for robot, rounds in header["asked"].items()},
@@ -149,14 +139,6 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
             f"{path}: belongs to a run that began from {state.origin}, not from {origin}; give another --output"
         )
     return state
-
-
-def _key(evaluator: Evaluator) -> str:
-    return _PUBLIC_IMAGES_KEY if isinstance(evaluator, PublicImages) else evaluator
-
-
-def _evaluator(key: str) -> Evaluator:
-    return PublicImages() if key == _PUBLIC_IMAGES_KEY else str(key)
 
 
 def _fixed(settings: Mapping[str, Any]) -> dict[str, Any]:

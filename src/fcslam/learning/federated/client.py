@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fcslam.learning.code_batches import RevisitExamples
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.federated.client_state import legacy_weights, load_robot_state, save_robot_state
 from fcslam.learning.federated.evaluation import SCORE_METRICS
@@ -20,10 +21,9 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, shared_weights, with_private
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
-from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
-from fcslam.learning.trainer import TrainingProgress, validation_pairs
+from fcslam.learning.trainer import validation_pairs
 from fcslam.learning.validation import validate
 
 
@@ -100,28 +100,28 @@ class RobotClient:
             TrainingError: there are too few usable images, the weights belong to another network, training diverged,
                 or the cache cannot be used.
         """
-        encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
+        encoder = settings.training.encoder
         moments, own = load_robot_state(self.cache, run_id, round_number)
         weights = with_private(weights, own, settings.private)
         start = weights_to_network(weights, encoder).state_dict()
+        training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
+        needs_former = settings.compatible > 0.0 or settings.on_revisits
+        former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
         plan = LocalTrainingPlan(
+            settings=training,
             first_step=round_number * settings.local_steps,
             steps=settings.local_steps,
             compatible=settings.compatible,
-            frozen_statistics=frozen,
+            legacy=None if former is None else weights_to_network(former, encoder).state_dict(),
+            frozen_statistics=settings.normalisation == "frozen",
+            optimizer_state=moments,
+            device=torch.device(self.device),
+            on_step=partial(self.on_step, self.name),
         )
-        training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
-        needs_former = plan.compatible > 0.0 or settings.on_revisits
-        former = legacy_weights(self.cache, run_id, round_number, weights) if needs_former else None
-        legacy = None if former is None else weights_to_network(former, encoder).state_dict()
-        device, on_step = torch.device(self.device), partial(self.on_step, self.name)
         if settings.on_revisits:
-            trained = train_codes(
-                start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimizer_state=moments
-            )
+            trained = train_codes(start, self.revisits, self.inputs, plan)
         else:
-            images = self._labelled_images(weights, settings).train
-            trained = local_training(start, images, training, plan, device, on_step, legacy, optimizer_state=moments)
+            trained = local_training(start, self._labelled_images(weights, settings).train, plan)
         found = network_to_weights(trained.network)
         shared = shared_weights(found, settings.private)
         own = {name: array for name, array in found.items() if name not in shared}
@@ -176,7 +176,7 @@ class RobotClient:
             labeller = keypoint_response(weights_to_network(weights, settings.training.encoder).to(device), device)
             files = find_images([self.folder])
             self.images = read_labelled_images(
-                files, self.cache, settings.training, labeller, None, _ignore_progress, self.most_images
+                files, self.cache, settings.training, labeller, None, lambda _stage, _progress: None, self.most_images
             )
             self.images_settings = settings.training
         return self.images
@@ -185,7 +185,3 @@ class RobotClient:
 def robot_seed(robot: str, seed: int) -> int:
     """The seed of a robot, so that two robots draw different views."""
     return int(np.random.default_rng([seed, zlib.crc32(robot.encode())]).integers(2**31))
-
-
-def _ignore_progress(_stage: str, _progress: TrainingProgress) -> None:
-    pass

@@ -5,9 +5,8 @@ from typing import Final
 
 from fcslam.errors import FcslamError
 from fcslam.learning.federated.client import FederatedClient, JudgingClient
-from fcslam.learning.federated.codec import weights_to_record
 from fcslam.learning.federated.flower import ClientApp, Context, Error, InProcessGrid, Message
-from fcslam.learning.federated.messages import PAIRS_KEY, client_reply, read_request
+from fcslam.learning.federated.messages import PAIRS_KEY, client_reply, read_request, weights_to_record
 from fcslam.learning.federated.weights import shared_weights
 
 CLIENT_ERROR: Final = 1000

@@ -15,32 +15,33 @@ import numpy as np
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, CoordinatorState, read_state, run_id, write_state
-from fcslam.learning.federated.codec import GlobalModel, record_to_weights
 from fcslam.learning.federated.evaluation import (
+    PUBLIC_IMAGES,
     EvaluateFn,
-    Evaluator,
     Metrics,
-    PublicImages,
     VersionComparison,
     combined_score,
+    decide,
     valid_metrics,
 )
 from fcslam.learning.federated.flower import Message, MessageType, NodeSelection, RecordDict, RobotGrid
-from fcslam.learning.federated.gate import decide
 from fcslam.learning.federated.held_out import Judgement, check_judgement
 from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
-from fcslam.learning.federated.live_settings import GateSettings
 from fcslam.learning.federated.messages import (
     ARRAYS_KEY,
     CONFIG_KEY,
     PAIRS_KEY,
+    GlobalModel,
+    RoundReplies,
+    printable_line,
+    read_replies,
+    record_to_weights,
     reply_metrics,
     reply_sender,
     request_config,
 )
-from fcslam.learning.federated.replies import RoundReplies, printable_line, read_replies
 from fcslam.learning.federated.screening import screen, update_length
-from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.federated.settings import FederatedSettings, GateSettings
 from fcslam.learning.federated.strategies import Aggregator, StrategyFactory
 from fcslam.learning.federated.weights import Weights, check_private, interpolate_weights, shared_weights
 from fcslam.learning.training_step import learning_rate
@@ -137,10 +138,23 @@ class Coordinator:
         comparison = self._evaluate(candidate, state, replies)
         decision = self._decide(comparison, state)
 
-        length = update_length(replies.weights, self._shared(sent.weights))
-        following = self._next_state(trained, weights, candidate.weights, comparison, decision, length)
+        number = state.rounds_done + 1
+        if decision.returned:
+            self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
+        following = CoordinatorState(
+            rounds_done=number,
+            weights=trained.best if decision.returned else weights,
+            average=trained.best if decision.returned else candidate.weights,
+            best=candidate.weights if decision.released else trained.best,
+            best_scores=comparison.scores if decision.released else comparison.best,
+            best_round=number if decision.released else trained.best_round,
+            strategy_state=self._aggregator.state,
+            times_asked=trained.times_asked,
+            origin=trained.origin,
+            update_length=update_length(replies.weights, self._shared(sent.weights)),
+        )
         report = RoundReport(
-            round_number=following.rounds_done,
+            round_number=number,
             version=candidate.version,
             robots=tuple(sorted(replies.weights)),
             left_out=replies.left_out,
@@ -217,13 +231,12 @@ class Coordinator:
             return self._ask_gate(self._hooks.gate, model, state, replies)
         metrics = self._measure(model, state.rounds_done)
         newcomers = metrics.keys() - state.best_scores.keys()
-        best: Mapping[Evaluator, Metrics] = {}
+        best: Mapping[str, Metrics] = {}
         if newcomers and self._hooks.evaluate_fn is not None:
-            best = {PublicImages(): self._hooks.evaluate_fn(state.best)}
+            best = {PUBLIC_IMAGES: self._hooks.evaluate_fn(state.best)}
         elif newcomers:
             nodes = {robot: node for robot, node in self._present().items() if robot in newcomers}
-            measured, failed = self._measure_on(nodes, self._model(state.best), state.rounds_done)
-            best = {robot: measured[robot] for robot in measured}
+            best, failed = self._ask(nodes, self._model(state.best), state.rounds_done, _metrics)
             replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
         scores = {evaluator: combined_score(found) for evaluator, found in best.items()}
         return VersionComparison(metrics, {**state.best_scores, **scores})
@@ -251,47 +264,15 @@ class Coordinator:
         # Never back to the initial weights: as long as training costs something at first, nothing would be learnt.
         return Decision(released=gain >= 0.0, returned=state.best_round > 0 and gain < -self._settings.collapse)
 
-    def _next_state(
-        self,
-        state: CoordinatorState,
-        weights: Weights,
-        average: Weights,
-        comparison: VersionComparison,
-        decision: Decision,
-        length: float,
-    ) -> CoordinatorState:
-        """The state after the round; ``state`` is the one in which the robots were asked."""
-        number = state.rounds_done + 1
-        if decision.returned:
-            self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
-        return CoordinatorState(
-            rounds_done=number,
-            weights=state.best if decision.returned else weights,
-            average=state.best if decision.returned else average,
-            best=average if decision.released else state.best,
-            best_scores=comparison.scores if decision.released else comparison.best,
-            best_round=number if decision.released else state.best_round,
-            strategy_state=self._aggregator.state,
-            times_asked=state.times_asked,
-            origin=state.origin,
-            update_length=length,
-        )
-
-    def _measure(self, model: GlobalModel, round_number: int) -> Mapping[Evaluator, Metrics]:
+    def _measure(self, model: GlobalModel, round_number: int) -> Mapping[str, Metrics]:
         """Metrics of the model on public images, or else by all robots that can give them, at least one."""
         if self._hooks.evaluate_fn is not None:
-            return {PublicImages(): self._hooks.evaluate_fn(model.weights)}
-        found, failed = self._measure_on(self._connected(), model, round_number)
+            return {PUBLIC_IMAGES: self._hooks.evaluate_fn(model.weights)}
+        found, failed = self._ask(self._connected(), model, round_number, _metrics)
         while not found:
             self._wait_or_fail(_joined(failed))
-            found, failed = self._measure_on(self._connected(), model, round_number)
-        return {robot: found[robot] for robot in found}
-
-    def _measure_on(
-        self, nodes: Mapping[str, int], model: GlobalModel, round_number: int
-    ) -> tuple[dict[str, Metrics], dict[str, str]]:
-        """Metrics of the model by these robots, and the reasons why some gave none."""
-        return self._ask(nodes, model, round_number, _metrics)
+            found, failed = self._ask(self._connected(), model, round_number, _metrics)
+        return found
 
     def _ask(
         self, nodes: Mapping[str, int], model: GlobalModel, round_number: int, read: Callable[[RecordDict], _Answer]
@@ -319,9 +300,7 @@ class Coordinator:
 
     def _present(self) -> dict[str, int]:
         """Node numbers by robot, in the order of the names."""
-        nodes = self._grid.get_node_ids()
-        names = self._grid.robot_names()  # asked last: whoever came meanwhile has a name
-        return dict(sorted((names[node], node) for node in nodes))
+        return dict(sorted(self._grid.nodes().items()))
 
     def _connected(self) -> dict[str, int]:
         """Node numbers by robot, as soon as enough robots are connected."""
@@ -365,14 +344,7 @@ def _means(rows: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
 def _sample(names: Iterable[str], fraction: float, minimum: int, rng: np.random.Generator) -> list[str]:
     """Draw robots for a round.
 
-    Args:
-        names: of the connected robots.
-        fraction: share of them to draw, in (0, 1].
-        minimum: number of robots to draw at least, if enough are connected.
-        rng: source of randomness.
-
-    Returns:
-        Names in alphabetical order.
+    Returns names in alphabetical order; ``minimum`` robots at least, if enough are connected.
     """
     everyone = sorted(names)
     count = min(max(int(np.ceil(fraction * len(everyone))), minimum), len(everyone))

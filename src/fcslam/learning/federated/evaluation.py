@@ -7,9 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.learning.federated.gate import GateDecision
-from fcslam.learning.federated.held_out import COLUMNS
+from fcslam.learning.federated.held_out import COLUMNS, Judgement, same_pairs
+from fcslam.learning.federated.settings import GateSettings
 from fcslam.learning.federated.weights import Weights
+from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.records import FloatArray
 
 SCORE_METRICS: Final = ("repeatability", "mma_3px")
 LOWEST_SCORE: Final = -1.0
@@ -19,15 +21,68 @@ Metrics = Mapping[str, float]
 """Values by name; those in ``SCORE_METRICS`` are shares in [0, 1]."""
 EvaluateFn = Callable[[Weights], Metrics]
 """Evaluation by the coordinator itself, on public images; Flower's ``evaluate_fn``."""
+PUBLIC_IMAGES: Final = ""
+"""Stands for the coordinator among the evaluators of a version, which are named; no robot's name is empty."""
 
 
 @dataclass(frozen=True, slots=True)
-class PublicImages:
-    """The evaluator that is not a robot: the coordinator, on public images."""
+class GateDecision:
+    """Whether a version is released, and why."""
+
+    released: bool
+    reason: str
+    pairs: int
+    """On which both versions were judged."""
+    gains: Mapping[str, Interval]
+    """Mean differences to the released version with 95 % intervals, by column."""
+    values: Mapping[str, float]
+    """Means of the version itself, by column."""
 
 
-Evaluator = str | PublicImages
-"""The evaluator of a version: a robot, by its name, on images that it held out, or the coordinator."""
+def decide(
+    candidate: Mapping[str, Judgement], released: Mapping[str, Judgement], settings: GateSettings, seed: int
+) -> GateDecision:
+    """The release gate of a fleet that learns while it maps: compare a version with the released one.
+
+    It has to be better on pairs that no robot trained on, and to find places as well. Both comparisons are paired:
+    every pair is judged with both versions, and the intervals are those of the differences. Both mappings hold what
+    each robot reports, on the same pairs; ``seed`` is that of the bootstrap.
+    """
+    differences = same_pairs(candidate, released)
+    rows = np.concatenate([*differences.values(), np.empty((0, len(COLUMNS)))])
+    rng = np.random.default_rng(seed)
+    gains = {name: mean_interval(column, rng) for name, column in zip(COLUMNS, rows.T, strict=True)}
+    known = [candidate[robot].astype(np.float64) for robot in differences]
+    values = {
+        name: float(np.nanmean(column)) if np.isfinite(column).any() else np.nan
+        for name, column in zip(COLUMNS, np.concatenate([*known, np.empty((0, len(COLUMNS)))]).T, strict=True)
+    }
+    reason = _objection(
+        rows, [float(np.mean(each[:, 0])) for each in differences.values() if len(each)], gains, settings
+    )
+    return GateDecision(reason is None, reason or "better on held-out pairs", len(rows), gains, values)
+
+
+def _objection(
+    rows: FloatArray, by_robot: list[float], gains: Mapping[str, Interval], settings: GateSettings
+) -> str | None:
+    """Why a version is not released; None if it is."""
+    recall, found = (gains[name] for name in COLUMNS)
+    if len(rows) < settings.fewest_pairs:
+        return f"{len(rows)} held-out pairs, {settings.fewest_pairs} needed"
+    if not recall.low > 0.0:
+        return f"not better on held-out pairs: {_shown(recall)}"
+    if float(np.median(by_robot)) < 0.0:  # the reports of a few robots do not decide for the others
+        return "not better for most robots"
+    if not np.isfinite(found.mean):
+        return "no robot knows two different places to compare"
+    if not found.low >= -settings.margin:
+        return f"may find fewer places: {_shown(found)}"
+    return None
+
+
+def _shown(interval: Interval) -> str:
+    return f"{interval.mean:+.3f} [{interval.low:+.3f}; {interval.high:+.3f}]"
 
 
 def combined_score(metrics: Metrics) -> float:
@@ -46,15 +101,15 @@ def valid_metrics(metrics: Metrics) -> dict[str, float]:
 class VersionComparison:
     """A version beside the best one so far."""
 
-    by_evaluator: Mapping[Evaluator, Metrics]
+    by_evaluator: Mapping[str, Metrics]
     """Metrics of the version; empty if it was not evaluated in this round."""
-    best: Mapping[Evaluator, float]
+    best: Mapping[str, float]
     """Scores of the best version, by everyone who ever evaluated it."""
     gate: GateDecision | None = None
     """The decision of the gate on pairs that robots hold out, if there is one; then nothing else was evaluated."""
 
     @property
-    def scores(self) -> dict[Evaluator, float]:
+    def scores(self) -> dict[str, float]:
         """Scores of the version by evaluator."""
         return {evaluator: combined_score(metrics) for evaluator, metrics in self.by_evaluator.items()}
 

@@ -1,21 +1,22 @@
-"""The ``Grid`` of a fleet on several machines: robots fetch their requests and bring their replies."""
+"""The grid of a fleet on several machines: robots fetch their requests and bring their replies."""
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
 from fcslam.learning.federated.flower import (
     FIRST_NODE,
     Message,
-    RobotGrid,
     error_reply,
     message_to_bytes,
     reply_from_bytes,
+    use_own_identity,
 )
-from fcslam.learning.federated.replies import MAX_REPLY_RATIO
+from fcslam.learning.federated.messages import MAX_REPLY_RATIO
 
 ONLINE_S: Final = 60.0
 """A robot that has been silent for longer is gone."""
@@ -35,18 +36,15 @@ class Request:
     """The serialised message."""
 
 
-class FleetGrid(RobotGrid):
+class FleetGrid:
     """Requests and replies of the robots of a fleet. Any thread may call.
 
     A request stays with its robot until the reply is there or nobody waits for it any more. So a robot that starts
     again gets it again, and only the first reply counts.
-
-    Args:
-        clock: gives seconds since any fixed moment.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__()
+        use_own_identity()
         self._clock = clock
         self._nodes: dict[str, int] = {}
         self._seen: dict[int, float] = {}
@@ -92,18 +90,13 @@ class FleetGrid(RobotGrid):
         if request is not None:
             self._close(robot, number, error_reply(reason, request.message))
 
-    def robot_names(self) -> dict[int, str]:
-        """Names of the robots by node number: the server knows them when they connect."""
-        with self._changed:
-            return {node: robot for robot, node in self._nodes.items()}
-
-    def get_node_ids(self) -> list[int]:
+    def nodes(self) -> dict[str, int]:
         """Node numbers of the robots that were heard of a short time ago."""
         with self._changed:
             now = self._clock()
-            return sorted(node for node, seen in self._seen.items() if now - seen <= ONLINE_S)
+            return {robot: node for robot, node in self._nodes.items() if now - self._seen.get(node, -inf) <= ONLINE_S}
 
-    def push_messages(self, messages: Iterable[Message]) -> list[str]:
+    def push_messages(self, messages: Iterable[Message]) -> list[int]:
         """Let robots fetch messages; returns the numbers under which ``pull_messages`` gives the replies."""
         numbers = []
         with self._changed:
@@ -111,18 +104,17 @@ class FleetGrid(RobotGrid):
                 self._issued += 1
                 request = Request(self._issued, message, message_to_bytes(message))
                 self._requests[message.metadata.dst_node_id].append(request)
-                numbers.append(str(request.number))
+                numbers.append(request.number)
         return numbers
 
-    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
+    def pull_messages(self, numbers: Iterable[int]) -> list[Message]:
         """Replies to these messages that are there, each of them once."""
         with self._changed:
-            numbers = [int(name) for name in message_ids]
             return [self._replies.pop(number) for number in numbers if number in self._replies]
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
         """Replies that arrive within ``timeout`` seconds. Nobody waits for a robot that is gone."""
-        numbers = [int(name) for name in self.push_messages(messages)]
+        numbers = self.push_messages(messages)
         end = None if timeout is None else self._clock() + timeout
         with self._changed:
             while self._is_awaited(numbers) and (end is None or self._clock() < end):
@@ -130,7 +122,7 @@ class FleetGrid(RobotGrid):
             for waiting in self._requests.values():
                 for request in [request for request in waiting if request.number in numbers]:
                     waiting.remove(request)
-        return self.pull_messages(map(str, numbers))
+        return self.pull_messages(numbers)
 
     def _close(self, robot: str, number: int, reply: Message) -> bool:
         with self._changed:
@@ -143,8 +135,7 @@ class FleetGrid(RobotGrid):
             return True
 
     def _is_awaited(self, numbers: Sequence[int]) -> bool:
-        online = self.get_node_ids()
-        return any(request.number in numbers for node in online for request in self._requests[node])
+        return any(request.number in numbers for node in self.nodes().values() for request in self._requests[node])
 
     def _node(self, robot: str) -> int | None:
         if robot not in self._nodes and len(self._nodes) < MAX_ROBOTS:

@@ -16,12 +16,12 @@ from typing import Final
 
 import torch
 
-from fcslam.errors import FcslamError, OutputError
+from fcslam.errors import FcslamError, writing
 from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.learning.federated.fleet_server import open_port, waiting
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
-from fcslam.learning.federated.launch import open_port, waiting
-from fcslam.learning.federated.live_settings import RELEASE, FleetLearningSettings
+from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.service.http.authentication import Authenticator
 from fcslam.service.supervisor import READY, tell
@@ -69,12 +69,10 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
 def _start(data: Path, output: Path) -> Path:
     """The detector from which training starts: a copy of the one that was announced at the first start."""
     kept = output / START
-    try:
+    with writing(kept, "free disk space"):
         if not kept.exists():
             output.mkdir(parents=True, exist_ok=True)
             write_file(kept, _announced(data).read_bytes())
-    except OSError as error:
-        raise OutputError(f"{kept}: cannot be written ({error}); free disk space") from error
     return kept
 
 

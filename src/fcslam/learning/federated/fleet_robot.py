@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Final, TypeVar
 from urllib.parse import quote
 
@@ -29,14 +28,17 @@ from fcslam.learning.federated.flower import (
     request_from_bytes,
     use_own_identity,
 )
-from fcslam.learning.federated.replies import printable_line
+from fcslam.learning.federated.messages import printable_line
 from fcslam.wire.http_transport import HttpClient
+from fcslam.wire.keys import NO_CREDENTIALS, Credentials
 
 ALIVE_S: Final = 15.0
 """Time between two signs of life; a quarter of that after which a robot counts as gone."""
 ANSWER_S: Final = 60.0
 RETRY_S: Final = 3.0
 """Time between two attempts to reach the server."""
+IDLE_S: Final = 1.0
+"""Time after which a robot that was not ready asks again."""
 MAX_REQUEST_BYTES: Final = 256 * 2**20
 """A larger request of the server is not read: weights take a few megabytes."""
 
@@ -46,20 +48,11 @@ _T = TypeVar("_T")
 class RobotLink(HttpClient):
     """The connection of a robot with the service that it learns at.
 
-    Args:
-        url, token, ca, own: as in ``HttpClient``.
-        robot: name of the robot.
+    ``url`` and ``shown`` are as in ``HttpClient``; ``robot`` is its name.
     """
 
-    def __init__(
-        self,
-        url: str,
-        robot: str,
-        token: str | None = None,
-        ca: Path | None = None,
-        own: tuple[Path, Path] | None = None,
-    ) -> None:
-        super().__init__(url, token, ca, own)
+    def __init__(self, url: str, robot: str, shown: Credentials = NO_CREDENTIALS) -> None:
+        super().__init__(url, shown)
         self._path = f"robots/{quote(robot, safe='')}/learning/"
         self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 
@@ -119,25 +112,29 @@ class RobotLink(HttpClient):
 def serve_requests(
     link: RobotLink,
     app: ClientApp,
-    context: Context,
     on_notice: Callable[[str], None],
     sleep: Callable[[float], None] = time.sleep,
+    is_ready: Callable[[], bool] = lambda: True,
 ) -> None:
     """Answer the server's requests until the robot is interrupted. Waits for a server that is not there, or gone.
 
-    Args:
-        link: to the server.
-        app: answers the requests.
-        context: of the app.
-        on_notice: called with one line for a request that was refused, and while the server is not there.
-        sleep: waits for a number of seconds.
+    ``on_notice`` is called with one line for a request that was refused, and while the server is not there.
+    ``is_ready`` is asked before each request; if false, the robot asks for none now.
 
     Raises:
         TrainingError: the server does not accept the robot.
     """
+    use_own_identity()
+    context = Context(RUN_ID, FIRST_NODE, {}, RecordDict(), {})  # the app keeps nothing in it
+
+    def fetch() -> tuple[int, bytes] | None:
+        if is_ready():
+            return link.fetch()
+        sleep(IDLE_S)
+        return None
 
     while True:
-        found = _retried(link.fetch, on_notice, sleep)
+        found = _retried(fetch, on_notice, sleep)
         if found is None:
             continue
         number, data = found
@@ -163,12 +160,6 @@ def answer(app: ClientApp, context: Context, data: bytes, on_notice: Callable[[s
     if reply.has_error():
         on_notice(f"refused: a request to {request.metadata.message_type}: {printable_line(reply.error.reason or '')}")
     return message_to_bytes(reply)
-
-
-def robot_context() -> Context:
-    """The context of an app that keeps nothing in it."""
-    use_own_identity()
-    return Context(RUN_ID, FIRST_NODE, {}, RecordDict(), {})
 
 
 def _retried(operation: Callable[[], _T], on_notice: Callable[[str], None], sleep: Callable[[float], None]) -> _T:

@@ -26,7 +26,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.replies import printable_line
+from fcslam.learning.federated.messages import printable_line
 from fcslam.service.http.authentication import Authenticator, Identity, Role
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 
@@ -38,6 +38,8 @@ LONG_POLL_S: Final = 10.0
 POLL_S: Final = 0.1
 MAX_OPEN_REQUESTS: Final = 4
 """Requests of one robot at the same time. A robot needs two: one at work, and the sign of life."""
+WAIT_S: Final = 5.0
+"""Time after which a round is tried again that could not be completed."""
 START_S: Final = 30.0
 STOP_S: Final = 5.0
 MAX_NOTICES: Final = 100
@@ -52,10 +54,8 @@ OnNotice = Callable[[str], None]
 class FleetApp:
     """The operations of the port. Its methods are the handlers.
 
-    Args:
-        grid: holds requests and replies.
-        authenticator: knows the tokens of robots; an open one believes the name in the path.
-        on_notice: called with one line for each kind of refused request; from the thread of the server.
+    An open ``authenticator`` believes the name in the path. ``on_notice`` is called with one line for each kind of
+    refused request, from the thread of the server.
     """
 
     def __init__(self, grid: FleetGrid, authenticator: Authenticator, on_notice: OnNotice) -> None:
@@ -164,13 +164,30 @@ class FleetApp:
 
 
 @contextlib.contextmanager
+def open_port(
+    listener: socket.socket, tls: tuple[Path, Path] | None, authenticator: Authenticator, on_notice: OnNotice
+) -> Iterator[FleetGrid]:
+    """Let robots fetch requests while the block runs; arguments as for ``FleetApp`` and ``listening``."""
+    grid = FleetGrid()
+    with listening(FleetApp(grid, authenticator, on_notice), listener, tls):
+        yield grid
+
+
+def waiting(on_notice: OnNotice) -> Callable[[str], None]:
+    """A function that says the reason to wait, and waits."""
+
+    def wait(reason: str) -> None:
+        on_notice(f"waiting: {reason}")
+        time.sleep(WAIT_S)
+
+    return wait
+
+
+@contextlib.contextmanager
 def listening(app: FleetApp, listener: socket.socket, tls: tuple[Path, Path] | None = None) -> Iterator[None]:
     """Serve the operations in a thread while the block runs.
 
-    Args:
-        app: the operations to serve.
-        listener: bound socket.
-        tls: PEM files of this machine's certificate and its key; None for no encryption.
+    ``tls``: PEM files of this machine's certificate and its key; None for no encryption.
     """
     server = GuardedServer(
         uvicorn.Config(

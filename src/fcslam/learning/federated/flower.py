@@ -1,6 +1,7 @@
 """The adapter to Flower: the only module that imports it or knows what it does not document.
 
-It relies on internals: who sends a message, how a message is serialised, what a ``Grid`` has to offer.
+It relies on internals: who sends a message, how a message is serialised, what a strategy
+asks of a ``Grid``.
 ``tests/learning/federated/test_flower.py`` checks each of them. To support another version of Flower, change
 ``SUPPORTED_VERSIONS`` and the requirement in pyproject.toml, and make that test pass.
 
@@ -11,10 +12,9 @@ credentials; see docs/howto/federated.md.
 import logging
 import os
 import time
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version as installed_version
-from typing import Any, Final
+from typing import Final, Protocol
 
 from fcslam.errors import TrainingError
 
@@ -58,7 +58,6 @@ from flwr.app import (  # noqa: E402
 from flwr.clientapp import ClientApp  # noqa: E402
 from flwr.common.serde import message_from_proto, message_to_proto  # noqa: E402
 from flwr.proto.message_pb2 import Message as MessageProto  # noqa: E402
-from flwr.serverapp import Grid  # noqa: E402
 from flwr.serverapp.strategy import FedAvg, FedMedian  # noqa: E402
 from flwr.supercore.task_identity import TaskIdentity  # noqa: E402
 
@@ -75,7 +74,6 @@ __all__ = [
     "Error",
     "FedAvg",
     "FedMedian",
-    "Grid",
     "InProcessGrid",
     "Message",
     "MessageType",
@@ -103,70 +101,33 @@ def use_own_identity() -> None:
     TaskIdentity.task_id = TaskIdentity.run_id = TaskIdentity.node_id = RUN_ID
 
 
-class RobotGrid(Grid):
-    """The part of a ``Grid`` that is the same whatever carries the messages."""
+class RobotGrid(Protocol):
+    """What carries the coordinator's messages to the robots: the part of Flower's ``Grid`` that is needed."""
 
-    def __init__(self) -> None:
-        use_own_identity()
+    def nodes(self) -> dict[str, int]:
+        """Node numbers of the connected robots, by their names."""
 
-    @abstractmethod
-    def robot_names(self) -> dict[int, str]:
-        """Names of the robots by node number."""
-
-    def set_run(self, run: Any) -> None:
-        """Do nothing: there is one run."""
-
-    @property
-    def run(self) -> Any:
-        """None: there is no record of the run."""
-        return None
-
-    def create_message(
-        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
-    ) -> Message:
-        """A message to a robot."""
-        return Message(content, dst_node_id, message_type, group_id=group_id, ttl=ttl)
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
+        """The replies to messages that arrive within ``timeout`` seconds."""
 
 
-class InProcessGrid(RobotGrid):
-    """A ``Grid`` that calls the robots' apps in this process, one after another, without ports and daemons.
+class InProcessGrid:
+    """Calls the robots' apps in this process, one after another, without ports and daemons.
 
     Every robot has the whole deadline for itself, as if all worked at the same time.
-
-    Args:
-        apps: of the robots by name.
-        clock: gives seconds since any fixed moment.
     """
 
     def __init__(self, apps: Mapping[str, ClientApp], clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__()
-        self._robots = dict(enumerate(apps.items(), FIRST_NODE))
+        use_own_identity()
         self._clock = clock
-        self._replies: dict[str, Message] = {}
-        self._pushed = 0
+        self._nodes = {name: node for node, name in enumerate(apps, FIRST_NODE)}
+        self._apps = dict(enumerate(apps.values(), FIRST_NODE))
         # Contexts stay from round to round, as Flower's daemons keep them.
-        self._contexts = {node: Context(RUN_ID, node, {}, RecordDict(), {}) for node in self._robots}
+        self._contexts = {node: Context(RUN_ID, node, {}, RecordDict(), {}) for node in self._apps}
 
-    def robot_names(self) -> dict[int, str]:
-        """Names of the robots by node number."""
-        return {node: name for node, (name, _) in self._robots.items()}
-
-    def get_node_ids(self) -> list[int]:
-        """Node numbers of all robots; in one process they are always connected."""
-        return list(self._contexts)
-
-    def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Have messages answered; returns the numbers under which ``pull_messages`` gives the replies."""
-        names = []
-        for message in messages:
-            self._pushed += 1
-            names.append(str(self._pushed))
-            self._replies[names[-1]] = self._ask(message)
-        return names
-
-    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Replies to these messages, each of them once."""
-        return [self._replies.pop(name) for name in message_ids if name in self._replies]
+    def nodes(self) -> dict[str, int]:
+        """Node numbers of all robots: in one process they are always connected."""
+        return self._nodes
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
         """Replies of the robots that took at most ``timeout`` seconds each."""
@@ -181,7 +142,7 @@ class InProcessGrid(RobotGrid):
     def _ask(self, message: Message) -> Message:
         node = message.metadata.dst_node_id
         try:
-            return self._robots[node][1](message, self._contexts[node])
+            return self._apps[node](message, self._contexts[node])
         except Exception as error:  # as across a network, one robot's failure does not end the training of the others
             return error_reply(f"{type(error).__name__}: {error}", message)
 

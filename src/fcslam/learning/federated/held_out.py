@@ -6,21 +6,20 @@ choice is made once for each keyframe and stays, also when the map moves.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.features.codes import Matches, mutual_matches
+from fcslam.features.codes import mutual_matches
 from fcslam.features.dense import find_peaks, sample_codes
 from fcslam.features.detector import ImageFeatures, OnnxConfig
 from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
-from fcslam.places.hypotheses import rigid_hypotheses
-from fcslam.places.motions import LARGEST_HAMMING, LARGEST_LEVEL_M
-from fcslam.records import Codes, FloatArray, frozen
+from fcslam.places.motions import LARGEST_HAMMING, level_matches, rigid_hypotheses
+from fcslam.records import FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")
 """Columns that a robot reports about each pair: right matches as a share of the shared points, and whether the pair is
@@ -34,15 +33,6 @@ MOST_PAIRS: Final = 1000
 
 Judgement = NDArray[np.float32]
 """Shape (P, 2): a row for each pair, by ``COLUMNS``; a place is found (1), not found (0), or NaN without others."""
-
-
-class PlacePoints(NamedTuple):
-    """The keypoints of a camera place in space."""
-
-    positions: FloatArray
-    """Shape (N, 3), metres."""
-    codes: Codes
-    """Shape (N, 32)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +68,8 @@ def judge(network: KeypointNetwork, pairs: HeldOutPairs, device: torch.device) -
         _recall(frames[i], frames[j], T_i_j, shared)
         for (i, j, shared), T_i_j in zip(pairs.revisits, between, strict=True)
     ]
-    same = [_inliers(frames[i], frames[j]) for i, j, _ in pairs.revisits]
-    other = [_inliers(frames[i], frames[j]) for i, j in pairs.apart.tolist()]
+    same = [inliers(frames[i], frames[j]) for i, j, _ in pairs.revisits]
+    other = [inliers(frames[i], frames[j]) for i, j in pairs.apart.tolist()]
     judged = np.full((len(found), len(COLUMNS)), np.nan, np.float32)
     judged[:, 0] = found
     if other:
@@ -131,18 +121,10 @@ def _recall(a: Keyframe, b: Keyframe, T_a_b: FloatArray, shared: int) -> float:
     return min(right / shared, 1.0)
 
 
-def _inliers(a: Keyframe, b: Keyframe) -> int:
-    first, second = (
-        PlacePoints(each.positions[each.placed], each.features.descriptors[each.placed]) for each in (a, b)
-    )
-    return inliers(first, second)
-
-
-def inliers(first: PlacePoints, second: PlacePoints) -> int:
-    """Keypoints that the best motion between two places explains, as the cloud compares camera places."""
-    matches = mutual_matches(first.codes, second.codes, LARGEST_HAMMING)
-    a, b, rows = first.positions, second.positions, matches.pairs
-    level = np.abs(a[rows[:, 0], 2] - b[rows[:, 1], 2]) <= LARGEST_LEVEL_M
-    kept = Matches(rows[level], matches.distances[level])
-    flat = a[:, :2].astype(np.float32), b[:, :2].astype(np.float32)
-    return max((each.inlier_count for each in rigid_hypotheses(*flat, kept)), default=0)
+def inliers(a: Keyframe, b: Keyframe) -> int:
+    """Keypoints that the best motion between two keyframes explains, as the cloud compares camera places."""
+    positions_a, positions_b = (each.positions[each.placed] for each in (a, b))
+    codes_a, codes_b = (each.features.descriptors[each.placed] for each in (a, b))
+    matches = level_matches(positions_a, positions_b, mutual_matches(codes_a, codes_b, LARGEST_HAMMING))
+    flat = positions_a[:, :2].astype(np.float32), positions_b[:, :2].astype(np.float32)
+    return max((each.inlier_count for each in rigid_hypotheses(*flat, matches)), default=0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import TrainingError, writing
 from fcslam.storage.files import write_file
 
 ROUNDS_FILE: Final = "rounds.csv"
@@ -94,10 +94,6 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(content, list(names), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, content.getvalue())
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error}); free disk space and run the same command again"
-        ) from error

@@ -35,15 +35,9 @@ def prepare_initial_weights(
     """Weights of a checkpoint or an exported detector, or of a detector trained on synthetic shapes.
 
     An exported detector has no batch statistics. They are measured once, on public images or on shapes, and kept in
-    ``folder``, so that other public images later do not change where the run started.
-
-    Args:
-        start: checkpoint, ONNX file, or name of a network that comes with fcslam; None to train on synthetic shapes.
-        folder: of the run.
-        settings: of the run.
-        options: where and how to compute.
-        on_progress: receives the progress of the training on shapes.
-        public: images that the server may read.
+    ``folder``, so that other public images later do not change where the run started. ``start`` is a checkpoint, an
+    ONNX file, or the name of a network that comes with fcslam; None to train on synthetic shapes. The server may read
+    the ``public`` images.
 
     Raises:
         TrainingError: ``start`` holds no weights of this network, or ``folder`` belongs to another run or holds a

@@ -1,4 +1,4 @@
-"""A federated training job on the server, from the initial weights to the exported detector, over any transport."""
+"""A federated training job from the initial weights to the exported detector: over any transport, or in one process."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.config import dump
-from fcslam.errors import OutputError
+from fcslam.errors import TrainingError, writing
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.artifacts import write_federated_artifacts
+from fcslam.learning.federated.client import RobotClient
+from fcslam.learning.federated.client_app import in_process_grid
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.flower import RobotGrid
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
-from fcslam.learning.federated.live_settings import GateSettings
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.public_images import public_evaluation, read_public_images
-from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
+from fcslam.learning.federated.settings import DETECTOR, FederatedSettings, GateSettings
 from fcslam.learning.federated.strategies import StrategyFactory
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.stages import StageCallback
@@ -64,17 +65,9 @@ def run_job(
     grid: RobotGrid,
     wait: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Run a job, or continue it.
+    """Run a job, or continue it; returns the files for the user: detector, picture of the rounds, and model card.
 
-    Args:
-        job: what to do.
-        options: where and how to compute.
-        callbacks: receive the progress.
-        grid: carries the messages to the robots.
-        wait: as in ``CoordinatorHooks``.
-
-    Returns:
-        The files for the user: the detector, the picture of the rounds, and the model card.
+    ``wait``: as in ``CoordinatorHooks``.
 
     Raises:
         TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
@@ -106,9 +99,40 @@ def run_job(
 
 def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:
     """Write the settings at the end, and at the start unless an earlier start has written them."""
-    try:
+    with writing(job.output, "choose another output folder"):
         job.output.mkdir(parents=True, exist_ok=True)
         if again or not path.exists():
             path.write_text(dump(job.settings), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{job.output}: cannot be used as the output folder ({error})") from error
+
+
+def federate_locally(
+    folders: Sequence[Path],
+    job: FederatedJob,
+    options: ExecutionOptions,
+    callbacks: ProgressCallbacks,
+    most_images: int | None = None,
+) -> list[Path]:
+    """Run or continue federated training; returns the files for the user, see ``run_job``.
+
+    ``folders`` hold the images of each robot, which has the name of its folder. It trains on its first ``most_images``
+    alone; None for all.
+
+    Raises:
+        TrainingError: two folders have the same name, a folder is unusable, no robot can train, or the output folder
+            belongs to another run.
+        OutputError: a file cannot be written.
+    """
+    names = [folder.resolve().name for folder in folders]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise TrainingError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
+    for folder in folders:
+        if not folder.is_dir():
+            raise TrainingError(f"{folder}: is not a folder; give one folder of images for each robot")
+    clients = [
+        RobotClient(
+            name, folder, job.output / "robots" / name, options.device, callbacks.steps, most_images=most_images
+        )
+        for name, folder in zip(names, folders, strict=True)
+    ]
+    return run_job(job, options, callbacks, in_process_grid(clients))

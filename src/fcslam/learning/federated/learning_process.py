@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fcslam.learning.federated.live_settings import RobotLearningSettings
+from fcslam.learning.federated.settings import RobotLearningSettings
 from fcslam.robot.keyframe_folder import KEYFRAMES
 
 STOP_S: Final = 5.0

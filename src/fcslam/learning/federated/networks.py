@@ -3,7 +3,7 @@
     KeypointNetwork  <->  Weights (float32 arrays by name)  <->  ArrayRecord
 
 Aggregation and screening work on ``Weights``. Networks exist where something is trained or evaluated, records
-(``codec``) where something is sent.
+(``messages``) where something is sent.
 """
 
 import numpy as np

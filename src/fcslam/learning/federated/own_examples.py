@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.geometry import se2
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair
 from fcslam.learning.federated.held_out import HeldOutPairs
-from fcslam.learning.federated.live_settings import HeldOutSettings, RobotLearningSettings
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair
+from fcslam.learning.federated.settings import HeldOutSettings, RobotLearningSettings
 from fcslam.learning.revisits import Keyframe, revisits_in_map
 from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
@@ -26,21 +25,8 @@ SPLIT_FILE: Final = "split.json"
 """Says of each keyframe that was ever used whether it is held out."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OwnExamples:
-    """Examples to train on, and pairs that are held out from training."""
-
-    revisits: RevisitExamples
-    held_out: HeldOutPairs
-
-
-def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
-    """Read the keyframes of a robot and find what it saw again.
-
-    Args:
-        folder: of the keyframes.
-        settings: of the robot.
-    """
+def own_examples(folder: Path, settings: RobotLearningSettings) -> tuple[RevisitExamples, HeldOutPairs]:
+    """What a robot saw again by its keyframes: examples to train on, and pairs that are held out from training."""
     kept = read_keyframes(folder, MOST_KEYFRAMES)
     version = kept[-1].detector_version if kept else ""
     shown = [(frame, picture) for frame in kept if (picture := _picture(frame, version)) is not None]
@@ -50,7 +36,7 @@ def own_examples(folder: Path, settings: RobotLearningSettings) -> OwnExamples:
     frames, poses = _keyframes(trained)
     pairs = [_pair(frames, poses, i, j, rows) for i, j, rows in revisits_in_map(frames, poses)]
     examples = RevisitExamples([frame.image for frame in frames], pairs)
-    return OwnExamples(examples, HeldOutPairs.of(*_keyframes(judged)))
+    return examples, HeldOutPairs.of(*_keyframes(judged))
 
 
 def _picture(frame: KeptKeyframe, version: str) -> GreyImage | None:

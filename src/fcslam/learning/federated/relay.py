@@ -20,18 +20,14 @@ Operation = Annotated[str, InPath(pattern="^(next|alive|reply/[0-9]{1,18})$")]
 def learning_router(state: ServiceState, listener: Path) -> APIRouter:
     """Routes for robots that learn, which have the tokens and limits of the service.
 
-    Args:
-        state: of the service.
-        listener: Unix socket of the process in which the fleet learns; only the user of the service can open it.
+    ``listener`` is the Unix socket of the process in which the fleet learns; only the user of the service can open it.
     """
     router = APIRouter(include_in_schema=False)
     limits = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 
     @router.post(f"{PATH}/{{operation:path}}", dependencies=state.require(Role.ROBOT))
     async def learn(request: Request, robot: Name, operation: Operation) -> Response:
-        wait_s = state.rate.wait_s(robot, 0)
-        if wait_s > 0.0:
-            raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
+        state.rate.check(robot)
         transport = httpx.AsyncHTTPTransport(uds=str(listener), verify=False)
         address = f"http://learning{PATH.format(robot=robot)}/{operation}"
         try:

@@ -23,9 +23,9 @@ from fcslam.errors import FcslamError, TrainingError
 from fcslam.learning.code_training import CodeInputs
 from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import build_client_app
-from fcslam.learning.federated.fleet_robot import RobotLink, robot_context, serve_requests
-from fcslam.learning.federated.live_settings import RobotLearningSettings
+from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.own_examples import own_examples
+from fcslam.learning.federated.settings import RobotLearningSettings
 from fcslam.wire.keys import Credentials, read_credentials
 
 NICENESS: Final = 19
@@ -83,48 +83,22 @@ class LearningRobot:
         return bool(self._client.revisits)
 
     def _look(self) -> None:
-        examples = own_examples(self._folder, self._settings)
-        self._client.revisits, self._client.held_out = examples.revisits, examples.held_out
-        self._client.inputs = CodeInputs()
-        revisits = examples.revisits
+        revisits, held_out = own_examples(self._folder, self._settings)
+        self._client.revisits, self._client.held_out, self._client.inputs = revisits, held_out, CodeInputs()
         tell(
             f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
-            f"{len(examples.held_out.revisits)} pairs held out"
+            f"{len(held_out.revisits)} pairs held out"
         )
 
 
-class _IdleLink(RobotLink):
-    """Asks for requests only while the robot is idle and has something to learn from."""
-
-    def __init__(
-        self,
-        robot: LearningRobot,
-        url: str,
-        name: str,
-        token: str | None,
-        ca: Path | None,
-        own: tuple[Path, Path] | None,
-    ) -> None:
-        super().__init__(url, name, token, ca, own)
-        self._robot = robot
-
-    def fetch(self) -> tuple[int, bytes] | None:
-        """As of a ``RobotLink``; BusyRobotError, LearningEndError: as ``LearningRobot.prepare``."""
-        if not self._robot.prepare():
-            time.sleep(1.0)
-            return None
-        return super().fetch()
-
-
-def learn(open_link: Callable[[], RobotLink], client: RobotClient, idle: threading.Event) -> str:
+def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: LearningRobot, idle: threading.Event) -> str:
     """Join rounds until learning ends; returns why.
 
     Raises:
         TrainingError: the server does not accept the robot.
         CloudError: the server's address or certificate cannot be used.
     """
-    app, context = build_client_app(client), robot_context()
-    told = ""
+    app, told = build_client_app(client), ""
 
     def notice(line: str) -> None:
         nonlocal told
@@ -136,7 +110,7 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, idle: threadi
         idle.wait()
         try:
             with open_link() as link:
-                serve_requests(link, app, context, notice)
+                serve_requests(link, app, notice, is_ready=robot.prepare)
         except BusyRobotError:
             continue
         except LearningEndError as end:
@@ -180,8 +154,8 @@ def main(arguments: Sequence[str]) -> int:
         client = RobotClient(given.name, given.keyframes, given.cache)
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
-        link = partial(_IdleLink, robot, given.server, given.name, shown.token, shown.ca, shown.own)
-        tell(f"learning ends: {learn(link, client, idle)}")
+        link = partial(RobotLink, given.server, given.name, shown)
+        tell(f"learning ends: {learn(link, client, robot, idle)}")
     except (FcslamError, OSError) as error:
         tell(f"learning ends: {error}")
     return 0

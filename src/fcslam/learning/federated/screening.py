@@ -41,14 +41,9 @@ def screen(
 
     Batch statistics change many times as much as parameters, and depend on the light at each robot. So the length of
     their change is checked separately, and its direction is not checked. Instead they must be close to those of the
-    other robots: these differ much less from one another than from the ones that were sent.
-
-    Args:
-        updates: weights after training, by robot.
-        sent: weights that all robots trained from.
-        settings: the thresholds.
-        frozen: batch statistics must come back unchanged.
-        earlier_length: ``update_length`` of the round before; 0 in the first round.
+    other robots: these differ much less from one another than from the ones that were sent. ``sent`` are the weights
+    that all robots trained from. ``frozen``: batch statistics must come back unchanged. ``earlier_length``:
+    ``update_length`` of the round before; 0 in the first round.
     """
     refused = {robot: reason for robot, weights in updates.items() if (reason := weights_error(weights, sent))}
     parameters = trained_names(sent, frozen_statistics=True)

@@ -7,9 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.codec import record_to_weights, weights_to_record
 from fcslam.learning.federated.flower import FedAvg, FedMedian, Message, MetricRecord, RecordDict
-from fcslam.learning.federated.messages import ARRAYS_KEY, CONFIG_KEY, EXAMPLES_KEY, METRICS_KEY
+from fcslam.learning.federated.messages import (
+    ARRAYS_KEY,
+    CONFIG_KEY,
+    EXAMPLES_KEY,
+    METRICS_KEY,
+    record_to_weights,
+    weights_to_record,
+)
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, trained_names, weights_error
 
@@ -21,10 +27,8 @@ state of a strategy."""
 class Aggregator:
     """One of Flower's strategies with momentum between rounds.
 
-    Args:
-        settings: choose the strategy and the momentum.
-        state: the ``state`` of an earlier aggregator to continue; empty for a new run.
-        strategy: makes a strategy in place of the one that the settings name.
+    ``state`` is that of an earlier aggregator to continue; empty for a new run. ``strategy`` makes a strategy in place
+    of the one that the settings name.
     """
 
     def __init__(
@@ -42,10 +46,8 @@ class Aggregator:
     def aggregate(self, round_number: int, updates: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
         """The next global weights.
 
-        Args:
-            round_number: from 1, as Flower counts.
-            updates: the robots' replies, with the weights in them; these have passed screening.
-            old: the weights from which the robots trained.
+        ``round_number`` counts from 1, as Flower does. ``updates`` are the robots' replies that passed screening, with
+        the weights in them; they trained from ``old``.
 
         Raises:
             TrainingError: the strategy gives weights that are not finite or do not fit the network.
@@ -77,16 +79,7 @@ def apply_server_momentum(
 
     A mean of updates is less noisy than each of them, so it can be followed further. With u = ``aggregated`` - ``old``:
     m <- share m + u, w <- w + u + share m. Batch statistics are taken as aggregated: they are measured and not trained,
-    and variances must not become negative.
-
-    Args:
-        aggregated: mean of the robots' weights.
-        old: weights from which the robots trained.
-        momentum: of the last round; empty before the first.
-        share: of the momentum that is kept, in [0, 1).
-
-    Returns:
-        The next weights, and the momentum for the next round.
+    and variances must not become negative. ``momentum`` is empty before the first round. Returns w and m.
     """
     following, next_momentum = {name: aggregated[name] for name in old}, {}
     for name in trained_names(old, frozen_statistics=True):

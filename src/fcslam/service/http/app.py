@@ -18,7 +18,7 @@ from fcslam.service.http.event_stream import event_router
 from fcslam.service.http.joint_maps import joint_map_router
 from fcslam.service.http.limits import CONTENT
 from fcslam.service.http.local_names import LocalNames
-from fcslam.service.http.missions import file_router, mission_router
+from fcslam.service.http.missions import mission_router
 from fcslam.service.http.named_missions import NamedMissions
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
@@ -32,7 +32,7 @@ LONGEST_ACTION = 300
 """Characters of a request in the audit log; anybody with a token chooses the rest."""
 VIEWER_ROUTERS = (fleet_router, map_router, event_router)
 """Routes of the page; they read."""
-ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, file_router, decision_router)
+ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, decision_router)
 
 
 class Service(FastAPI):

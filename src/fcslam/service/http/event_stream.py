@@ -5,10 +5,10 @@ import json
 from collections.abc import AsyncIterator
 
 from fastapi import APIRouter, Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import StreamingResponse
 
 from fcslam.service.http.authentication import Role
-from fcslam.service.http.responses import content, refusals
+from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.state import ViewerState
 
 EVENTS = "text/event-stream"
@@ -49,7 +49,7 @@ def event_router(state: ViewerState) -> APIRouter:
                 streams.remove(mine)
             following.cancel()
 
-    @router.get("/events", response_class=Response, responses={200: content(EVENTS)})
+    @router.get("/events", **file_of(EVENTS, refused=()))
     async def get_events(request: Request) -> StreamingResponse:
         """``live``: there is a new live run; ``finalized``: a result was written. A comment comes at least every 5 s.
 

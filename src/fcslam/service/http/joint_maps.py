@@ -22,7 +22,7 @@ from fcslam.runs import QUALITY, Run, separations
 from fcslam.runs.folder import identity
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
-from fcslam.service.http.responses import content, refusals
+from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
@@ -89,12 +89,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
             )
         return FleetReply(robots=tuple(robots), separations=_apart(run_of(state.mission)))
 
-    @router.get(
-        "/robots/{robot}/map",
-        dependencies=as_reader,
-        response_class=Response,
-        responses={**refusals(404), 200: content(NETWORK), 304: {"description": "as you have it"}},
-    )
+    @router.get("/robots/{robot}/map", dependencies=as_reader, **file_of(NETWORK, is_tagged=True))
     def get_joint_map(
         robot: Name,
         limit: Annotated[int, Query(ge=1, le=LARGEST_ANSWER)] = LARGEST_ANSWER,

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ValidationError
 
 from fcslam.service.http.responses import content
 from fcslam.service.token_buckets import TokenBuckets
+from fcslam.wire.batches import LENGTH, read_batch
+from fcslam.wire.packets import unpacked_size
 
 BYTES_PER_S = 8.0 * 2**20
 """Bytes per second of one robot: a thousand times its rate while it drives, for the backlog after an outage."""
@@ -27,17 +29,21 @@ class RateLimit:
     """Bytes of each robot's requests. Any thread may call."""
 
     def __init__(self, clock: Callable[[], float], burst: float = BURST_BYTES) -> None:
-        self._burst = burst
+        self._largest = int(burst - REQUEST_BYTES)
         self._buckets = TokenBuckets(clock, BYTES_PER_S, burst)
 
-    @property
-    def largest(self) -> int:
-        """Largest request, in bytes."""
-        return int(self._burst - REQUEST_BYTES)
+    def check(self, robot: str, batch: bytes = b"") -> None:
+        """Count a request. Refuses more than the robot may send: 413, 429 (HTTPException).
 
-    def wait_s(self, robot: str, size: int) -> float:
-        """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
-        return self._buckets.wait_s(robot, REQUEST_BYTES + size)
+        Raises:
+            PacketError: ``batch`` is not a batch.
+        """
+        size = sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(batch))  # unpacking takes time
+        if size > self._largest:
+            raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
+        wait_s = self._buckets.wait_s(robot, REQUEST_BYTES + size)
+        if wait_s > 0.0:
+            raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
 
 
 async def read_body(request: Request, longest: int) -> bytes:

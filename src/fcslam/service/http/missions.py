@@ -8,7 +8,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
@@ -18,7 +18,7 @@ from fcslam.mission.mission_store import check_mission
 from fcslam.records import NAME
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
-from fcslam.service.http.responses import MissionList, content, refusals
+from fcslam.service.http.responses import MissionList, content, file_of, refusals
 from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.missions import EXPORT, IMPORT
@@ -41,7 +41,7 @@ class NewMission(StrictModel):
 
 
 def mission_router(state: ServiceState) -> APIRouter:
-    """All missions of the service, and which one is open."""
+    """All missions of the service, which one is open, and missions and results as files."""
     router = APIRouter(tags=["missions"], responses=refusals(401, 403, 503))
     as_admin = state.require(Role.ADMIN)
 
@@ -71,16 +71,10 @@ def mission_router(state: ServiceState) -> APIRouter:
             await run_in_threadpool(state.missions.open, name)
         return _missions(state)
 
-    return router
-
-
-def file_router(state: ServiceState) -> APIRouter:
-    """Missions as files."""
-    router = APIRouter(tags=["missions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503))
-
     @router.post(
         "/missions/import",
         status_code=201,
+        dependencies=as_admin,
         openapi_extra={"requestBody": {"required": True, **content(FILE)}},
         responses=refusals(400, 409, 413, 507),
     )
@@ -97,20 +91,12 @@ def file_router(state: ServiceState) -> APIRouter:
                 await run_in_threadpool(state.missions.import_mission, name, path)
         return _missions(state)
 
-    @router.get(
-        "/missions/{name}/export",
-        response_class=Response,
-        responses={**refusals(400, 404, 507), 200: content(FILE)},
-    )
+    @router.get("/missions/{name}/export", dependencies=as_admin, **file_of(FILE, refused=(400, 404, 507)))
     async def export_mission(name: Name) -> StreamingResponse:
         """A mission as one file."""
         return await _download(state, f"{name}.sqlite", FILE, lambda path: state.missions.export(name, path))
 
-    @router.get(
-        "/missions/{name}/runs/{number}.zip",
-        response_class=Response,
-        responses={**refusals(400, 404, 507), 200: content(ZIP)},
-    )
+    @router.get("/missions/{name}/runs/{number}.zip", dependencies=as_admin, **file_of(ZIP, refused=(400, 404, 507)))
     async def download_run(name: Name, number: RunNumber) -> StreamingResponse:
         """A result as one file: the run folder in a ZIP archive."""
         run = state.missions.result(name, number) if name in state.missions.names else None

@@ -10,7 +10,7 @@ from fcslam.errors import StoreError
 from fcslam.service.audit_log import AuditEntry
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.problems import problem
-from fcslam.service.http.responses import Health, Readiness, Unready, content, refusals
+from fcslam.service.http.responses import Health, Readiness, Unready, file_of, refusals
 from fcslam.service.http.state import ServiceState
 
 LARGEST_BACKLOG = 200
@@ -53,12 +53,9 @@ def operations_router(state: ServiceState) -> APIRouter:
         """The newest lines of the audit log: who did what, and how many logins were refused."""
         return state.audit.newest(limit)
 
-    @router.get(
-        "/metrics",
-        dependencies=state.require(Role.VIEWER, Role.ADMIN),
-        response_class=Response,
-        responses={**refusals(401, 403, 503, 507), 200: content("text/plain")},
-    )
+    as_viewer, metrics = state.require(Role.VIEWER, Role.ADMIN), file_of("text/plain", refused=(401, 403, 503, 507))
+
+    @router.get("/metrics", dependencies=as_viewer, **metrics)
     def get_metrics() -> Response:
         """Metrics in the Prometheus text format."""
         return Response(state.measures.text(state.mission), media_type=CONTENT_TYPE_LATEST)

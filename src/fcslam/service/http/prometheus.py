@@ -3,13 +3,12 @@
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, generate_latest
-from prometheus_client.core import CounterMetricFamily
+from prometheus_client import CollectorRegistry, Counter, Metric, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from fcslam.cloud.stage_times import StageTotal
 from fcslam.service.missions import OpenMission
 from fcslam.wire.batches import read_batch
 from fcslam.wire.ledger import Traffic
@@ -34,20 +33,7 @@ class ServiceMetrics:
             registry=self._registry,
         )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
-        self._packets = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
-        self._queue = Gauge("fcslam_packets_queued", "Packets without effect so far", registry=self._registry)
-        self._age = Gauge(
-            "fcslam_oldest_packet_age_seconds",
-            "Time since the oldest packet arrived that has no effect so far",
-            registry=self._registry,
-        )
-        self._waiting = Gauge("fcslam_packets_waiting", "Packets after one that is missing", registry=self._registry)
-        self._starts = Gauge("fcslam_worker_starts", "Starts of the open mission's worker", registry=self._registry)
-        self._alive = Gauge("fcslam_worker_up", "Whether the worker runs", registry=self._registry)
         self._uplink = _Uplink()
-        self._registry.register(self._uplink)
-        self._stages = _Stages()
-        self._registry.register(self._stages)
         self._arrivals = _Arrivals()
 
     def answer(self, robot: str, batch: bytes) -> None:
@@ -69,18 +55,33 @@ class ServiceMetrics:
 
     def text(self, mission: OpenMission) -> bytes:
         """All metrics in the Prometheus text format."""
-        ready = mission.intake.ready_count()
-        self._packets.set(ready)
-        applied = mission.store.applied()
-        self._queue.set(ready - applied)
+        families = *self._registry.collect(), *self._gauges(mission), *self._uplink.families(mission), *_stages(mission)
+        return generate_latest(_Families(families))
+
+    def _gauges(self, mission: OpenMission) -> Iterator[Metric]:
+        ready, applied, worker = mission.intake.ready_count(), mission.store.applied(), mission.worker
         self.arrived(mission)  # packets from before this start, if nobody noted them
-        self._age.set(self._arrivals.age_s(applied, self._clock()))
-        self._stages.follow(mission)
-        self._waiting.set(mission.intake.waiting_count())
-        self._starts.set(mission.worker.starts)
-        self._alive.set(mission.worker.pid is not None)
-        self._uplink.follow(mission)
-        return generate_latest(self._registry)
+        age_s = self._arrivals.age_s(applied, self._clock())
+        for name, text, value in (
+            ("packets_stored", "Packets of the open mission", ready),
+            ("packets_queued", "Packets without effect so far", ready - applied),
+            ("oldest_packet_age_seconds", "Time since the oldest packet arrived that has no effect so far", age_s),
+            ("packets_waiting", "Packets after one that is missing", mission.intake.waiting_count()),
+            ("worker_starts", "Starts of the open mission's worker", worker.starts),
+            ("worker_up", "Whether the worker runs", float(worker.pid is not None)),
+        ):
+            yield GaugeMetricFamily(f"fcslam_{name}", text, value)
+
+
+class _Families(Collector):
+    """Metrics that were read before."""
+
+    def __init__(self, families: Iterable[Metric]) -> None:
+        self._families = families
+
+    def collect(self) -> Iterable[Metric]:
+        """For the registry."""
+        return self._families
 
 
 class _Arrivals:
@@ -110,28 +111,18 @@ class _Arrivals:
             return now_s - self._noted[0][1] if self._noted else 0.0
 
 
-class _Stages(Collector):
+def _stages(mission: OpenMission) -> Iterator[Metric]:
     """Runs of the present worker's stages and the time they took; they begin again with a new worker."""
-
-    def __init__(self) -> None:
-        self._totals: Mapping[str, StageTotal] = {}
-
-    def follow(self, mission: OpenMission) -> None:
-        """Take over the totals of the mission's worker."""
-        self._totals = mission.worker.stages
-
-    def collect(self) -> Iterator[CounterMetricFamily]:
-        """For the registry."""
-        runs = CounterMetricFamily("fcslam_stage_runs", "Runs of a stage of the worker", labels=("stage",))
-        seconds = CounterMetricFamily("fcslam_stage_seconds", "Time of a stage of the worker", labels=("stage",))
-        for stage, total in sorted(self._totals.items()):
-            runs.add_metric((stage,), total.runs)
-            seconds.add_metric((stage,), total.seconds)
-        yield runs
-        yield seconds
+    runs = CounterMetricFamily("fcslam_stage_runs", "Runs of a stage of the worker", labels=("stage",))
+    seconds = CounterMetricFamily("fcslam_stage_seconds", "Time of a stage of the worker", labels=("stage",))
+    for stage, total in sorted(mission.worker.stages.items()):
+        runs.add_metric((stage,), total.runs)
+        seconds.add_metric((stage,), total.seconds)
+    yield runs
+    yield seconds
 
 
-class _Uplink(Collector):
+class _Uplink:
     """Uplink by the missions' stores; it continues after a restart of the service."""
 
     def __init__(self) -> None:
@@ -141,21 +132,17 @@ class _Uplink(Collector):
         self._traffic: defaultdict[tuple[str, str, str, str], Traffic] = defaultdict(Traffic)
         """By mission, robot, kind and channel; without a kind are packets that could not be read."""
 
-    def follow(self, mission: OpenMission) -> None:
-        """Count the packets that arrived since the last call."""
+    def families(self, mission: OpenMission) -> Iterator[Metric]:
+        """The traffic of all missions, with the packets of this one that arrived since the last call."""
+        labels = ("mission", "robot", "kind", "channel")
+        packets = CounterMetricFamily("fcslam_packets", "Packets taken in", labels=labels)
+        sizes = CounterMetricFamily("fcslam_bytes", "Bytes of packets taken in", labels=labels)
         name = mission.folder.name
         with self._lock:
             while groups := mission.store.traffic_since(self._counted.get(name, 0), _AT_ONCE):
                 for arrival, robot, kind, channel, traffic in groups:
                     self._traffic[name, robot, kind or "", channel or ""] += traffic
                     self._counted[name] = max(self._counted.get(name, 0), arrival)
-
-    def collect(self) -> Iterator[CounterMetricFamily]:
-        """For the registry."""
-        labels = ("mission", "robot", "kind", "channel")
-        packets = CounterMetricFamily("fcslam_packets", "Packets taken in", labels=labels)
-        sizes = CounterMetricFamily("fcslam_bytes", "Bytes of packets taken in", labels=labels)
-        with self._lock:
             for label, traffic in sorted(self._traffic.items()):
                 packets.add_metric(label, traffic.count)
                 sizes.add_metric(label, traffic.bytes)

@@ -1,5 +1,6 @@
 """The responses of the service, as OpenAPI describes them."""
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
@@ -17,10 +18,9 @@ class Problem(StrictModel):
     error: str = Field(description="what, where, what to do: one line")
 
 
-class PacketProblem(StrictModel):
+class PacketProblem(Problem):
     """Why a batch is refused, and from which of its packets on."""
 
-    error: str = Field(description="what, where, what to do: one line")
     index: int | None = Field(None, description="of the refused packet; those before it are stored")
 
 
@@ -267,3 +267,15 @@ def content(*media_types: str, model: dict[str, Any] | None = None) -> dict[str,
     """The OpenAPI description of a body; bytes if no schema is given."""
     schema = model or {"type": "string", "format": "binary"}
     return {"content": {media_type: {"schema": schema} for media_type in media_types}}
+
+
+def file_of(
+    *media_types: str, refused: Sequence[int] = (404,), model: dict[str, Any] | None = None, is_tagged: bool = False
+) -> dict[str, Any]:
+    """Arguments of a route that sends a file; ``is_tagged``: a client that has it gets 304."""
+    from starlette.responses import Response  # who writes a report needs the models, and may have no web server
+
+    responses = {**refusals(*refused), 200: content(*media_types, model=model)}
+    if is_tagged:
+        responses[304] = {"description": "as you have it"}
+    return {"response_class": Response, "responses": responses}

@@ -9,13 +9,14 @@ from starlette.concurrency import run_in_threadpool
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import NAME, Channel
 from fcslam.service.http.authentication import Role
-from fcslam.service.http.limits import RateLimit, read_body
+from fcslam.service.http.limits import read_body
 from fcslam.service.http.responses import (
     DetectorSummary,
     PacketProblem,
     PacketRefusal,
     RobotState,
     content,
+    file_of,
     refusals,
 )
 from fcslam.service.http.state import ServiceState
@@ -23,14 +24,11 @@ from fcslam.service.intake import IntakeReply
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
-    LENGTH,
     MEDIA_TYPE,
     REFUSED_HEADER,
     REMOVED_HEADER,
-    read_batch,
 )
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
-from fcslam.wire.packets import unpacked_size
 
 NETWORK = "application/octet-stream"
 """Media type of a detector's file."""
@@ -73,7 +71,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         mission = state.mission
 
         def take() -> IntakeReply:
-            _check_rate(state.rate, robot, body)
+            state.rate.check(robot, body)
             return mission.intake.take(robot, agent, body, correction)
 
         reply = await run_in_threadpool(take)
@@ -119,8 +117,7 @@ def detector_router(state: ServiceState) -> APIRouter:
         "/detectors/{channel}/{version}",
         tags=["robots"],
         dependencies=state.require(*Role),
-        response_class=Response,
-        responses={**refusals(404), 200: content(NETWORK)},
+        **file_of(NETWORK),
     )
     def get_detector(channel: Channel, version: Name) -> FileResponse:
         """The network of a detector version."""
@@ -138,22 +135,3 @@ def refused_packets(store: MissionStore, robot: str) -> list[PacketRefusal]:
         PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
         for epoch, sequence, reason in store.refusals(robot)
     ]
-
-
-def _check_rate(rate: RateLimit, robot: str, body: bytes) -> None:
-    """Refuse (HTTPException 413, 429) more than the robot may send."""
-    size = _unpacked_size(body)
-    if size > rate.largest:
-        raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
-    wait_s = rate.wait_s(robot, size)
-    if wait_s > 0.0:
-        raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
-
-
-def _unpacked_size(body: bytes) -> int:
-    """Size of a batch for the rate limit: the unpacked size, because unpacking takes time.
-
-    Raises:
-        PacketError: it is not a batch.
-    """
-    return sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(body))

@@ -5,11 +5,12 @@ themselves. Turns go round the addresses, so that one address cannot take those 
 """
 
 import asyncio
-import json
 from collections import deque
 from collections.abc import Callable
 
 from starlette.types import ASGIApp, Receive, Scope, Send
+
+from fcslam.service.http.problems import problem
 
 PER_S, AT_ONCE = 100.0, 20.0
 """Requests that are answered, on average and at once: each takes about a millisecond of the process."""
@@ -36,7 +37,8 @@ class Strangers:
             if self._count >= MOST_WAITING:
                 self._drop()
             if not await self._turn(scope):
-                await _refuse(send)
+                text = f"{MOST_WAITING} requests without a known token wait already; send a token"
+                await problem(429, text, {"retry-after": "60", "connection": "close"})(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 
@@ -88,10 +90,3 @@ class Strangers:
             turn.set_result(True)
         if self._waiting:
             asyncio.get_running_loop().call_later(1.0 / PER_S, self._next)
-
-
-async def _refuse(send: Send) -> None:
-    body = json.dumps({"error": f"{MOST_WAITING} requests without a known token wait already; send a token"}).encode()
-    headers = [(b"content-type", b"application/json"), (b"retry-after", b"60"), (b"connection", b"close")]
-    await send({"type": "http.response.start", "status": 429, "headers": headers})
-    await send({"type": "http.response.body", "body": body})

@@ -19,7 +19,6 @@ from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, ClosureRow, Run
 from fcslam.runs.map_files import map_stem
-from fcslam.service.closure_submaps import overlay_png
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,
@@ -33,13 +32,13 @@ from fcslam.service.http.responses import (
     RobotSummary,
     SessionSummary,
     WallDirection,
-    content,
+    file_of,
     refusals,
 )
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
+from fcslam.service.keyscans import live_scan, overlay_png
 from fcslam.service.learning_rounds import read_rounds
-from fcslam.service.live_poses import live_scan
 from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
@@ -113,8 +112,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
 
     @router.get(
         "/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}.png",
-        response_class=Response,
-        responses={**refusals(400, 404), 200: content(MEDIA["png"])},
+        **file_of(MEDIA["png"], refused=(400, 404)),
     )
     def get_closure_picture(channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp) -> Response:
         """Walls around both ends of a closure, laid on each other as it measured them."""
@@ -164,9 +162,7 @@ def map_router(state: ViewerState) -> APIRouter:
         """Why maps of one floor are separate, for every two of them."""
         return map_separations(state.mission)
 
-    @router.get(
-        "/maps/{k}.{suffix}", response_class=Response, responses={**refusals(400, 404), 200: content(*MEDIA.values())}
-    )
+    @router.get("/maps/{k}.{suffix}", **file_of(*MEDIA.values(), refused=(400, 404)))
     def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif|zip)$")]) -> Response:
         """A map: picture, occupancy, what map_server needs to know of it, both in one archive, drawing, and GeoTIFF if
         its place on earth is known.
@@ -178,17 +174,9 @@ def map_router(state: ViewerState) -> APIRouter:
             raise HTTPException(404, f"there is no {map_stem(k)}, or its place on earth is not known")
         return Response(exported, media_type=MEDIA[suffix])
 
-    @router.get(
-        "/maps/{k}/tiles/{z}/{x}/{y}.png",
-        response_class=Response,
-        responses={**refusals(400, 404), 200: content(MEDIA["png"]), 304: {"description": "as you have it"}},
-    )
+    @router.get("/maps/{k}/tiles/{z}/{x}/{y}.png", **file_of(MEDIA["png"], refused=(400, 404), is_tagged=True))
     def get_tile(
-        request: Request,
-        k: Index,
-        z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)],
-        x: Square,
-        y: Square,
+        request: Request, k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square
     ) -> Response:
         """A square of a map: at zoom z it has 512 m / 2^z; x and y count squares from the origin, y upwards."""
         try:
@@ -218,33 +206,27 @@ def map_router(state: ViewerState) -> APIRouter:
             async with turn:
                 return await run_in_threadpool(walls_of, image.parent, k)
 
-    @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
+    @router.get(f"/{METRICS}", **file_of(JSON, model=_ROWS))
     def get_metrics() -> FileResponse:
         """All metrics with their units."""
         return _file(state, METRICS, JSON)
 
-    @router.get(
-        "/quality.json", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_SETTINGS)}
-    )
+    @router.get("/quality.json", **file_of(JSON, model=_SETTINGS))
     def get_quality() -> FileResponse:
         """The certificate of each map, by its number; of a live map about half a minute old."""
         return _file(state, f"{QUALITY}.json", JSON)
 
-    @router.get(
-        f"/{CONFIG}", response_class=Response, responses={**refusals(404), 200: content(MEDIA["yaml"], model=_SETTINGS)}
-    )
+    @router.get(f"/{CONFIG}", **file_of(MEDIA["yaml"], model=_SETTINGS))
     def get_config() -> FileResponse:
         """The complete configuration."""
         return _file(state, CONFIG, MEDIA["yaml"])
 
-    @router.get("/pose_graph.g2o", response_class=Response, responses={**refusals(404), 200: content(TEXT)})
+    @router.get("/pose_graph.g2o", **file_of(TEXT))
     def get_pose_graph() -> FileResponse:
         """The pose graph."""
         return _file(state, POSE_GRAPH, TEXT)
 
-    @router.get(
-        f"/{TRAJECTORIES}.zip", response_class=Response, responses={**refusals(404), 200: content(MEDIA["zip"])}
-    )
+    @router.get(f"/{TRAJECTORIES}.zip", **file_of(MEDIA["zip"]))
     async def get_trajectories() -> Response:
         """The poses of all sessions, a file each."""
         folder = _folder_of(state)
@@ -255,9 +237,7 @@ def map_router(state: ViewerState) -> APIRouter:
             raise HTTPException(404, "there are no trajectories")
         return Response(archive, media_type=MEDIA["zip"])
 
-    @router.get(
-        "/trajectories/{session}.tum", response_class=Response, responses={**refusals(400, 404), 200: content(TEXT)}
-    )
+    @router.get("/trajectories/{session}.tum", **file_of(TEXT, refused=(400, 404)))
     def get_trajectory(
         session: Name,
         after: Annotated[int, Query(ge=0, le=MOST)] = 0,

@@ -3,9 +3,12 @@
 import logging
 import queue
 import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
 
 from fcslam.errors import StoreError
+from fcslam.service.audit_log import AuditLog
 from fcslam.storage.postgres import Postgres
 
 _MOST_WAITING = 10_000
@@ -14,10 +17,11 @@ _MOST_WAITING = 10_000
 _log = logging.getLogger(__name__)
 
 
-class AuditTable:
+class AuditTable(AuditLog):
     """Lines wait for the store on a thread of its own, so no request does. A kill loses those that wait."""
 
-    def __init__(self, server: Postgres, instance: str) -> None:
+    def __init__(self, server: Postgres, instance: str, wall_clock: Callable[[], float] = time.time) -> None:
+        super().__init__(wall_clock)
         self._server, self._instance = server, instance
         self._waiting: queue.Queue[bytes | None] = queue.Queue(_MOST_WAITING)
         self._thread = threading.Thread(target=self._write, name="audit log", daemon=True)
@@ -27,14 +31,14 @@ class AuditTable:
         return f"{self._server.url}: the audit log"
 
     def append(self, line: bytes) -> None:
-        """As in AuditPlace."""
+        """As in ``AuditLog``."""
         try:
             self._waiting.put_nowait(line)
         except queue.Full as error:
             raise OSError("the store does not answer") from error
 
-    def newest(self, limit: int) -> list[bytes]:
-        """As in AuditPlace; lines of all instances."""
+    def lines(self, limit: int) -> list[bytes]:
+        """As in ``AuditLog``; lines of all instances."""
         rows = self._server.rows("SELECT entry FROM audit ORDER BY number DESC LIMIT ?", (limit,))
         return [entry.encode() for (entry,) in reversed(rows)]
 

@@ -7,7 +7,6 @@ from typing import Final
 
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.mission_tables import Lease, check_lease
-from fcslam.service.shared.registry import note_finalized, note_live
 from fcslam.service.shared.schema import schema_of
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing_folder, write_file
@@ -45,10 +44,10 @@ class SharedFiles:
                 " SET number = files.number + 1, content = excluded.content",
                 (name, content),
             )
-            if name == LIVE:
-                note_live(transaction, self._lease.mission)
-            elif name.startswith(RESULT):
-                note_finalized(transaction, self._lease.mission)
+            counted = "live" if name == LIVE else "finalized" if name.startswith(RESULT) else None
+            if counted is not None:
+                statement = f"UPDATE fcslam.missions SET {counted} = {counted} + 1 WHERE number = ?"
+                transaction.execute(statement, (self._lease.mission,))
             connection.execute("COMMIT")
 
     def fetch_snapshot(self, folder: MissionFolder) -> None:

@@ -26,19 +26,14 @@ NAME_S: Final = LEASE_S + 2.0
 
 _log = logging.getLogger(__name__)
 
-Launch = Callable[[KnownMission, Lease], RunningWorker]
-"""Starts the worker of a mission."""
-
-Listen = Callable[[str, str, int], None]
-"""Receives the name of a mission, an event and its number."""
-
 
 class Hooks(NamedTuple):
     """What an instance calls."""
 
-    launch: Launch
-    listen: Listen
-    """Receives what happened to missions, whoever has their worker."""
+    launch: Callable[[KnownMission, Lease], RunningWorker]
+    """Starts the worker of a mission."""
+    listen: Callable[[str, str, int], None]
+    """Receives the name of a mission, an event and its number, whoever has the mission's worker."""
     on_taken: Callable[[], None]
     """Called when another process has taken the name, after this one was gone for a while."""
     follow: Callable[[], None] = lambda: None
@@ -72,14 +67,7 @@ class Instance:
         hooks: Hooks,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take the name.
-
-        Args:
-            registry: of all instances.
-            name: of this one.
-            most_missions: how many workers it runs.
-            hooks: what it calls.
-            clock: seconds.
+        """Take the name; ``most_missions``: how many workers it runs.
 
         Raises:
             ServiceError: another instance has this name.
@@ -95,7 +83,8 @@ class Instance:
         """Activity of each mission, and since when it is the same."""
         self._rest_look_at = clock() + REST_LOOK_S
         self._claims_from = clock()
-        self._known: Mapping[str, KnownMission] = {}
+        self.known: Mapping[str, KnownMission] = {}
+        """All missions by name, as they were a moment ago."""
         self.look()
         self._thread = threading.Thread(target=self._run, name=f"instance {name}", daemon=True)
 
@@ -117,19 +106,14 @@ class Instance:
         except StoreError as error:
             _log.error("the name of this instance ends by itself: %s", error)
 
-    @property
-    def known(self) -> Mapping[str, KnownMission]:
-        """All missions by name, as they were a moment ago."""
-        return self._known
-
     def worker(self, number: int) -> RunningWorker | None:
         """The worker of a mission, if it is here."""
         return next((worker for lease, worker in list(self._held.items()) if lease.mission == number), None)
 
     def look(self) -> None:
         """See which missions there are now."""
-        before, self._known = self._known, {mission.name: mission for mission in self._registry.missions()}
-        for name, mission in self._known.items():
+        before, self.known = self.known, {mission.name: mission for mission in self._registry.missions()}
+        for name, mission in self.known.items():
             old = before.get(name)
             if old is not None and mission.live > old.live:
                 self._hooks.listen(name, "live", mission.live)
@@ -175,7 +159,7 @@ class Instance:
 
     def _let_rest(self) -> None:
         """Find missions in which nothing happens, and end their workers."""
-        resting = {mission.number for mission in self._known.values() if not mission.is_wanted}
+        resting = {mission.number for mission in self.known.values() if not mission.is_wanted}
         for lease in [lease for lease in self._held if lease.mission in resting]:
             self._end(lease)
         now = self._clock()
@@ -192,7 +176,7 @@ class Instance:
 
     def _spread(self) -> None:
         """Take missions without a worker, or give one up, until each instance has its part."""
-        wanted = [mission for mission in self._known.values() if mission.is_wanted]
+        wanted = [mission for mission in self.known.values() if mission.is_wanted]
         part = fair_part(len(wanted), self._registry.rooms(), self._most)
         is_any_free = any(not mission.is_held for mission in wanted)
         may_claim = self._clock() >= self._claims_from

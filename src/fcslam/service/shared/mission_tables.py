@@ -1,15 +1,16 @@
 """A mission on a PostgreSQL server: the rows of a mission file, and what its worker leaves for other instances."""
 
-from collections.abc import Iterable
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fcslam.errors import ServiceError
 from fcslam.mission.mission_store import SCHEMA, TABLES, VERSION
-from fcslam.service.shared.schema import schema_of
+from fcslam.service.shared.schema import LOCK, schema_of
 from fcslam.storage.database import Database, translate_errors
-from fcslam.storage.postgres import Postgres, PostgresTables, PostgresTransaction
+from fcslam.storage.postgres import Postgres, PostgresTransaction
+from fcslam.storage.row_store import RowStore
 
 
 class LeaseLostError(ServiceError):
@@ -25,25 +26,47 @@ class Lease(NamedTuple):
     """How often the mission had a new worker; the highest one counts."""
 
 
-class MissionTables(PostgresTables):
-    """The rows of one mission, as a ``RowStore``."""
+class MissionTables(RowStore):
+    """The rows of one mission; writers to it wait for each other."""
 
     def __init__(self, server: Postgres, number: int, lease: Lease | None = None) -> None:
         """Open a mission that exists; a worker gives its ``lease``, and writes nothing after it lost it."""
-        self._number, self._lease = number, lease
-        super().__init__(server, schema_of(number), number, self._check)
+        super().__init__()
+        self._server, self._number, self._lease, self._schema = server, number, lease, schema_of(number)
+        self._begin = f"BEGIN; SET LOCAL search_path TO {self._schema}; SELECT pg_advisory_xact_lock({LOCK}, {number})"
 
-    def _check(self, transaction: PostgresTransaction) -> None:
-        """Raises:
-        LeaseLostError: another worker has the mission.
+    def close(self) -> None:
+        """The server's connections stay."""
+
+    @contextmanager
+    def transaction(self) -> Iterator[PostgresTransaction]:
+        """As in ``RowStore``.
+
+        Raises:
+            LeaseLostError: another worker has the mission.
         """
-        if self._lease is None:
-            # A worker has to follow the rows that an instance writes.
-            transaction.execute(
-                "UPDATE fcslam.missions SET is_wanted = true WHERE number = ? AND NOT is_wanted", (self._number,)
-            )
-        else:
-            check_lease(transaction, self._lease)
+        with self._server.connection(self._begin) as connection:
+            transaction = PostgresTransaction(connection)
+            if self._lease is not None:
+                check_lease(transaction, self._lease)
+            else:  # a worker has to follow the rows that an instance writes
+                transaction.execute(
+                    "UPDATE fcslam.missions SET is_wanted = true WHERE number = ? AND NOT is_wanted", (self._number,)
+                )
+            yield transaction
+            connection.execute("COMMIT")
+
+    def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        """All rows that a query finds."""
+        return self._server.rows(statement, values, self._schema)
+
+    @contextmanager
+    def _snapshot(self) -> Iterator[PostgresTransaction]:
+        """Read several tables as they are at one moment."""
+        begin = f"BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL search_path TO {self._schema}"
+        with self._server.connection(begin) as connection:
+            yield PostgresTransaction(connection)
+            connection.execute("COMMIT")
 
     def import_mission(self, path: Path) -> None:
         """Insert the rows of a mission file into a mission that has none.
@@ -58,17 +81,13 @@ class MissionTables(PostgresTables):
                 transaction.insert(table, rows)
 
     def export(self, path: Path) -> None:
-        """Write the mission as one new mission file, atomically.
-
-        Raises:
-            StoreError: there is a file already, or it cannot be written.
-        """
+        """As in ``RowStore``."""
         rows = path.with_name(f".{path.name}.rows")
         with translate_errors(path):
             rows.unlink(missing_ok=True)
         try:
             with closing(Database(rows, SCHEMA, VERSION)) as file:
-                with self.snapshot() as found, file.transaction() as transaction:
+                with self._snapshot() as found, file.transaction() as transaction:
                     for table in TABLES:
                         transaction.insert(table, found.stream(table))
                 file.export(path)
@@ -87,6 +106,5 @@ def check_lease(transaction: PostgresTransaction, lease: Lease) -> None:
         LeaseLostError: it has not.
     """
     statement = "SELECT fence FROM fcslam.missions WHERE number = ? FOR KEY SHARE"
-    found: Iterable[Any] = transaction.execute(statement, (lease.mission,)).fetchall()
-    if list(found) != [(lease.fence,)]:
+    if transaction.execute(statement, (lease.mission,)).fetchall() != [(lease.fence,)]:
         raise LeaseLostError(f"mission {lease.mission}: another worker has it")

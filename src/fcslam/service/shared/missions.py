@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextvars import ContextVar
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -37,16 +36,6 @@ _SEEN: Final = "seen"
 
 _JOINT_LOOK_S: Final = 1.0
 """Between two looks for joint maps that a worker elsewhere shared."""
-
-
-@dataclass(frozen=True, slots=True)
-class Admission:
-    """How much an instance takes."""
-
-    missions: int
-    """Workers that it runs at a time."""
-    robots: int
-    """Robots that send to it at a time."""
 
 
 class SharedMission(OpenMission):
@@ -96,7 +85,7 @@ class SharedMission(OpenMission):
         return copy
 
     def result(self, name: str) -> Path | None:
-        """The run folder of a requested result; None if it does not exist."""
+        """As in ``OpenMission``."""
         return self._fetched(f"{RESULT}{name}", f"result-{name}")
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
@@ -136,18 +125,14 @@ class SharedMissions:
         config: CloudConfig,
         server: Postgres,
         name: str,
-        admission: Admission,
+        most_missions: int,
+        most_robots: int,
         hooks: Hooks,
     ) -> None:
         """Take the instance's name, and create the first mission if the server has no mission.
 
-        Args:
-            root: folder of this instance's own files, which can be made again from the store.
-            config: of new missions.
-            server: the store.
-            name: of the instance.
-            admission: how much the instance takes.
-            hooks: what it calls.
+        Files in ``root`` are this instance's own, and can be made again from the store. At a time, the instance runs
+        ``most_missions`` workers, and ``most_robots`` robots send to it.
 
         Raises:
             ServiceError: the folder cannot be used, or another instance has the name.
@@ -163,13 +148,13 @@ class SharedMissions:
             for seen in root.glob(f"missions/*/{_SEEN}"):
                 shutil.rmtree(seen, ignore_errors=True)
             self.detectors = SharedDetectors(root / "detectors", server)
-            self._robots = RobotLimit(admission.robots, time.monotonic)
+            self._robots = RobotLimit(most_robots, time.monotonic)
             self._registry = Registry(server, name, secrets.token_hex(8))
             self._opening = threading.Lock()
             self._opened: dict[str, SharedMission] = {}
             self.detectors.follow()
             hooks = hooks._replace(follow=self.detectors.follow)
-            self._instance = Instance(self._registry, name, admission.missions, hooks)
+            self._instance = Instance(self._registry, name, most_missions, hooks)
             if not any(known.is_open for known in self._instance.known.values()):
                 self._open_first()
             self._instance.start()
@@ -197,11 +182,7 @@ class SharedMissions:
         return self._open_here(named) if mission is None else mission
 
     def create(self, name: str) -> None:
-        """Create a mission and open it.
-
-        Raises:
-            ServiceError: there is one of this name.
-        """
+        """As in ``Missions``."""
         check_words(name, self._config.fleet)
         check_name(name, "mission")
         number = self._registry.create(name)
@@ -209,34 +190,20 @@ class SharedMissions:
         self.open(name)
 
     def open(self, name: str) -> None:
-        """Let robots that name no mission send to this one.
-
-        Raises:
-            ServiceError: no mission has this name.
-        """
+        """Let robots that name no mission send to this one; raises as in ``Missions``."""
         self._registry.open(self._known(name).number)
         self._instance.look()
 
     def result(self, name: str, number: int) -> Path | None:
-        """The run folder of a result of a mission; None if it does not exist."""
+        """As in ``Missions``."""
         return self._open_here(name).result(str(number))
 
     def export(self, name: str, path: Path) -> None:
-        """Write a mission as one new file.
-
-        Raises:
-            ServiceError: no mission has this name.
-            StoreError: it cannot be written.
-        """
+        """As in ``Missions``."""
         MissionTables(self._server, self._known(name).number).export(path)
 
     def import_mission(self, name: str, path: Path) -> None:
-        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open.
-
-        Raises:
-            ServiceError: there is one of this name.
-            StoreError: it cannot be written.
-        """
+        """As in ``Missions``."""
         check_name(name, "mission")
         MissionTables(self._server, self._registry.create(name)).import_mission(path)
         self._instance.look()
@@ -254,12 +221,11 @@ class SharedMissions:
             self.open(FIRST)
 
     def _known(self, name: str) -> KnownMission:
+        if name not in self._instance.known:
+            self._instance.look()
         known = self._instance.known.get(name)
         if known is None:
-            self._instance.look()
-            known = self._instance.known.get(name)
-        if known is None:
-            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self._instance.known)}")
+            raise UnknownMissionError(name, self._instance.known)
         return known
 
     def _open_here(self, name: str) -> SharedMission:

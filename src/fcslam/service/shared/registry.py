@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 from fcslam.errors import ServiceError
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.schema import mission_statements, schema_of
-from fcslam.storage.postgres import Postgres, PostgresTransaction
+from fcslam.storage.postgres import Postgres
 
 LEASE_S: Final = 3.0
 """An instance that does not renew its leases for so long loses them."""
@@ -154,13 +154,3 @@ class Registry:
         with MissionTables(self._server, lease.mission, lease).transaction() as transaction:
             if transaction.execute(_ACTIVITY).fetchone() == activity:
                 transaction.execute("UPDATE fcslam.missions SET is_wanted = false WHERE number = ?", (lease.mission,))
-
-
-def note_live(transaction: PostgresTransaction, mission: int) -> None:
-    """Note that there is a new live run."""
-    transaction.execute("UPDATE fcslam.missions SET live = live + 1 WHERE number = ?", (mission,))
-
-
-def note_finalized(transaction: PostgresTransaction, mission: int) -> None:
-    """Note that there is a new result."""
-    transaction.execute("UPDATE fcslam.missions SET finalized = finalized + 1 WHERE number = ?", (mission,))

@@ -4,15 +4,17 @@ The schema ``fcslam`` holds what all missions share; each mission has a schema o
 file.
 """
 
+import re
 from typing import Final
 
 from fcslam.errors import StoreError
+from fcslam.mission.mission_store import SCHEMA
 from fcslam.storage.postgres import Postgres
 
 VERSION: Final = 1
 """Version of the tables."""
-PREPARING: Final = 0x0FC51A
-"""The lock of whoever makes the tables."""
+LOCK: Final = 0x0FC51A  # of fcslam's, in case other programs lock as well
+"""The lock of whoever makes the tables, and first number of the locks of those who write to a mission."""
 SHARED: Final = """
 CREATE TABLE missions (
     number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -35,39 +37,22 @@ CREATE TABLE detectors (
     channel TEXT NOT NULL, version TEXT NOT NULL, content BYTEA NOT NULL, UNIQUE (channel, version)
 )
 """
-MISSION: Final = """
-CREATE TABLE packets (
-    arrival BIGINT PRIMARY KEY,
-    robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL, sequence BIGINT NOT NULL,
-    received DOUBLE PRECISION NOT NULL, time DOUBLE PRECISION NOT NULL,
-    kind TEXT COLLATE "C", channel TEXT COLLATE "C", refusal TEXT, data BYTEA NOT NULL,
-    UNIQUE (robot, epoch, sequence)
-);
-CREATE INDEX refusals ON packets (robot, epoch, sequence) WHERE refusal IS NOT NULL;
-CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
-CREATE TABLE corrections (
-    robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL, version BIGINT NOT NULL UNIQUE,
-    time DOUBLE PRECISION NOT NULL, map_index BIGINT NOT NULL,
-    x DOUBLE PRECISION NOT NULL, y DOUBLE PRECISION NOT NULL, theta DOUBLE PRECISION NOT NULL,
-    quality DOUBLE PRECISION NOT NULL,
-    PRIMARY KEY (robot, epoch)
-);
-CREATE TABLE edits (
-    number BIGINT PRIMARY KEY, author TEXT NOT NULL, time DOUBLE PRECISION NOT NULL, kind TEXT NOT NULL,
-    content TEXT NOT NULL
-);
-CREATE TABLE finalizations (
-    number BIGINT PRIMARY KEY, arrivals BIGINT NOT NULL, edits BIGINT NOT NULL, run TEXT, failure TEXT
-);
-CREATE TABLE tracks (
-    robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL,
-    stamps BYTEA NOT NULL, keyscans BYTEA NOT NULL, offsets BYTEA NOT NULL,
-    PRIMARY KEY (robot, epoch)
-);
-CREATE TABLE facts (name TEXT COLLATE "C" PRIMARY KEY, value TEXT NOT NULL);
+_TYPES: Final = {
+    "INTEGER": "BIGINT",
+    "REAL": "DOUBLE PRECISION",
+    "BLOB": "BYTEA",
+    "TEXT": 'TEXT COLLATE "C"',
+    " STRICT": "",
+}
+"""Words of a mission file's schema, and what they are here; only rows of a file have seals."""
+_UNSEALED: Final = re.sub(r",\s*seal BLOB NOT NULL", "", SCHEMA)
+MISSION: Final = (
+    re.sub("|".join(_TYPES), lambda word: _TYPES[word[0]], _UNSEALED).rstrip()
+    + """;
 CREATE TABLE files (name TEXT COLLATE "C" PRIMARY KEY, number BIGINT NOT NULL, content BYTEA NOT NULL);
 CREATE TABLE agents (robot TEXT COLLATE "C" PRIMARY KEY, agent TEXT NOT NULL, heard TIMESTAMPTZ NOT NULL)
 """
+)
 
 
 def schema_of(number: int) -> str:
@@ -81,7 +66,7 @@ def prepare(server: Postgres) -> None:
     Raises:
         StoreError: they are of another version, the role may not make them, or the server cannot be used.
     """
-    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({PREPARING})") as connection:
+    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({LOCK})") as connection:
         found = connection.execute("SELECT to_regclass('fcslam.version') IS NOT NULL").fetchone()
         if not (found and found[0]):
             connection.execute("CREATE SCHEMA IF NOT EXISTS fcslam")

@@ -40,20 +40,20 @@ class Calibration(NamedTuple):
 
 
 def image_of(content: Any, kind: str, bag_time_ns: int) -> ImageMessage:
-    """Convert a message of type ``kind``, COMPRESSED_IMAGE or IMAGE; raises ValueError if the image is not read."""
-    return (_compressed_image_of if kind == COMPRESSED_IMAGE else _raw_image_of)(content, bag_time_ns)
+    """Convert a message of type ``kind``, COMPRESSED_IMAGE or IMAGE; raises ValueError if the image is not read.
 
-
-def _compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
-    """A JPEG or PNG image as it was sent; raises ValueError for other formats."""
-    encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
-    image_suffix(encoded)
+    A compressed image is JPEG or PNG as it was sent; one of encoding rgb8, bgr8 or mono8 becomes lossless PNG.
+    """
+    if kind == COMPRESSED_IMAGE:
+        encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
+        image_suffix(encoded)
+    else:
+        encoded = _png(content)
     stamp, _ = header_of(content.header, bag_time_ns)
     return ImageMessage(stamp, encoded)
 
 
-def _raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
-    """An image of encoding rgb8, bgr8 or mono8 as lossless PNG; raises ValueError for other encodings."""
+def _png(content: Any) -> bytes:
     import cv2
 
     channels, width, height, step = _CHANNELS.get(content.encoding), content.width, content.height, content.step
@@ -68,8 +68,7 @@ def _raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
     if content.encoding == "rgb8":
         pixels = pixels[..., ::-1]
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, _FASTEST])
-    stamp, _ = header_of(content.header, bag_time_ns)
-    return ImageMessage(stamp, encoded.tobytes())
+    return bytes(encoded)
 
 
 def calibration_of(content: Any) -> Calibration:

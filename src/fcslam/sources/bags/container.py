@@ -13,16 +13,16 @@ from functools import cached_property
 from heapq import merge
 from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol, cast
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import OLD_TRANSFORMS, SCANS, TRANSFORMS, MessageCodec
-from fcslam.sources.bags.limited_rosbags import METADATA, check_chunks, check_tables, ros1_reader, ros2_reader
+from fcslam.sources.bags.limited_rosbags import METADATA, check_chunks, ros1_reader, ros2_reader
 from fcslam.sources.bags.mcap_records import MCAP_MAGIC, chunk_bytes, profile_of
 from fcslam.sources.bags.sequential import LARGEST_CHUNK_BYTES, SequentialReader
 from fcslam.sources.logs.archive import translate_errors
-from fcslam.untrusted import MOST_CHUNKS_RATIO, check_unpacked, open_file, unpack
+from fcslam.untrusted import MOST_CHUNKS_RATIO, check_unpacked, open_database, open_file, unpack
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -313,11 +313,8 @@ class _Part:
     @property
     def remedy(self) -> str:
         """Commands that mend a damaged file of this kind."""
-        if self.is_ros1:
-            return "copy it again, or mend it with `rosbag reindex`"
-        if self._magic.startswith(_MCAP):
-            return "copy it again, or mend it with `mcap recover`"
-        return "copy it again, or mend it with `ros2 bag reindex`"
+        of_ros2 = "mcap recover" if self._magic.startswith(_MCAP) else "ros2 bag reindex"
+        return f"copy it again, or mend it with `{'rosbag reindex' if self.is_ros1 else of_ros2}`"
 
 
 def _chosen(reader: _Reader, topics: Sequence[Topic]) -> Iterator[tuple[Topic, int, bytes]]:
@@ -361,21 +358,15 @@ def is_transforms(topic: Topic) -> bool:
 
 
 def _reader(path: Path, magic: bytes) -> _Reader:
-    reader: _Reader
-    if path.is_dir():
-        for database in path.glob("*.db3"):
-            _check_database(database)
-        reader = ros2_reader(path, "dir")
-    elif magic.startswith(_ROS1):
-        reader = ros1_reader(path)
-    elif magic.startswith(_SQLITE):
-        _check_database(path)
-        reader = ros2_reader(path, ".db3")
-    elif magic.startswith(_MCAP):
-        reader = ros2_reader(path, ".mcap")
-    else:
+    for database in path.glob("*.db3") if path.is_dir() else [path] * magic.startswith(_SQLITE):
+        _check_database(database)
+    if magic.startswith(_ROS1):
+        return cast(_Reader, ros1_reader(path))
+    suffixes = {_SQLITE: ".db3", _MCAP: ".mcap"}
+    suffix = "dir" if path.is_dir() else next((suffixes[start] for start in suffixes if magic.startswith(start)), None)
+    if suffix is None:
         raise SourceError(f"{path}: the whole bag is compressed; unpack it first, as by `gunzip`, `xz -d` or `zstd -d`")
-    return reader
+    return cast(_Reader, ros2_reader(path, suffix))
 
 
 def _check_mcap(path: Path, file: BinaryIO) -> None:
@@ -425,7 +416,7 @@ def _check_database(database: Path) -> None:
     )
     if changes == counted_at and database.stat().st_size < page_bytes * pages:
         raise ValueError("the file is truncated")
-    check_tables(database)
+    open_database(database).close()  # refuses what is more than tables
 
 
 def _parts_in(folder: Path) -> list[Path]:

@@ -9,6 +9,7 @@ from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import header_of
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
+from fcslam.sources.faults import Fault
 
 SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
 """Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
@@ -22,28 +23,25 @@ LARGEST_SIGMA_M: Final = 1e4
 _NO_FIX: Final = -1
 
 
-class FixAtZeroError(ValueError):
-    """Latitude and longitude are 0: the receiver has no fix, and does not say so."""
-
-
 def fix_topics(robot: BagRobot) -> list[Topic]:
     """The topics of fixes of a robot, the one with most messages first."""
     topics = [topic for topic in robot.topics if topic.type == FIX and topic.message_count]
     return sorted(topics, key=lambda topic: (-topic.message_count, topic.name))
 
 
-def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | None:
+def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | Fault | None:
     """Convert a message; None if it states that there is no fix.
 
+    Latitude and longitude 0 are a fault: the receiver has no fix, and does not say so.
+
     Raises:
-        FixAtZeroError: latitude and longitude are 0.
         ValueError: a number is out of range.
     """
     if content.status.status <= _NO_FIX:
         return None
     latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
     if latitude == 0.0 == longitude:
-        raise FixAtZeroError("latitude and longitude are 0")
+        return Fault.FIX_AT_ZERO
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
         raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are not a position on the earth")
     stamp, frame = header_of(content.header, bag_time_ns)

@@ -5,11 +5,9 @@ database. The first two are replaced where rosbags looks them up; SQLite gets it
 """
 
 import os
-from collections.abc import Collection
-from contextlib import closing
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -22,7 +20,6 @@ from fcslam.untrusted import (
     check_unpacked,
     longest_value,
     most_unpacked,
-    open_database,
     open_zstd,
     read_text,
     step_counter,
@@ -118,16 +115,6 @@ def check_chunks(reader: Any) -> None:
         check_unpacked(size, unpacked)
 
 
-def check_tables(database: Path) -> None:
-    """Refuse a database that is more than tables.
-
-    Raises:
-        OSError, sqlite3.Error: it is.
-    """
-    with closing(open_database(database)):
-        pass
-
-
 @cache
 def _limit_rosbags() -> None:
     """Put limits into rosbags, once in a process."""
@@ -136,22 +123,17 @@ def _limit_rosbags() -> None:
     from rosbags.rosbag2 import reader as folders
     from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
-    ros1.decompressors |= {kind: _whole(kind) for kind in ("bz2", "lz4")}
-    storage_mcap.DECOMPRESSORS |= {kind: _stated(kind) for kind in ("lz4", "zstd")}
-    setattr(folders, "zstd", SimpleNamespace(decompress=_whole("zstd"), open=lambda file, _: open_zstd(file)))  # noqa: B010
-    modules: Collection[ModuleType] = (folders, storage_mcap, storage_sqlite3)
-    for module in modules:
+    ros1.decompressors |= {kind: partial(unpack, compression=kind) for kind in ("bz2", "lz4")}
+    # One byte more than stated is enough for rosbags to refuse the chunk.
+    storage_mcap.DECOMPRESSORS |= {
+        "lz4": lambda packed, size: unpack(packed, "lz4", size + 1),
+        "zstd": lambda packed, size: unpack(packed, "zstd", size + 1),
+    }
+    zstd = SimpleNamespace(decompress=partial(unpack, compression="zstd"), open=lambda file, _: open_zstd(file))
+    setattr(folders, "zstd", zstd)  # noqa: B010
+    for module in (folders, storage_mcap, storage_sqlite3):
         setattr(module, "parse_qos", lambda _: [])  # noqa: B010
     apsw.connection_hooks.append(_limit_database)
-
-
-def _whole(compression: str) -> Any:
-    return lambda packed: unpack(packed, compression)
-
-
-def _stated(compression: str) -> Any:
-    """One byte more than stated is enough for rosbags to refuse the chunk."""
-    return lambda packed, size: unpack(packed, compression, size + 1)
 
 
 def _limit_database(connection: Any) -> None:

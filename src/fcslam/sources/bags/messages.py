@@ -192,8 +192,6 @@ def _frame(name: str) -> str:
 
 def _transform(translation: Any, rotation: Any) -> Transform:
     x, y, z = translation.x, translation.y, translation.z
-    if not max(abs(x), abs(y), abs(z)) < _MAX_COORDINATE_M:
+    if not all(abs(value) < _MAX_COORDINATE_M for value in (x, y, z)):  # false for NaN
         raise ValueError(f"the position {x:g}, {y:g}, {z:g} cannot be that of a robot")
-    if not all(map(isfinite, (x, y, z))):
-        raise ValueError(f"the position {x:g}, {y:g}, {z:g} is not finite")
     return transform_of((x, y, z), (rotation.x, rotation.y, rotation.z, rotation.w))

@@ -1,28 +1,28 @@
 """The mounted sensors of a robot: they turn its messages into records."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import degrees, radians
 from typing import NamedTuple
 
 import numpy as np
 
 from fcslam.errors import FcslamError
-from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
+from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.codec import LASER_SCANS
-from fcslam.sources.bags.messages import measured_ranges, reversed_sweep
+from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
+from fcslam.sources.gate import usual_beams
 from fcslam.sources.images import check_image
-from fcslam.sources.pose import pose_array
 
 _LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
 
 
-class TiltedLaserError(FcslamError):
-    """A laser does not look along the floor; the message says by how much."""
+class MountingError(FcslamError):
+    """A laser cannot be read as it is mounted; the message says why, and what to do."""
 
 
 class Rig(NamedTuple):
@@ -39,43 +39,71 @@ class Rig(NamedTuple):
         scan, upside_down = posed.scan, self.upside_down[posed.scan.laser]
         if scan.ranges_at_stamp is not None and scan.sweep is not None:
             scan = scan._replace(raw_ranges_m=scan.ranges_at_stamp(scan.sweep), sweep=None)
-        ranges_m = _turned(measured_ranges(scan), upside_down)
+        ranges_m = measured_ranges(scan)
+        ranges_m = frozen(ranges_m[::-1] if upside_down else ranges_m, np.float32)
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
-        return LaserScan(scan.stamp, ranges_m, laser, pose_array(posed.T_odom_base), sweep)
+        return LaserScan(scan.stamp, ranges_m, laser, frozen(posed.T_odom_base), sweep)
 
     def image(self, posed: PosedImage) -> CameraImage:
         """The record of an image; raises ValueError if it is damaged, or of another camera, or there is none."""
         if self.camera is None:
             raise ValueError("no camera")
         check_image(posed.image.encoded, self.camera)
-        T_odom_base = None if posed.T_odom_base is None else pose_array(posed.T_odom_base)
-        return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, T_odom_base)
+        pose = posed.T_odom_base
+        return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, None if pose is None else frozen(pose))
+
+
+def usual_scan(scans: Sequence[ScanMessage]) -> ScanMessage:
+    """The first of these scans of one laser that has its usual beams."""
+    usual = usual_beams([scan.beams for scan in scans])
+    return next(scan for scan in scans if scan.beams == usual)
 
 
 def rig_of(
-    beams: Sequence[Beams], ranges_max_m: Sequence[float], mountings: Sequence[Mounting], camera: CameraModel | None
+    first: Sequence[ScanMessage],
+    ranges_max_m: Sequence[float],
+    mountings: Sequence[Mounting],
+    camera: CameraModel | None,
 ) -> Rig:
-    """The rig whose lasers have these usual beams, largest ranges and mountings."""
+    """The rig whose lasers have the beams of these scans, and these largest ranges and mountings."""
     lasers = tuple(
-        LaserModel(*_turned_beams(its, mounted.upside_down), range_max_m, mounted.T_base_laser)
-        for its, range_max_m, mounted in zip(beams, ranges_max_m, mountings, strict=True)
+        LaserModel(*_turned_beams(scan.beams, mounted.upside_down), range_max_m, mounted.T_base_laser)
+        for scan, range_max_m, mounted in zip(first, ranges_max_m, mountings, strict=True)
     )
     return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera)
 
 
-def sensor_mounting(tree: TransformTree, base_frame: str, frame: str, kind: str) -> Mounting:
+def check_frames(frames: Iterable[tuple[str, str]]) -> None:
+    """Check the topic and the frame of each laser.
+
+    Raises:
+        MountingError: two topics have one frame, so tf cannot give the pose of each laser.
+    """
+    topic_of: dict[str, str] = {}
+    for topic, frame in frames:
+        if (other := topic_of.setdefault(frame, topic)) != topic:
+            raise MountingError(
+                f"the scans of {other} and {topic} have one frame, '{frame}', so tf cannot give the pose of each "
+                "laser; give it with --sensors laser-pose=X,Y,THETA for each"
+            )
+
+
+def sensor_mounting(tree: TransformTree, base_frame: str, frame: str, kind: str, name: str) -> Mounting:
     """Where tf says that a laser, or another sensor with messages of type ``kind``, sits.
 
     Raises:
         NoTransformError: tf does not say it.
-        TiltedLaserError: a laser does not look along the floor.
+        MountingError: the laser ``name`` does not look along the floor.
     """
     mounted = mounting(tree.fixed(base_frame, frame))
     if kind not in LASER_SCANS:  # their scans are level
         return Mounting(mounted.T_base_laser, upside_down=False, tilt_rad=0.0)
     if mounted.tilt_rad > _STEEPEST_RAD:
-        raise TiltedLaserError(f"tilted by {degrees(mounted.tilt_rad):.0f} degrees")
+        raise MountingError(
+            f"the laser of {name} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and does not look along the "
+            "floor; choose a level one by --sensors scan-topic, or give its pose with --sensors laser-pose"
+        )
     return mounted
 
 
@@ -108,11 +136,3 @@ def mounted_camera(
 def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
     """The beams of a laser that is mounted upside down, as seen from above."""
     return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
-
-
-def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
-    """Reverse the ranges (beam_count,) of a laser that is mounted upside down."""
-    if upside_down:
-        ranges_m = np.ascontiguousarray(ranges_m[::-1])
-    ranges_m.setflags(write=False)
-    return ranges_m

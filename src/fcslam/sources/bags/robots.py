@@ -39,11 +39,6 @@ class BagRobot(NamedTuple):
     """By the name of a topic of odometry."""
     notes: tuple[str, ...] = ()
 
-    @property
-    def tree(self) -> TransformTree:
-        """All its frames and transforms."""
-        return self.bag.census.tree(self.transforms)
-
 
 @dataclass(slots=True)
 class _Member:

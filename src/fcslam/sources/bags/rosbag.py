@@ -8,22 +8,23 @@ shows that there is odometry.
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord
+from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.codec import LASER_SCANS
-from fcslam.sources.bags.fixes import FIX_INTERVAL_S, FixAtZeroError, fix_of, fix_topics
+from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.rig import (
+    MountingError,
     Rig,
-    TiltedLaserError,
+    check_frames,
     given_mounting,
     mounted_camera,
     rig_of,
@@ -39,10 +40,10 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import FEWEST_POSES, PathSummary
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
-from fcslam.sources.pose import pose_array
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
+_audit = partial(Audit, "message")
 _EACH_LASER = "give one for each laser, in the same order"
 
 _MOST_JUMPS = 0.2
@@ -118,7 +119,7 @@ class RosBag:
                 watch.add(number, record)
                 yield record
             elif isinstance(entry, OdometryReading):
-                yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
+                yield Odometry(entry.stamp, frozen(entry.T_odom_base))
             else:
                 try:
                     yield rig.image(entry)
@@ -133,13 +134,12 @@ class RosBag:
         for message in stream.bag.messages(topics) if topics else ():
             try:
                 fix = fix_of(stream.bag.decode(message), message.bag_time_ns, stream.tree, self._reading.base_frame)
-            except FixAtZeroError:
-                audit.add(Fault.FIX_AT_ZERO, message.number)
             except ValueError:
-                audit.add(Fault.BROKEN_MESSAGE, message.number)
-            else:
-                if fix is not None:
-                    found.append(fix)
+                fix = Fault.BROKEN_MESSAGE
+            if isinstance(fix, Fault):
+                audit.add(fix, message.number)
+            elif fix is not None:
+                found.append(fix)
         apart: list[GnssFix] = []
         for fix in sorted(found, key=lambda fix: fix.stamp):
             if not apart or fix.stamp >= apart[-1].stamp + FIX_INTERVAL_S:
@@ -183,8 +183,11 @@ class RosBag:
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
         body_notes = self._leave_out_body(bodies, mountings)
         camera, camera_notes = self._camera(tree, base_frame)
+        of_several = which if len(which) > 1 else [""]
         tilts = (
-            self._tilt_note(laser.name, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
+            f"{self.stream.path}: the laser{its} is {tilt}"
+            for its, mounted in zip(of_several, mountings, strict=True)
+            if (tilt := tilt_note(mounted))
         )
         unlimited = (
             f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
@@ -193,7 +196,7 @@ class RosBag:
         )
         notes = (
             *self._notes,
-            *self.stream.reading_notes,
+            *self.stream.bag.notes,
             *unlimited,
             *chain.from_iterable(
                 laser.notes(self.stream.path, self._options.cloud_band) for laser in self.stream.lasers
@@ -206,10 +209,10 @@ class RosBag:
             *self.stream.robot.notes,
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
-            *filter(None, tilts),
+            *tilts,
             *camera_notes,
         )
-        rig = rig_of([laser.first.beams for laser in self.stream.lasers], farthest_m, mountings, camera)
+        rig = rig_of([laser.first for laser in self.stream.lasers], farthest_m, mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
         return _Reading(survey, rig, placeholders, base_frame)
 
@@ -261,17 +264,11 @@ class RosBag:
             raise SourceError(f"{self.stream.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
         if poses:
             return [given_mounting(pose, laser.topic.type) for pose, laser in zip(poses, lasers, strict=True)]
-        topic_of: dict[str, str] = {}
-        for laser in lasers:
-            other = topic_of.setdefault(laser.first.frame, laser.topic.name)
-            if other != laser.topic.name:
-                raise SourceError(
-                    f"{self.stream.path}: the scans of {other} and {laser.topic.name} have one frame, "
-                    f"'{laser.first.frame}', so tf cannot give the pose of each laser; give it with --sensors "
-                    "laser-pose=X,Y,THETA "
-                    "for each"
-                )
-        return [self._mounting(laser, tree, base_frame) for laser in lasers]
+        try:
+            check_frames((laser.topic.name, laser.first.frame) for laser in lasers)
+            return [self._mounting(laser, tree, base_frame) for laser in lasers]
+        except MountingError as error:
+            raise SourceError(f"{self.stream.path}: {error}") from error
 
     @property
     def is_upside_down(self) -> bool:
@@ -313,20 +310,14 @@ class RosBag:
         return RosBag(self.stream.path, called, options, self._notes, robot)
 
     def _mounting(self, laser: RecordedLaser, tree: TransformTree, base_frame: str) -> Mounting:
-        topic = laser.name
         try:
-            return sensor_mounting(tree, base_frame, laser.first.frame, laser.topic.type)
+            return sensor_mounting(tree, base_frame, laser.first.frame, laser.topic.type, laser.name)
         except NoTransformError as error:
             raise SourceError(
-                f"{self.stream.path}: tf has {error}{self._first_errors()}, so the pose of the laser of {topic} "
+                f"{self.stream.path}: tf has {error}{self._first_errors()}, so the pose of the laser of {laser.name} "
                 "is unknown; give it with --sensors laser-pose=X,Y,THETA (metres, "
                 f"radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
                 "if it is in another part of this recording, give both joined by a comma"
-            ) from error
-        except TiltedLaserError as error:
-            raise SourceError(
-                f"{self.stream.path}: the laser of {topic} is {error} and does not look along the floor; choose a "
-                "level one by --sensors scan-topic, or give its pose with --sensors laser-pose"
             ) from error
 
     def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
@@ -336,11 +327,6 @@ class RosBag:
             return None, ()
         camera, note = mounted_camera(self.stream.calibration, tree, base_frame)
         return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
-
-    def _tilt_note(self, name: str, mounted: Mounting) -> str:
-        tilt = tilt_note(mounted)
-        which = f" of {name}" * (len(self.stream.lasers) > 1)
-        return f"{self.stream.path}: the laser{which} is {tilt}" * bool(tilt)
 
 
 def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]:
@@ -359,7 +345,3 @@ def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
     x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
     mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
     return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
-
-
-def _audit() -> Audit:
-    return Audit("message")

@@ -111,6 +111,12 @@ class SectorJoiner:
         )
 
 
+def joined_turns(sectors: Sequence[ScanMessage]) -> list[ScanMessage]:
+    """The complete turns of successive sectors; the last one as it is if none is complete."""
+    joiner = SectorJoiner()
+    return [turn for sector in sectors for turn in joiner.add(sector)] or list(joiner.flush())
+
+
 def _follows(a: ScanMessage, b: ScanMessage) -> bool:
     """Whether ``b`` goes on where ``a`` ends, in either direction."""
     if not _is_alike(a, b):

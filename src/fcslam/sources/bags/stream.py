@@ -1,25 +1,19 @@
 """The scans of a bag with their odometry, in the order of recording."""
 
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from itertools import islice
+from itertools import chain, islice
 from math import acos, degrees, tau
 from pathlib import Path
 from statistics import quantiles
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Sweep
-from fcslam.sources.bags.camera import (
-    Calibration,
-    ImageMessage,
-    calibration_of,
-    image_of,
-)
+from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
 from fcslam.sources.bags.census import CountedBag
-from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
+from fcslam.sources.bags.clouds import CloudMessage, cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, ODOMETRY, SCANS
 from fcslam.sources.bags.container import RawMessage, Topic
 from fcslam.sources.bags.merging import merge_scans
@@ -27,24 +21,26 @@ from fcslam.sources.bags.messages import (
     BeamsError,
     OdometryReading,
     ScanMessage,
-    StampedTransform,
     odometry_in,
     odometry_of,
     scan_of,
     transforms_of,
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry, without_odometry
+from fcslam.sources.bags.pairing import Entry, EntryGate, Message, pair_with_odometry, without_odometry
+from fcslam.sources.bags.rig import usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
-from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad
+from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad, joined_turns
 from fcslam.sources.bags.topics import Candidates, Topics, calibration_beside, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
+from fcslam.sources.gate import SCANS_THAT_VOTE
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, leaning
 from fcslam.sources.pose import Pose
+
+Found = TypeVar("Found")
 
 _IMAGES_TRIED = 5
 _STRIDE = 5
@@ -103,10 +99,6 @@ class OdometryInput(NamedTuple):
         """The name of the topic, or the frames in tf."""
         return self.topics[0].name if self.edge is None else f"tf from {self.edge[0]} to {self.edge[1]}"
 
-    def readings_in(self, transforms: Iterable[StampedTransform]) -> Iterator[OdometryReading]:
-        """The readings among the transforms of a message."""
-        yield from (odometry_in(each) for each in transforms if (each.parent, each.child) == self.edge)
-
 
 class BagStream:
     """Decodes and combines the chosen topics of a bag."""
@@ -130,11 +122,6 @@ class BagStream:
         self.first_errors: dict[str, str] = {}
         """The fault of the first invalid message of each topic, by its name."""
 
-    @property
-    def reading_notes(self) -> tuple[str, ...]:
-        """How the bag was read, if it is not whole; complete after a pass over all messages."""
-        return self.bag.notes
-
     @cached_property
     def robot(self) -> BagRobot:
         """The robot whose topics are read.
@@ -147,7 +134,7 @@ class BagStream:
     @cached_property
     def tree(self) -> TransformTree:
         """The frames and transforms of the robot."""
-        return self.robot.tree
+        return self.bag.census.tree(self.robot.transforms)
 
     @cached_property
     def candidates(self) -> Candidates:
@@ -173,7 +160,7 @@ class BagStream:
         errors = []
         for message in islice(self.bag.messages([topic]), _READINGS_TRIED if topic.type == ODOMETRY else 0):
             try:
-                odometry_of(self.bag.decode(message), message.bag_time_ns)
+                self._reading_in(message)
             except ValueError as error:
                 errors.append(str(error))
             else:
@@ -208,11 +195,7 @@ class BagStream:
                 "driver publish whole turns, or record its laser scans"
             )
         is_in_sectors = are_sectors(scans)
-        if is_in_sectors:
-            joiner = SectorJoiner()
-            scans = [turn for sector in scans for turn in joiner.add(sector)] or list(joiner.flush())
-        usual = usual_beams([scan.beams for scan in scans])
-        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual), frame, is_in_sectors)
+        return RecordedLaser(topic, usual_scan(joined_turns(scans) if is_in_sectors else scans), frame, is_in_sectors)
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -220,27 +203,26 @@ class BagStream:
         return self._calibration_in(self.topics.camera_info)
 
     def _calibration_in(self, topic: Topic | None) -> Calibration | None:
-        for message in () if topic is None else self.bag.messages([topic]):
+        found = self._valid([topic] if topic else [], lambda message: calibration_of(self.bag.decode(message)))
+        return next(found, None)
+
+    def _valid(
+        self, topics: Sequence[Topic], convert: Callable[[RawMessage], Found], most: int | None = None, step: int = 1
+    ) -> Iterator[Found]:
+        """Every ``step``-th of the first messages of some topics, converted; invalid ones are left out."""
+        for message in islice(self.bag.messages(topics) if topics else (), 0, most, step):
             try:
-                return calibration_of(self.bag.decode(message))
+                found = convert(message)
             except ValueError:
                 continue
-        return None
+            yield found
 
     def entries(self, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         """Odometry, consistent scans with odometry, and images if asked, each with its message's number."""
-        gates = [ScanGate(laser.first.beams, audit) for laser in self.lasers]
-        items = merge_scans(self._joined(self._items(audit, with_images)), len(gates))
-        for number, entry in (without_odometry if self.odometry is None else pair_with_odometry)(items):
-            if not isinstance(entry, PosedScan):
-                if isinstance(entry, OdometryReading) and entry.is_after_jump:
-                    audit.add(Fault.ODOMETRY_JUMP, number)
-                yield number, entry
-            elif gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
-                if entry.fault is not None:
-                    audit.add(entry.fault, number)
-                if entry.fault is not Fault.NO_ODOMETRY:
-                    yield number, entry
+        gate = EntryGate((laser.first.beams for laser in self.lasers), audit)
+        items = merge_scans(self._joined(self._items(audit, with_images)), len(self.lasers))
+        entries = (without_odometry if self.odometry is None else pair_with_odometry)(items)
+        yield from ((number, entry) for number, entry in entries if gate.admits(number, entry))
 
     def _joined(self, items: Iterator[tuple[int, Message]]) -> Iterator[tuple[int, Message]]:
         """The items with the sectors of a turn joined to one scan."""
@@ -281,27 +263,18 @@ class BagStream:
         """Decode one message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
             scan = self._scan_in(message)
-            return [self._corrected(scan)._replace(laser=laser) for laser in self._lasers_of(message.topic, scan.frame)]
+            return [
+                self._corrected(scan)._replace(laser=number)
+                for number, laser in enumerate(self.lasers)
+                if laser.topic == message.topic and laser.frame in (None, scan.frame)
+            ]
         if message.topic == self.topics.camera:
             return [self._image_in(message)]
-        odometry = self.odometry
-        if odometry is None:
-            return []
-        if odometry.edge is None:
-            reading = odometry_of(self.bag.decode(message), message.bag_time_ns)
-            return [self._in_time(reading)] if odometry.base_frame in (None, reading.base_frame) else []
-        return [self._in_time(reading) for reading in odometry.readings_in(self._transforms_in(message))]
-
-    def _lasers_of(self, topic: Topic, frame: str) -> list[int]:
-        """The number of the laser whose scans in ``frame`` are on ``topic``; none if it is of another robot."""
-        return [
-            number for number, laser in enumerate(self.lasers) if laser.topic == topic and laser.frame in (None, frame)
-        ]
-
-    def _in_time(self, reading: OdometryReading) -> OdometryReading:
-        """The reading with its stamp by the clock of the scans."""
         ahead_s = self._clock_ahead_s + self._options.correction.odometry_delay_s
-        return reading._replace(stamp=reading.stamp - ahead_s)
+        return [
+            reading._replace(stamp=reading.stamp - ahead_s)
+            for reading in (self._readings_in(message, self.odometry) if self.odometry else ())
+        ]
 
     @cached_property
     def _clock_ahead_s(self) -> float:
@@ -310,10 +283,7 @@ class BagStream:
             return 0.0
         found = []
         for topics in (self.topics.scans[:1], self.odometry.topics):
-            lags_s: list[float] = []
-            for message in islice(self.bag.messages(list(topics)), _READINGS_TRIED):
-                with suppress(ValueError):
-                    lags_s += [message.bag_time_ns / 1e9 - stamp for stamp in self._ends_in(message)]
+            lags_s = list(chain.from_iterable(self._valid(topics, self._lags_s_in, _READINGS_TRIED)))
             if len(lags_s) < _FEWEST_LAGS:
                 return 0.0
             low_s, middle_s, high_s = quantiles(lags_s, n=4)
@@ -329,13 +299,13 @@ class BagStream:
         )
         return ahead_s
 
-    def _ends_in(self, message: RawMessage) -> list[float]:
-        """When a message of scans or odometry was complete, by its stamps; raises ValueError if it is invalid."""
+    def _lags_s_in(self, message: RawMessage) -> list[float]:
+        """How long before its recording a message of scans or odometry was complete, by its stamps."""
         if message.topic in self.topics.scans:
-            return [self._scan_in(message).end]
-        if message.topic.type == ODOMETRY:
-            return [odometry_of(self.bag.decode(message), message.bag_time_ns).stamp]
-        return [each.stamp for each in self.odometry.readings_in(self._transforms_in(message))] if self.odometry else []
+            ends_s = [self._scan_in(message).end]
+        else:
+            ends_s = [reading.stamp for reading in self._readings_in(message, self.odometry)] if self.odometry else []
+        return [message.bag_time_ns / 1e9 - end_s for end_s in ends_s]
 
     def _corrected(self, scan: ScanMessage) -> ScanMessage:
         """The scan with the times of its beams as they were found."""
@@ -351,7 +321,7 @@ class BagStream:
         return first.sweep if first.ranges_at_stamp is None else None
 
     @cached_property
-    def odometry(self) -> "OdometryInput | None":
+    def odometry(self) -> OdometryInput | None:
         """The odometry that is read: the chosen topic, else tf; one that says nothing is none."""
         if self._options.odom_topic == NO_ODOMETRY:
             return None
@@ -374,7 +344,7 @@ class BagStream:
             for scan in islice(scans, None, None, _STRIDE)
         )
 
-    def _odometry_candidates(self) -> Iterator["OdometryInput"]:
+    def _odometry_candidates(self) -> Iterator[OdometryInput]:
         """The chosen topic of odometry, then tf.
 
         Raises:
@@ -417,24 +387,23 @@ class BagStream:
             "laser is on; choose one by --sensors base-frame"
         )
 
-    def _poses_of(self, odometry: "OdometryInput") -> Iterator[Pose]:
-        for message in self.bag.messages(odometry.topics):
-            with suppress(ValueError):
-                if odometry.edge is not None:
-                    yield from (each.T_odom_base for each in odometry.readings_in(self._transforms_in(message)))
-                else:
-                    yield odometry_of(self.bag.decode(message), message.bag_time_ns).T_odom_base
+    def _poses_of(self, odometry: OdometryInput) -> Iterator[Pose]:
+        readings = self._valid(odometry.topics, lambda message: self._readings_in(message, odometry))
+        return (reading.T_odom_base for reading in chain.from_iterable(readings))
 
-    def _transforms_in(self, message: RawMessage) -> list[StampedTransform]:
-        return list(transforms_of(self.bag.decode(message), message.bag_time_ns))
+    def _readings_in(self, message: RawMessage, odometry: OdometryInput) -> list[OdometryReading]:
+        """The readings of an odometry in one of its messages; raises ValueError if it is invalid."""
+        if odometry.edge is None:
+            reading = self._reading_in(message)
+            return [reading] if odometry.base_frame in (None, reading.base_frame) else []
+        transforms = list(transforms_of(self.bag.decode(message), message.bag_time_ns))
+        return [odometry_in(each) for each in transforms if (each.parent, each.child) == odometry.edge]
+
+    def _reading_in(self, message: RawMessage) -> OdometryReading:
+        return odometry_of(self.bag.decode(message), message.bag_time_ns)
 
     def _scans_of(self, topic: Topic) -> Iterator[ScanMessage]:
-        for message in self.bag.messages([topic]):
-            try:
-                scan = self._scan_in(message)
-            except ValueError:
-                continue
-            yield scan
+        return self._valid([topic], self._scan_in)
 
     def _scan_in(self, message: RawMessage) -> ScanMessage:
         """Decode a laser scan, a point cloud or a depth image; raises ValueError if it is invalid."""
@@ -478,22 +447,21 @@ class BagStream:
         return mounting._replace(rotation=found @ mounting.rotation)
 
     def _some_clouds(self, topic: Topic, frame: str) -> Iterator[PointCloud]:
+        calibration = self._depth_calibrations[topic]
+
+        def convert(message: RawMessage) -> CloudMessage:
+            return cloud_of(self.bag.decode(message), topic.type, message.bag_time_ns, calibration)
+
         step = max(1, min(topic.message_count, _CLOUDS_TRIED) // _CLOUDS_FOR_FLOOR)
-        for message in islice(self.bag.messages([topic]), 0, _CLOUDS_TRIED, step):
-            with suppress(ValueError):
-                calibration = self._depth_calibrations[topic]
-                cloud = cloud_of(self.bag.decode(message), topic.type, message.bag_time_ns, calibration)
-                if cloud.frame == frame:
-                    yield cloud.cloud
+        clouds = self._valid([topic], convert, _CLOUDS_TRIED, step)
+        return (found.cloud for found in clouds if found.frame == frame)
 
     def _base_frame_of(self, frame: str) -> str:
         """The base of the robot with ``frame``, before its lasers are known."""
         bases = [self._options.base_frame]
         for topic in (topic for topic in self.topics.odometry if topic.type == ODOMETRY):
             bases.append(self._base_frame(topic))
-            for message in islice(self.bag.messages([topic]), _READINGS_TRIED):
-                with suppress(ValueError):
-                    bases.append(odometry_of(self.bag.decode(message), message.bag_time_ns).base_frame)
+            bases += [reading.base_frame for reading in self._valid([topic], self._reading_in, _READINGS_TRIED)]
         link = self.tree.odometry_link(frame, self._options.odom_frame)
         usual_ones = [each for each in USUAL_BASES if each in self.tree]
         return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
@@ -512,13 +480,7 @@ class BagStream:
 
     def _has_images(self, topic: Topic) -> bool:
         """Whether one of the first messages is a readable image; depth images are not."""
-        for message in islice(self.bag.messages([topic]), _IMAGES_TRIED):
-            try:
-                self._image_in(message)
-            except ValueError:
-                continue
-            return True
-        return False
+        return next(self._valid([topic], self._image_in, _IMAGES_TRIED), None) is not None
 
     def _field_of_view_rad(self, topic: Topic) -> float:
         """Of the topic's first scan; 0 if it cannot be read; a full turn of a point cloud."""

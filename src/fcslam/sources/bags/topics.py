@@ -83,7 +83,7 @@ def choose_topics(
         bare = [topic.name for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
         remedy = "record them"
         if bare:
-            remedy = f"the depth images of {bare[0]} need their {_info_name(bare[0])}"
+            remedy = f"the depth images of {bare[0]} need their {info_beside(bare[0])}"
         if packed:
             remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
         raise SourceError(
@@ -102,16 +102,13 @@ def choose_topics(
     if wanted is not None:
         able = [topic for topic in heard if topic.type == ODOMETRY or is_transforms(topic)]
     odometries = [] if wanted == NO_ODOMETRY else _candidates(robot, able, wanted, "--sensors odom-topic")
-    camera, camera_info, camera_notes = _choose_camera(robot, options.camera_topic, has_images)
-    notes = [*camera_notes]
+    camera, camera_info, notes = _choose_camera(robot, options.camera_topic, has_images)
     if not options.scan_topics:
-        notes = [*_note(robot, "laser scans", "--sensors scan-topic", lasers[0], scans), *camera_notes]
-    measured = [topic for topic in odometries if topic.type == ODOMETRY]
-    if not measured:
-        return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
-    odometry = _best_odometry(measured)
-    notes += _note(robot, "odometry", "--sensors odom-topic", odometry, measured)
-    return Topics(tuple(lasers), (odometry,), transforms, camera, camera_info, tuple(notes))
+        notes = [*_note(robot, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
+    if measured := [topic for topic in odometries if topic.type == ODOMETRY]:
+        odometries = [_best_odometry(measured)]
+        notes += _note(robot, "odometry", "--sensors odom-topic", odometries[0], measured)
+    return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
 
 
 def find_candidates(
@@ -160,18 +157,15 @@ def _heard(robot: BagRobot) -> list[Topic]:
 
 
 def _scans(robot: BagRobot) -> list[Topic]:
-    return [topic for topic in _heard(robot) if topic.type in SCANS or _is_depth(topic, robot)]
+    depths = [each for each in _heard(robot) if each.type == IMAGE and is_depth(each.name)]
+    calibrated = [each for each in depths if calibration_beside(each, robot)]
+    return [topic for topic in _heard(robot) if topic.type in SCANS or topic in calibrated]
 
 
 def _preferred(scans: Sequence[Topic]) -> list[Topic]:
     """The laser scans, else the point clouds, else the depth images."""
     kinds = ([topic for topic in scans if topic.type in types] for types in (LASER_SCANS, SCANS, (IMAGE,)))
     return next(filter(None, kinds), [])
-
-
-def _is_depth(topic: Topic, robot: BagRobot) -> bool:
-    """Whether a topic is named as one of depth images, and has their calibration beside it."""
-    return topic.type == IMAGE and is_depth(topic.name) and calibration_beside(topic, robot) is not None
 
 
 def _measured(robot: BagRobot) -> list[Topic]:
@@ -206,10 +200,8 @@ def _best_odometry(measured: Sequence[Topic]) -> Topic:
 
 
 def _fleet_note(what: str, option: str, chosen: Topic, candidates: Sequence[Sequence[Topic]]) -> list[str]:
-    others = sorted({topic.name for own in candidates for topic in own} - {chosen.name})
-    if not others:
-        return []
-    return [f"all bags: reads {what} from {chosen.name}, not from {', '.join(others)} ({option} chooses)"]
+    others = ", ".join(sorted({topic.name for own in candidates for topic in own} - {chosen.name}))
+    return [f"all bags: reads {what} from {chosen.name}, not from {others} ({option} chooses)"] * bool(others)
 
 
 def _choose_camera(
@@ -220,19 +212,13 @@ def _choose_camera(
     cameras = [topic for topic in _candidates(robot, images, wanted, "--sensors camera-topic") if has_images(topic)]
     if not cameras:
         names = ", ".join(topic.name for topic in images)
-        return (
-            None,
-            None,
-            [f"{robot.bag.path}: no images of {names} can be read, the camera is left out"] if images else [],
-        )
+        note = f"{robot.bag.path}: no images of {names} can be read, the camera is left out"
+        return None, None, [note] * bool(images)
     info_of = {camera: _calibration_of(camera, robot) for camera in cameras}
     chosen = min(cameras, key=lambda topic: (info_of[topic] is None, *_camera_rank(topic)))
     if info_of[chosen] is None:
-        return (
-            None,
-            None,
-            [f"{robot.bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"],
-        )
+        note = f"{robot.bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"
+        return None, None, [note]
     return chosen, info_of[chosen], _note(robot, "images", "--sensors camera-topic", chosen, cameras)
 
 
@@ -254,13 +240,13 @@ def _calibration_of(camera: Topic, robot: BagRobot) -> Topic | None:
 
 def calibration_beside(camera: Topic, robot: BagRobot) -> Topic | None:
     """The calibration topic beside the images."""
-    name = slashed(_info_name(camera.name))
+    name = slashed(info_beside(camera.name))
     infos = (topic for topic in _heard(robot) if topic.type == CAMERA_INFO)
     return next((info for info in infos if slashed(info.name) == name), None)
 
 
-def _info_name(images: str) -> str:
-    """The name of the calibration topic beside the images of a topic."""
+def info_beside(images: str) -> str:
+    """The topic of the calibration of the camera with these images."""
     return images.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
 
 
@@ -285,9 +271,8 @@ def _candidates(robot: BagRobot, candidates: Sequence[Topic], wanted: str | None
 
 def _note(robot: BagRobot, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
     others = ", ".join(topic.name for topic in candidates if topic != chosen)
-    return (
-        [f"{robot.bag.path}: reads {what} from {chosen.name}, not from {others} ({option} chooses)"] if others else []
-    )
+    note = f"{robot.bag.path}: reads {what} from {chosen.name}, not from {others} ({option} chooses)"
+    return [note] * bool(others)
 
 
 def _known(topics: Sequence[Topic]) -> str:

@@ -79,14 +79,14 @@ class TransformTree:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Transform]] = {}
         self._moving: set[str] = set()
-        self._links: dict[Link, Transform | None] = {}
-        """The first transform of each link; None if it moves."""
+        self.links: dict[Link, Transform | None] = {}
+        """The first transform of each link, in the order in which they appeared; None if it moves."""
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Add a transform. The first one counts; a frame whose transform changes later is moving."""
-        of_link = self._links.setdefault((parent, child), T_parent_child)
+        of_link = self.links.setdefault((parent, child), T_parent_child)
         if of_link is not None and differ(of_link, T_parent_child):
-            self._links[parent, child] = None
+            self.links[parent, child] = None
         first_parent, first = self._parents.setdefault(child, (parent, T_parent_child))
         if first is not T_parent_child and (parent != first_parent or differ(first, T_parent_child)):
             self._moving.add(child)
@@ -100,10 +100,10 @@ class TransformTree:
         Raises:
             NoTransformError: the frames are not connected, or one moves against the other.
         """
-        parents = [parent for parent, child in self._links if child == frame]
+        parents = [parent for parent, child in self.links if child == frame]
         if frame != base and len(parents) > 1:
             own = [parent for parent in parents if base in self._above(parent)]
-            T_parent_frame = self._links[own[0], frame] if len(own) == 1 else None
+            T_parent_frame = self.links[own[0], frame] if len(own) == 1 else None
             if T_parent_frame is None:
                 raise NoTransformError(
                     f"no fixed transform from '{base}' to '{frame}' ('{frame}' is in '{parents[0]}' and in "
@@ -128,13 +128,10 @@ class TransformTree:
 
         On the way up from ``frame``, it is the first whose parent has "odom" in its name. Without one, it is the first
         that moves and is neither a joint of the robot nor its pose in a map. The parent is empty if none fits; the
-        child is then the last frame to which ``frame`` is fixed.
-
-        Args:
-            frame: any of the robot.
-            odom_frame, base_frame: names of the parent and the child; None: any.
+        child is then the last frame to which ``frame`` is fixed. ``odom_frame`` and ``base_frame`` name the parent and
+        the child; None: any.
         """
-        above = [link for child in self._above(frame) for link in self._links if link[1] == child]
+        above = [link for child in self._above(frame) for link in self.links if link[1] == child]
         above = [link for link in above if _matches(link, odom_frame, base_frame)]
         named = [link for link in above if is_odom(link[0])]
         moving = [link for link in above if link[1] in self._moving and last_part(link[0]) not in _NO_ODOMETRY]
@@ -149,16 +146,11 @@ class TransformTree:
         link = self.robot(frame, odom_frame, base_frame)
         if link[0]:
             return link
-        unconnected = [] if frame in self else self._links
+        unconnected = [] if frame in self else self.links
         if odom_frame or base_frame:
             return next((each for each in unconnected if _matches(each, odom_frame, base_frame)), None)
-        bases = (each for each in self._links if is_odom(each[0]) and last_part(each[1]) in USUAL_BASES)
+        bases = (each for each in self.links if is_odom(each[0]) and last_part(each[1]) in USUAL_BASES)
         return next(bases, next((each for each in unconnected if is_odom(each[0])), None))
-
-    @property
-    def links(self) -> tuple[Link, ...]:
-        """Parent and child of all transforms, in the order in which they appeared."""
-        return tuple(self._links)
 
     def _above(self, frame: str) -> Iterator[str]:
         """The frame and its ancestors; a cycle ends where it closes."""

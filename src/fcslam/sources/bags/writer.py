@@ -43,21 +43,10 @@ BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
 
 _ODOM, _BASE, _LASER, _CAMERA, _BUILDING = "odom", "base_link", "laser", "camera_optical_frame", "building"
 _GNSS = "gnss"
-_SCAN_TOPIC, _FIX_TOPIC = "/scan", "/fix"
-_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, _SCAN_TOPIC: SCAN}
-"""Odometry first: at equal times it is read before the scan."""
-_IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
-    "/camera/image_raw/compressed",
-    "/camera/camera_info",
-    "/ground_truth",
-)
-_TOPICS_OF_SOME = {
-    _IMAGE_TOPIC: COMPRESSED_IMAGE,
-    _CAMERA_INFO_TOPIC: CAMERA_INFO,
-    _GROUND_TRUTH_TOPIC: ODOMETRY,
-    _FIX_TOPIC: FIX,
-}
-"""Topics that are created only if there is a message."""
+_SCAN_TOPIC = "/scan"
+_FIRST_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, _SCAN_TOPIC: SCAN}
+"""Odometry first: at equal times it is read before the scan. Other topics begin with their first message."""
+_IMAGE_TOPIC, _CAMERA_INFO_TOPIC = "/camera/image_raw/compressed", "/camera/camera_info"
 _IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31
 _NANOSECONDS = 10**9
@@ -121,7 +110,7 @@ class _Bag:
     def __init__(self, writer: "Writer1 | Writer2", ros1: bool) -> None:
         self._writer: Any = writer
         self._codec = MessageCodec(ros1)
-        self._connections = {topic: self._connect(topic, kind) for topic, kind in _TOPICS.items()}
+        self._connections = {topic: self._connect(topic, kind) for topic, kind in _FIRST_TOPICS.items()}
         self._bag_time_ns = -1
         self._mounted: set[str] = set()
         self._mountings: list[tuple[float, float, float]] = []
@@ -134,7 +123,7 @@ class _Bag:
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
         if isinstance(item, GroundTruth):
             header = self._codec.header(stamp_ns, _BUILDING)
-            self._put(_GROUND_TRUTH_TOPIC, self._odometry(header, item.T_building_base))
+            self._put("/ground_truth", ODOMETRY, self._odometry(header, item.T_building_base))
             return
         if isinstance(item, GnssFix):
             self._put_fix(stamp_ns, item)
@@ -150,8 +139,8 @@ class _Bag:
         reading = (stamp_ns, *T_odom_base.tolist())
         if reading != self._latest_reading:
             odom = self._codec.header(stamp_ns, _ODOM)
-            self._put("/odom", self._odometry(odom, T_odom_base))
-            self._put("/tf", self._codec.transforms(odom, _BASE, in_space(T_odom_base)))
+            self._put("/odom", ODOMETRY, self._odometry(odom, T_odom_base))
+            self._put("/tf", TRANSFORMS, self._codec.transforms(odom, _BASE, in_space(T_odom_base)))
             self._latest_reading = reading
 
     def _put_scan(self, stamp_ns: int, scan: LaserScan) -> None:
@@ -164,7 +153,7 @@ class _Bag:
         self._mount(stamp_ns, _LASER + suffix, in_space(np.array(T_base_laser)))
         begin_s = 0.0 if scan.sweep is None else min(scan.sweep.first_s, scan.sweep.last_s)
         header = self._codec.header(stamp_ns + round(begin_s * _NANOSECONDS), _LASER + suffix)
-        self._put(_SCAN_TOPIC + suffix, self._scan(header, scan), SCAN)
+        self._put(_SCAN_TOPIC + suffix, SCAN, self._scan(header, scan))
 
     def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
         try:
@@ -173,35 +162,40 @@ class _Bag:
             raise OutputError(f"an image at {image.stamp} s cannot be written ({error})") from error
         header = self._codec.header(stamp_ns, _CAMERA)
         self._mount(stamp_ns, _CAMERA, image.camera.T_base_camera)
-        self._put(_CAMERA_INFO_TOPIC, self._camera_info(header, image.camera))
+        self._put(_CAMERA_INFO_TOPIC, CAMERA_INFO, self._camera_info(header, image.camera))
         data = np.frombuffer(image.encoded, dtype=np.uint8)
-        self._put(_IMAGE_TOPIC, self._codec.make(COMPRESSED_IMAGE, header=header, format=encoding, data=data))
+        self._put(
+            _IMAGE_TOPIC,
+            COMPRESSED_IMAGE,
+            self._codec.make(COMPRESSED_IMAGE, header=header, format=encoding, data=data),
+        )
 
     def _put_fix(self, stamp_ns: int, fix: GnssFix) -> None:
         header, make = self._codec.header(stamp_ns, _GNSS), self._codec.make
         self._mount(stamp_ns, _GNSS, in_space(np.array((*fix.antenna_xy, 0.0))))
-        position = {"latitude": fix.latitude_deg, "longitude": fix.longitude_deg, "altitude": fix.altitude_m}
         message = make(
             FIX,
             header=header,
             status=make("sensor_msgs/NavSatStatus", status=0, service=1),
-            **position,
+            latitude=fix.latitude_deg,
+            longitude=fix.longitude_deg,
+            altitude=fix.altitude_m,
             position_covariance=fix.sigma_m**2 * np.eye(3).ravel(),
             position_covariance_type=2,
         )
-        self._put(_FIX_TOPIC, message)
+        self._put("/fix", FIX, message)
 
     def _mount(self, stamp_ns: int, frame: str, T_base_frame: Transform) -> None:
         """Write the mounting of a sensor once."""
         if frame not in self._mounted:
-            self._put("/tf_static", self._codec.transforms(self._codec.header(stamp_ns, _BASE), frame, T_base_frame))
+            header = self._codec.header(stamp_ns, _BASE)
+            self._put("/tf_static", TRANSFORMS, self._codec.transforms(header, frame, T_base_frame))
             self._mounted.add(frame)
 
     def _connect(self, topic: str, kind: str) -> Any:
         return self._writer.add_connection(topic, full_name(kind), typestore=self._codec.store)
 
-    def _put(self, topic: str, message: Any, kind: str = "") -> None:
-        kind = kind or _TOPICS.get(topic) or _TOPICS_OF_SOME[topic]
+    def _put(self, topic: str, kind: str, message: Any) -> None:
         if topic not in self._connections:
             self._connections[topic] = self._connect(topic, kind)
         self._writer.write(self._connections[topic], self._bag_time_ns, self._codec.encode(message, kind))

@@ -17,11 +17,11 @@ TRUEPOS ...) are passed over; a line that starts with no message name is broken.
 
 import re
 from collections.abc import Callable
+from math import nan
 
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams
 from fcslam.sources.logs.dialect import (
-    UNTIMED_STEP_S,
     Dialect,
     Line,
     OdometryLine,
@@ -50,14 +50,15 @@ _KNOWN = re.compile(
 
 
 class _CarmenParser:
-    """Holds the latest odometry, and counts the scans without a time."""
+    """Holds the latest odometry."""
 
     def __init__(self, raw: bool = False) -> None:
         """``raw``: scans are RAWLASER1 only."""
         self._T_odom_base: Pose | None = None
-        self._untimed = 0
         self._parsers: dict[bytes, Callable[[bytes], Line]] = {
-            **({b"RAWLASER1": self._rawlaser} if raw else {b"FLASER": self._flaser, b"ROBOTLASER1": _parse_robotlaser}),
+            **(
+                {b"RAWLASER1": self._rawlaser} if raw else {b"FLASER": _parse_flaser, b"ROBOTLASER1": _parse_robotlaser}
+            ),
             b"ODOM": self._odometry,
             b"PARAM": _parse_parameter,
         }
@@ -69,50 +70,48 @@ class _CarmenParser:
         parser = self._parsers.get(message[1])
         return parser(with_points(line)) if parser else None
 
-    def _flaser(self, line: bytes) -> ScanLine:
-        front, *tail = line.rsplit(None, 9)
-        _, count, range_text = front.split(None, 2)
-        beam_count = int(count)
-        is_timed = has_beams(range_text, beam_count)
-        if not is_timed:
-            front, *tail = line.rsplit(None, 6)
-            _, _, range_text = front.split(None, 2)
-        check_beams(range_text, beam_count)
-        stamp = stamp_of(tail[6]) if is_timed else self._next_stamp()
-        return ScanLine(stamp, pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text, is_timed=is_timed)
-
     def _rawlaser(self, line: bytes) -> ScanLine:
         front, *tail = line.rsplit(None, 3)
-        _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
-        beam_count = int(count)
-        range_text = _without_remissions(body, beam_count)
-        check_beams(range_text, beam_count)
-        stated = _stated_laser(int(kind), [float(token) for token in (start, fov, resolution, max_range)], beam_count)
+        measured = _measured(front)
         if self._T_odom_base is None:
             raise ValueError("no odometry before the scan")
-        return ScanLine(stamp_of(tail[0]), self._T_odom_base, self._T_odom_base, beam_count, range_text, stated)
+        return ScanLine(stamp_of(tail[0]), self._T_odom_base, self._T_odom_base, *measured)
 
     def _odometry(self, line: bytes) -> OdometryLine:
         words = line.split()
         if len(words) < 7:
             raise ValueError("too few words")
         self._T_odom_base = pose_of(words[1:4])
-        is_timed = len(words) >= 10
-        return OdometryLine(stamp_of(words[7]) if is_timed else self._untimed * UNTIMED_STEP_S, self._T_odom_base)
+        return OdometryLine(stamp_of(words[7]) if len(words) >= 10 else nan, self._T_odom_base)
 
-    def _next_stamp(self) -> float:
-        self._untimed += 1
-        return (self._untimed - 1) * UNTIMED_STEP_S
+
+def _parse_flaser(line: bytes) -> ScanLine:
+    front, *tail = line.rsplit(None, 9)
+    _, count, range_text = front.split(None, 2)
+    beam_count = int(count)
+    is_timed = has_beams(range_text, beam_count)
+    if not is_timed:
+        front, *tail = line.rsplit(None, 6)
+        _, _, range_text = front.split(None, 2)
+    check_beams(range_text, beam_count)
+    stamp = stamp_of(tail[6]) if is_timed else nan
+    return ScanLine(stamp, pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text)
 
 
 def _parse_robotlaser(line: bytes) -> ScanLine:
     front, *tail = line.rsplit(None, 14)
+    measured = _measured(front)
+    return ScanLine(stamp_of(tail[11]), pose_of(tail[3:6]), pose_of(tail[:3]), *measured)
+
+
+def _measured(front: bytes) -> tuple[int, bytes, StatedLaser]:
+    """Number of beams, ranges and laser in a line up to its remissions."""
     _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
     beam_count = int(count)
     range_text = _without_remissions(body, beam_count)
     check_beams(range_text, beam_count)
-    stated = _stated_laser(int(kind), [float(token) for token in (start, fov, resolution, max_range)], beam_count)
-    return ScanLine(stamp_of(tail[11]), pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text, stated)
+    numbers = [float(token) for token in (start, fov, resolution, max_range)]
+    return beam_count, range_text, _stated_laser(int(kind), numbers, beam_count)
 
 
 def _without_remissions(body: bytes, beam_count: int) -> bytes:
@@ -141,9 +140,9 @@ def _parse_parameter(line: bytes) -> ParameterLine:
     return ParameterLine(name, value)
 
 
-def _is_raw(head: bytes) -> bool:
-    return _RAW.search(head) is not None and _SCAN.search(head) is None
-
-
-CARMEN = Dialect("CARMEN log", lambda head: _KNOWN.search(head) is not None, _CarmenParser)
-RAW_CARMEN = Dialect("CARMEN log of raw scans", _is_raw, lambda: _CarmenParser(raw=True))
+CARMEN = Dialect("CARMEN log", _KNOWN.search, _CarmenParser)
+RAW_CARMEN = Dialect(
+    "CARMEN log of raw scans",
+    lambda head: _RAW.search(head) and not _SCAN.search(head),
+    lambda: _CarmenParser(raw=True),
+)

@@ -66,7 +66,7 @@ def _lines(records: Iterable[SensorRecord]) -> Iterator[str]:
         if isinstance(record, LaserScan) and record.laser.T_base_laser == (scans or [record])[0].laser.T_base_laser:
             scans.append(record)
     laser = scans[0].laser if scans else None
-    is_default = laser is not None and _is_default(laser) and all(scan.laser == laser for scan in scans)
+    is_default = all(scan.laser == _default(scan.laser) == laser for scan in scans)
     for record in chain(first, remaining):
         match record:
             case Odometry():
@@ -75,8 +75,8 @@ def _lines(records: Iterable[SensorRecord]) -> Iterator[str]:
                 yield _line(record, is_default and record.laser == laser)
 
 
-def _is_default(laser: LaserModel) -> bool:
-    return (laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m) == assumed_laser(laser.beam_count)
+def _default(laser: LaserModel) -> LaserModel:
+    return LaserModel(laser.beam_count, *assumed_laser(laser.beam_count), laser.T_base_laser)
 
 
 def _line(record: LaserScan | Odometry, is_default: bool = False) -> str:

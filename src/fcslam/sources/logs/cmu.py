@@ -45,4 +45,4 @@ def _parse_laser(line: bytes) -> ScanLine:
     return ScanLine(stamp_of(stamp), pose_of(poses[:3], _METRES), pose_of(poses[3:], _METRES), beam_count, range_text)
 
 
-CMU = Dialect("CMU log", lambda head: _KNOWN.search(head) is not None, lambda: _parse, _METRES)
+CMU = Dialect("CMU log", _KNOWN.search, lambda: _parse, _METRES)

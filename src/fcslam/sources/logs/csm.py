@@ -10,11 +10,12 @@ timestamps, scans are 1 s apart.
 
 import json
 import re
+from math import nan
 from typing import Any
 
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams
-from fcslam.sources.logs.dialect import UNTIMED_STEP_S, Dialect, ScanLine, StatedLaser, check_beams, stamp_of
+from fcslam.sources.logs.dialect import Dialect, ScanLine, StatedLaser, check_beams, stamp_of
 from fcslam.sources.logs.laser import SICK_MAX_RANGE_M
 from fcslam.sources.pose import Pose
 
@@ -22,52 +23,40 @@ _KNOWN = re.compile(rb'^\s*\{.*"(nrays|readings)"\s*:', re.MULTILINE)
 _MAX_COORDINATE = 1e7
 
 
-class _CsmParser:
-    """Counts the scans without a time."""
+def _parse(line: bytes) -> ScanLine | None:
+    if not line.strip():
+        return None
+    try:
+        return _scan(json.loads(line))
+    except (KeyError, TypeError, IndexError, RecursionError) as error:
+        raise ValueError("no scan of csm") from error
 
-    def __init__(self) -> None:
-        self._untimed = 0
 
-    def __call__(self, line: bytes) -> ScanLine | None:
-        if not line.strip():
-            return None
-        try:
-            content = json.loads(line)
-            return self._scan(content)
-        except (KeyError, TypeError, IndexError, RecursionError) as error:
-            raise ValueError("no scan of csm") from error
+def _scan(content: Any) -> ScanLine:
+    readings = content["readings"]
+    count = len(readings)
+    valid = content.get("valid") or [1] * count
+    if len(valid) != count or content.get("nrays", count) != count:
+        raise ValueError("not as many readings as stated")
+    values = [float(value) if value is not None and ok else 0.0 for value, ok in zip(readings, valid, strict=True)]
+    theta = content.get("theta") or [content["min_theta"], content["max_theta"]]
+    first_rad, last_rad = float(theta[0]), float(theta[-1])
+    if last_rad < first_rad:
+        first_rad, last_rad, values = last_rad, first_rad, values[::-1]
+    increment_rad = (last_rad - first_rad) / (count - 1) if count > 1 else 0.0
+    if not is_field_of_view(Beams(count, first_rad, increment_rad)):
+        raise ValueError("no sane field of view")
+    text = b" ".join(b"%r" % (value if value > 0.0 else 0.0) for value in values)  # NaN is not a return
+    check_beams(text, count)
+    pose, stamp = _pose(content.get("odometry")), _stamp(content.get("timestamp"))
+    return ScanLine(stamp, pose, pose, count, text, StatedLaser(first_rad, increment_rad, SICK_MAX_RANGE_M))
 
-    def _scan(self, content: Any) -> ScanLine:
-        readings = content["readings"]
-        count = len(readings)
-        valid = content.get("valid") or [1] * count
-        if len(valid) != count or content.get("nrays", count) != count:
-            raise ValueError("not as many readings as stated")
-        values = [float(value) if value is not None and ok else 0.0 for value, ok in zip(readings, valid, strict=True)]
-        theta = content.get("theta") or [content["min_theta"], content["max_theta"]]
-        first_rad, last_rad = float(theta[0]), float(theta[-1])
-        if last_rad < first_rad:
-            first_rad, last_rad, values = last_rad, first_rad, values[::-1]
-        increment_rad = (last_rad - first_rad) / (count - 1) if count > 1 else 0.0
-        if not is_field_of_view(Beams(count, first_rad, increment_rad)):
-            raise ValueError("no sane field of view")
-        text = b" ".join(b"%r" % (value if value > 0.0 else 0.0) for value in values)  # NaN is not a return
-        check_beams(text, count)
-        pose = _pose(content.get("odometry"))
-        stamp = self._stamp(content.get("timestamp"))
-        is_timed = stamp is not None
-        if stamp is None:
-            stamp = self._untimed * UNTIMED_STEP_S
-            self._untimed += 1
-        stated = StatedLaser(first_rad, increment_rad, SICK_MAX_RANGE_M)
-        return ScanLine(stamp, pose, pose, count, text, stated, is_timed=is_timed)
 
-    @staticmethod
-    def _stamp(stated: Any) -> float | None:
-        if not stated or not any(parts := stated if isinstance(stated, list) else [stated]):
-            return None
-        seconds, microseconds = (*parts, 0)[:2]
-        return stamp_of(str(seconds).encode()) + stamp_of(str(microseconds).encode()) * 1e-6
+def _stamp(stated: Any) -> float:
+    if not stated or not any(parts := stated if isinstance(stated, list) else [stated]):
+        return nan
+    seconds, microseconds = (*parts, 0)[:2]
+    return stamp_of(str(seconds).encode()) + stamp_of(str(microseconds).encode()) * 1e-6
 
 
 def _pose(stated: Any) -> Pose:
@@ -79,4 +68,4 @@ def _pose(stated: Any) -> Pose:
     return x, y, theta
 
 
-CSM = Dialect("csm log", lambda head: _KNOWN.search(head) is not None, _CsmParser)
+CSM = Dialect("csm log", _KNOWN.search, lambda: _parse)

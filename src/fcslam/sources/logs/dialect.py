@@ -25,6 +25,7 @@ class ScanLine(NamedTuple):
     """One scan, its ranges as text."""
 
     stamp: float
+    """Seconds; NaN if the log states none."""
     T_odom_base: Pose
     T_odom_laser: Pose
     beam_count: int
@@ -33,13 +34,14 @@ class ScanLine(NamedTuple):
     ranges_m: Ranges | None = None
     """The ranges, if they are parsed already, shape (beam_count,)."""
     is_timed: bool = True
-    """Whether the log states the stamp; otherwise the parser makes it, ``UNTIMED_STEP_S`` after the scan before."""
+    """False once a stamp stands where the log states none."""
 
 
 class OdometryLine(NamedTuple):
     """One reading of the odometry."""
 
     stamp: float
+    """As in ``ScanLine``."""
     T_odom_base: Pose
 
 
@@ -62,15 +64,11 @@ class Dialect:
     """A kind of text log and its parser."""
 
     name: str
-    recognises: Callable[[bytes], bool]
-    """Whether a log that starts with these bytes is of this kind."""
+    recognises: Callable[[bytes], object]
+    """True of the first bytes of a log of this kind."""
     parser: Callable[[], LineParser]
     """Makes a parser for one pass over a log; a line may depend on the lines before it."""
     metres_per_range_unit: float = 1.0
-
-
-UNTIMED_STEP_S = 1.0
-"""Time between the scans of a log that states none."""
 
 
 def pose_of(tokens: list[bytes], metres_per_unit: float = 1.0) -> Pose:

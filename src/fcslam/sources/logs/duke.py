@@ -8,17 +8,9 @@ A scan takes the pose of the odometry before it. Its 181 beams are a SICK's over
 """
 
 import re
-from math import cos, pi, sin
+from math import cos, nan, pi, sin
 
-from fcslam.sources.logs.dialect import (
-    UNTIMED_STEP_S,
-    Dialect,
-    ScanLine,
-    StatedLaser,
-    check_beams,
-    pose_of,
-    with_points,
-)
+from fcslam.sources.logs.dialect import Dialect, ScanLine, StatedLaser, check_beams, pose_of, with_points
 from fcslam.sources.pose import Pose
 
 _LASER_AHEAD_M = 0.40
@@ -29,11 +21,10 @@ _KNOWN = re.compile(rb"^(Odometry(" + _NUMBER + rb"){3}\s*$|Laser[ \t]+[0-9]+(" 
 
 
 class _DukeParser:
-    """Holds the latest odometry and counts the scans, which are the log's only clock."""
+    """Holds the latest odometry."""
 
     def __init__(self) -> None:
         self._T_odom_base: Pose | None = None
-        self._scan_count = 0
 
     def __call__(self, line: bytes) -> ScanLine | None:
         line = with_points(line)
@@ -52,12 +43,10 @@ class _DukeParser:
         check_beams(range_text, beam_count)
         if self._T_odom_base is None:
             raise ValueError("no odometry before the scan")
-        stamp = self._scan_count * UNTIMED_STEP_S
-        self._scan_count += 1
         geometry = StatedLaser(-pi / 2.0, pi / (beam_count - 1), _MAX_RANGE_M)
         x, y, theta = self._T_odom_base
         T_odom_laser = x + _LASER_AHEAD_M * cos(theta), y + _LASER_AHEAD_M * sin(theta), theta
-        return ScanLine(stamp, self._T_odom_base, T_odom_laser, beam_count, range_text, geometry, is_timed=False)
+        return ScanLine(nan, self._T_odom_base, T_odom_laser, beam_count, range_text, geometry)
 
 
-DUKE = Dialect("DP-SLAM log", lambda head: _KNOWN.search(head) is not None, _DukeParser)
+DUKE = Dialect("DP-SLAM log", _KNOWN.search, _DukeParser)

@@ -23,14 +23,16 @@ from math import degrees, isfinite, radians
 from typing import NamedTuple
 
 from fcslam.records import Beams, LaserModel
-from fcslam.sources.gate import usual_beams
+from fcslam.sources.gate import TOLERATED_SHARE, usual_beams
 from fcslam.sources.logs.dialect import ScanLine, StatedLaser
-from fcslam.sources.pose import Pose
+from fcslam.sources.pose import Pose, relative_pose
 
 SICK_MAX_RANGE_M = 50.0
 FEWEST_INTERLEAVED = 2
 """Least number of scans with each of two counts, among the first ones, of a scanner that interleaves."""
 
+_MOUNTING_TOLERANCE = 0.01
+"""Largest difference between the mountings of two scans, in metres or radians."""
 _FULL_TURN_DEG = 360.0
 _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
@@ -94,8 +96,48 @@ class LogBeams:
         return Beams(scan.beam_count, first_rad + share * increment_rad, increment_rad)
 
 
-def laser_model(scan: ScanLine, parameters: Mapping[str, str], T_base_laser: Pose) -> LaserModel:
+class MountingEstimate:
+    """Estimates the mounting of the laser from the two poses of every scan."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._first: Pose | None = None
+        self._differing = 0
+
+    def add(self, scan: ScanLine) -> None:
+        """Add one scan."""
+        pose = (0.0, 0.0, 0.0)
+        if scan.T_odom_laser != scan.T_odom_base:
+            pose = relative_pose(scan.T_odom_base, scan.T_odom_laser)
+        self._count += 1
+        self._first = self._first or pose
+        if pose != self._first and max(map(abs, relative_pose(self._first, pose))) > _MOUNTING_TOLERANCE:
+            self._differing += 1
+
+    def T_base_laser(self, offset_m: float) -> Pose:
+        """The mounting on which the scans agree, rounded to 0.1 mm; otherwise ``offset_m`` ahead of the base.
+
+        Scans disagree if only one of their poses was corrected. They contain no mounting if both poses are equal.
+        """
+        assert self._first is not None
+        agreed = tuple(round(value, 4) + 0.0 for value in self._first)
+        if self._differing > TOLERATED_SHARE * self._count or not any(agreed):
+            return (offset_m, 0.0, 0.0)
+        return agreed[0], agreed[1], agreed[2]
+
+
+def tells_more(scan: ScanLine, than: ScanLine) -> bool:
+    """Whether a scan says more about the laser: the angles of its beams, or how many beams a full scan has."""
+    if than.stated is not None:
+        return False
+    if scan.stated is not None:
+        return scan.beam_count == than.beam_count
+    return scan.beam_count > than.beam_count
+
+
+def laser_model(scan: ScanLine, parameters: Mapping[str, str], mounting: MountingEstimate) -> LaserModel:
     """The laser of ``scan``."""
+    T_base_laser = mounting.T_base_laser(_parameter(parameters, "robot_frontlaser_offset") or 0.0)
     stated = scan.stated or assumed_laser(scan.beam_count, parameters)
     return LaserModel(scan.beam_count, *stated, T_base_laser)
 
@@ -111,8 +153,8 @@ def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) 
 
 
 def _parameter_resolution_deg(beam_count: int, parameters: Mapping[str, str]) -> float | None:
-    resolution_deg = parameter(parameters, "laser_front_laser_resolution")
-    fov = parameter(parameters, "laser_front_laser_fov")
+    resolution_deg = _parameter(parameters, "laser_front_laser_resolution")
+    fov = _parameter(parameters, "laser_front_laser_fov")
     if fov is None or fov <= 0.0:
         return None
     fov_deg = degrees(fov) if fov < 7.0 else fov
@@ -124,7 +166,7 @@ def _parameter_resolution_deg(beam_count: int, parameters: Mapping[str, str]) ->
     return resolution_deg if fits else None
 
 
-def parameter(parameters: Mapping[str, str], name: str) -> float | None:
+def _parameter(parameters: Mapping[str, str], name: str) -> float | None:
     """A parameter's value; None if it is missing or not a finite number."""
     try:
         value = float(parameters[name])

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
-from fcslam.records import FloatArray, Ranges
+from fcslam.records import FloatArray, Ranges, frozen
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.logs.dialect import Line, ScanLine
 
@@ -56,7 +56,7 @@ def parse_ranges(scan: ScanLine, metres_per_unit: float, number: int, audit: Aud
             if count:
                 audit.add(kind, number, int(count))
         values = np.where(finite & ~negative, np.minimum(values, _LONGEST_RANGE_M), nan)
-    return _frozen(values)
+    return frozen(values, np.float32)
 
 
 def plain_numbers(text: bytes) -> FloatArray | None:
@@ -96,7 +96,7 @@ def _ranges_of(scans: list[ScanLine], metres_per_unit: float) -> Ranges | None:
     values = plain_numbers(b" ".join(scan.range_text for scan in scans)) if scans else None
     if values is None or values.max() * metres_per_unit >= _LONGEST_RANGE_M:
         return None
-    return _frozen(values * metres_per_unit)
+    return frozen(values * metres_per_unit, np.float32)
 
 
 def _batches(lines: Iterable[NumberedLine]) -> Iterator[list[NumberedLine]]:
@@ -113,9 +113,3 @@ def _batches(lines: Iterable[NumberedLine]) -> Iterator[list[NumberedLine]]:
         yield batch  # the lines before the damage
         raise
     yield batch
-
-
-def _frozen(values: FloatArray) -> Ranges:
-    ranges: Ranges = values.astype(np.float32)
-    ranges.setflags(write=False)
-    return ranges

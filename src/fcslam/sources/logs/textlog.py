@@ -10,24 +10,31 @@ Besides the rules of ``gate``:
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
+from math import isnan
 from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, Ranges, SensorRecord, frozen
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
+from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
 from fcslam.sources.logs.archive import numbered_lines
 from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLine, ScanLine
-from fcslam.sources.logs.laser import SICK_MAX_RANGE_M, Interleaving, LogBeams, first_beams
-from fcslam.sources.logs.overview import LogReading, Overview
+from fcslam.sources.logs.laser import (
+    SICK_MAX_RANGE_M,
+    Interleaving,
+    LogBeams,
+    MountingEstimate,
+    first_beams,
+    laser_model,
+    tells_more,
+)
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
-from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.pose import UNKNOWN_POSE, Pose, pose_array
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
+from fcslam.sources.pose import UNKNOWN_POSE, Pose
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -36,6 +43,25 @@ KEPT_BYTES = 1 << 25
 
 
 _WORDS_NAMED, _LONGEST_WORD = 5, 20
+UNTIMED_STEP_S = 1.0
+"""Time between the scans of a log that states none."""
+FULL_TURN_RAD = 6.0
+"""A scanner whose beams span more measures a full turn."""
+SPINNING_HZ = 4.0, 20.0
+"""Turns a second of scanners that spin, and log every turn."""
+
+
+class _Reading(NamedTuple):
+    """Summary of a log, and how to read it."""
+
+    survey: Survey
+    interleaving: Interleaving | None
+    pose_from_odometry: bool
+    """Whether scans take the pose of the latest odometry message, because their own never changes."""
+    has_odometry: bool
+    """Whether the poses are those of wheels."""
+    placeholders: tuple[float, ...]
+    """Values that are not ranges."""
 
 
 class _Scan(NamedTuple):
@@ -80,7 +106,7 @@ class TextLog:
         (laser,) = self._reading.survey.lasers
         unit = self._dialect.metres_per_range_unit
         for number, entry in self._entries(scans, parse_ahead(self._all_lines(), unit), audit):
-            T_odom_base = pose_array(entry.T_odom_base)
+            T_odom_base: FloatArray = frozen(entry.T_odom_base)
             if isinstance(entry, OdometryLine):
                 if self._reading.has_odometry:
                     yield Odometry(entry.stamp, T_odom_base)
@@ -101,24 +127,43 @@ class TextLog:
         self._kept = []  # whoever maps a recording reads its records once
 
     @cached_property
-    def _reading(self) -> LogReading:
+    def _reading(self) -> _Reading:
         """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
-        audit = Audit()
-        overview, sample = Overview(), RangeSample()
+        audit, sample, mounting = Audit(), RangeSample(), MountingEstimate()
+        scans, odometry, parameters = PathSummary(), PathSummary(), dict[str, str]()
         declared, interleaving = self._first_look()
         gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
+        telling: ScanLine | None = None
         for number, line in _sound(self._all_lines(), audit):
-            if isinstance(line, ScanLine):
-                if not gate.admits(number, line.stamp, log_beams.of(line)):
-                    continue
+            if isinstance(line, ParameterLine):
+                parameters[line.name] = line.value
+            elif isinstance(line, OdometryLine):
+                odometry.add(line.stamp, line.T_odom_base)
+            elif gate.admits(number, line.stamp, log_beams.of(line)):
                 _note_clock(number, line, audit)
                 self._sample(sample, line)
-            overview.add(line)
-        reading = overview.conclude(self._path, audit.faults(), interleaving)
-        sample.check(self._path, "", "the unit of the ranges")
+                scans.add(line.stamp, line.T_odom_base)
+                mounting.add(line)
+                telling = line if telling is None or tells_more(line, telling) else telling
+        assert telling is not None  # the first scans have the beams that the gate admits
+        path, faults = self._path, audit.faults()
+        check_consistency(path, faults, scans.count, odometry.count)
+        sample.check(path, "", "the unit of the ranges")
+        pose_from_odometry = not scans.moves and odometry.moves
+        driven = odometry if pose_from_odometry else scans
+        laser = laser_model(telling, parameters, mounting)
+        notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
+        notes += _spinning(laser, scans)
         placeholders = sample.placeholders()
-        notes = (*reading.survey.notes, *placeholder_note(self._path, placeholders, ""))
-        return reading._replace(survey=replace(reading.survey, notes=notes), placeholders=placeholders)
+        survey = Survey(
+            scans.count,
+            scans.duration_s,
+            driven.length_m,
+            (laser,),
+            faults,
+            (*(f"{path}: {note}" for note in notes), *placeholder_note(path, placeholders, "")),
+        )
+        return _Reading(survey, interleaving, pose_from_odometry, driven.fault is None, placeholders)
 
     def _sample(self, sample: RangeSample, line: ScanLine) -> None:
         if not sample.wants(line.T_odom_base):
@@ -158,12 +203,17 @@ class TextLog:
     def _parsed(self) -> Iterator[NumberedLine]:
         """Parse the log line by line; keeps the lines of a short log for the next pass."""
         parse = self._dialect.parser()
-        kept, size = list[NumberedLine](), 0
+        kept, size, untimed = list[NumberedLine](), 0, 0
         for number, text in numbered_lines(self._path):
             try:
                 line = parse(text)
                 if line is None:
                     continue
+                if isinstance(line, ScanLine) and isnan(line.stamp):
+                    line = line._replace(stamp=untimed * UNTIMED_STEP_S, is_timed=False)
+                    untimed += 1
+                elif isinstance(line, OdometryLine) and isnan(line.stamp):
+                    line = line._replace(stamp=untimed * UNTIMED_STEP_S)
             except ValueError:
                 line = None
             size += len(text)
@@ -199,6 +249,17 @@ class TextLog:
                     late = latest if reading.pose_from_odometry else None
                     pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
                     yield number, _Scan(line, beams, pose)
+
+
+def _spinning(laser: LaserModel, scans: PathSummary) -> list[str]:
+    """A note about a scanner that probably spins, as a log does not say when each beam was measured."""
+    rate_hz = (scans.count - 1) / scans.duration_s if scans.duration_s > 0.0 else 0.0
+    if laser.beams.span_rad < FULL_TURN_RAD or not SPINNING_HZ[0] <= rate_hz <= SPINNING_HZ[1]:
+        return []
+    return [
+        f"{rate_hz:.1f} scans a second of a full turn, and no times of beams; if the scanner spins, set "
+        f"robot.lidar.scan_duration_s: {1.0 / rate_hz:.3f}"
+    ]
 
 
 def _note_clock(number: int, line: ScanLine, audit: Audit) -> None:

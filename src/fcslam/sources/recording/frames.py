@@ -2,11 +2,11 @@
 
 import heapq
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from functools import cached_property, partial
+from contextlib import contextmanager
+from functools import partial
 from math import isnan
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -19,7 +19,6 @@ from fcslam.sources.recording.layout import (
     HEADER_BYTES,
     META,
     RANGE,
-    RANGES,
     SCANS,
     FrameFile,
     check_beams,
@@ -82,49 +81,32 @@ class Frame(NamedTuple):
         check_sweep(sweep)
         return sweep
 
-    def ranges_m(self, ranges: "RangesFile") -> Ranges:
-        """Ranges of the scan in metres; raises ValueError if they are damaged."""
-        content = ranges.read(int(self.content["offset"]), int(self.content["beam_count"]))
+    def ranges_m(self, file: BinaryIO) -> Ranges:
+        """Ranges of the scan in metres, from the file of ranges; raises ValueError if they are damaged."""
+        offset = int(self.content["offset"])
+        if offset >= 1 << 63:
+            raise ValueError("no place in a file")
+        file.seek(offset)
+        content = file.read(RANGE.itemsize * int(self.content["beam_count"]))
         if crc32(content) != self.content["ranges_crc32"]:
             raise ValueError("other ranges")
         return np.frombuffer(content, RANGE).astype(np.float32)
 
 
-class RangesFile:
-    """The file of the ranges, for a ``with``; it is opened when it is first needed."""
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """One of the files of a recording.
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / RANGES
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def check(self) -> None:
-        """Raise SourceError if the file is missing."""
-        if not self._path.is_file():
-            raise SourceError(f"{self._path}: is missing; copy the whole folder again")
-
-    def read(self, offset: int, count: int) -> bytes:
-        """``count`` ranges from byte ``offset`` on, fewer if the file ends before; raises ValueError if it is far off.
-
-        Raises:
-            SourceError: the file cannot be read.
-        """
-        if offset >= 1 << 63:
-            raise ValueError("no place in a file")
-        try:
-            self._file.seek(offset)
-            return self._file.read(RANGE.itemsize * count)
-        except OSError as error:
-            raise SourceError(f"{self._path}: cannot be read ({error}); check the file and its permissions") from error
-
-    @cached_property
-    def _file(self) -> BinaryIO:
-        return self._stack.enter_context(open_file(self._path, self._path.parent))
+    Raises:
+        SourceError: it is missing, or cannot be read.
+    """
+    try:
+        if not path.is_file():
+            raise SourceError(f"{path}: is missing; copy the whole folder again")
+        with open_file(path, path.parent) as file:
+            yield file
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error}); check the file and its permissions") from error
 
 
 def merged_frames(folder: Path, files: Sequence[FrameFile]) -> Iterator[Frame]:
@@ -157,16 +139,10 @@ def _frames(path: Path, file: FrameFile) -> Iterator[Frame]:
 
 def _pieces(path: Path, file: FrameFile) -> Iterator[memoryview]:
     """The bytes of each frame; the last one may be short."""
-    try:
-        if not path.is_file():
-            raise SourceError(f"{path}: is missing; copy the whole folder again")
-        with open_file(path, path.parent) as stream:
-            header = stream.read(HEADER_BYTES)
-            if header != file.header:
-                raise SourceError(f"{path}: does not fit {META} (its header is another one); copy both again")
-            for block in iter(partial(stream.read, _BLOCK_FRAMES * file.frame_bytes), b""):
-                view = memoryview(block)
-                for start in range(0, len(view), file.frame_bytes):
-                    yield view[start : start + file.frame_bytes]
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error}); check the file and its permissions") from error
+    with opened(path) as stream:
+        if stream.read(HEADER_BYTES) != file.header:
+            raise SourceError(f"{path}: does not fit {META} (its header is another one); copy both again")
+        for block in iter(partial(stream.read, _BLOCK_FRAMES * file.frame_bytes), b""):
+            view = memoryview(block)
+            for start in range(0, len(view), file.frame_bytes):
+                yield view[start : start + file.frame_bytes]

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError, model_validator
 
-from fcslam.config import StrictModel, parse_yaml
+from fcslam.config import StrictModel, one_line, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams, CameraModel, LaserModel, Sweep
@@ -42,7 +42,6 @@ _MAX_META_BYTES = 1 << 16
 _MAX_LASERS = 8
 _MAX_BEAMS = 1 << 16
 _MAX_RANGE_M = 1e6
-_LONGEST_REASON = 200
 _LONGEST_SWEEP_S, _FASTEST, _STEEPEST = 2.0, 50.0, 500.0
 """Limits of a sweep: times in seconds, velocities in m/s and rad/s, accelerations in m/s^2 and rad/s^2."""
 
@@ -160,7 +159,7 @@ def read_meta(folder: Path) -> Meta:
     except FileNotFoundError as error:
         raise SourceError(f"{path}: is missing; it says how the laser measures, so copy the whole folder") from error
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: cannot be read ({_one_line(error)}); copy it again") from error
+        raise SourceError(f"{path}: cannot be read ({one_line(str(error))}); copy it again") from error
     version = content.get("version") if isinstance(content, dict) else None
     if type(version) is not int:
         raise SourceError(f"{path}: does not describe a recording (no version); copy it again")
@@ -171,8 +170,4 @@ def read_meta(folder: Path) -> Meta:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or META
-        raise SourceError(f"{path}: {where}: {_one_line(first['msg'])}; copy it again") from error
-
-
-def _one_line(reason: object) -> str:
-    return " ".join(str(reason).split())[:_LONGEST_REASON]
+        raise SourceError(f"{path}: {where}: {one_line(first['msg'])}; copy it again") from error

@@ -7,9 +7,10 @@ rest is read. ``gate`` decides which scans are consistent.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import isnan, nan
 from pathlib import Path
+from typing import BinaryIO
 from zlib import crc32
 
 import numpy as np
@@ -32,13 +33,14 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
-from fcslam.sources.pose import UNKNOWN_POSE, pose_array
-from fcslam.sources.recording.frames import Frame, RangesFile, frame_count, merged_frames
+from fcslam.sources.pose import UNKNOWN_POSE
+from fcslam.sources.recording.frames import Frame, frame_count, merged_frames, opened
 from fcslam.sources.recording.layout import (
     GROUND_TRUTH,
     IMAGES_FILE,
     META,
     ODOMETRY_FILE,
+    RANGES,
     SCANS,
     SCANS_FILE,
     Meta,
@@ -51,6 +53,7 @@ from fcslam.untrusted import read_bytes
 _MAX_COORDINATE = 1e7
 """Metres, or radians of a heading that was never wrapped."""
 _MAX_STAMP_S = 1e12
+_audit = partial(Audit, "record")
 _SUFFIXES = (b"jpg", b"png")
 
 
@@ -94,7 +97,7 @@ class Recording:
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
         lasers, camera = self._survey.lasers, self._survey.camera
-        with RangesFile(self._path) as ranges:
+        with opened(self._path / RANGES) as ranges:
             for number, frame in self._entries(scans, audit):
                 if frame.is_scan:
                     laser = lasers[frame.laser].with_beams(frame.beams(lasers))
@@ -103,11 +106,11 @@ class Recording:
                     except ValueError:
                         audit.add(Fault.BROKEN_RECORD, number)
                     else:
-                        scan = LaserScan(frame.stamp, ranges_m, laser, pose_array(frame.T_odom_base), frame.sweep())
+                        scan = LaserScan(frame.stamp, ranges_m, laser, frozen(frame.T_odom_base), frame.sweep())
                         watch.add(number, scan)
                         yield scan
                 elif frame.file is ODOMETRY_FILE:
-                    yield Odometry(frame.stamp, pose_array(frame.T_odom_base))
+                    yield Odometry(frame.stamp, frozen(frame.T_odom_base))
                 elif camera is not None:
                     try:
                         image = self._image(frame, camera)
@@ -135,7 +138,8 @@ class Recording:
     def _survey(self) -> Survey:
         """Summary from one pass over the whole recording; rejects a recording that cannot be mapped."""
         audit, scans, odometry, notes = _audit(), PathSummary(), PathSummary(), list[str]()
-        RangesFile(self._path).check()
+        with opened(self._path / RANGES):
+            pass  # it is there
         for _, frame in self._checked(audit):
             if frame.is_scan:
                 if not scans.count and frame.T_odom_base == UNKNOWN_POSE:
@@ -187,7 +191,7 @@ class Recording:
             raise ValueError("another file")
         check_image(encoded, camera)
         pose = frame.T_odom_base
-        return CameraImage(frame.stamp, encoded, camera, None if isnan(pose[0]) else pose_array(pose))
+        return CameraImage(frame.stamp, encoded, camera, None if isnan(pose[0]) else frozen(pose))
 
 
 def _is_sane(frame: Frame, lasers: Sequence[LaserModel]) -> bool:
@@ -202,16 +206,11 @@ def _is_sane(frame: Frame, lasers: Sequence[LaserModel]) -> bool:
     return abs(frame.stamp) < _MAX_STAMP_S and (unknown or all(abs(value) < _MAX_COORDINATE for value in pose))
 
 
-def _ranges(frame: Frame, file: RangesFile, audit: Audit) -> Ranges:
+def _ranges(frame: Frame, file: BinaryIO, audit: Audit) -> Ranges:
     """Ranges in metres, shape (beam_count,); negative ones become NaN. Raises ValueError if they are damaged."""
     ranges = frame.ranges_m(file)
     negative = ranges < 0.0
     if negative.any():
         audit.add(Fault.NEGATIVE_RANGE, frame.number, int(np.count_nonzero(negative)))
         ranges[negative] = nan
-    ranges.setflags(write=False)
-    return ranges
-
-
-def _audit() -> Audit:
-    return Audit("record")
+    return frozen(ranges, np.float32)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from io import BytesIO, FileIO
 from math import nan
 from pathlib import Path
@@ -10,8 +10,10 @@ from typing import Self
 from zlib import crc32
 
 import numpy as np
+from pydantic import ValidationError
 
-from fcslam.errors import ConfigError, OutputError
+from fcslam.config import one_line
+from fcslam.errors import OutputError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import (
     CameraImage,
@@ -51,10 +53,19 @@ class RecordingWriter:
 
     def __init__(self, folder: Path, meta: Meta) -> None:
         """Use ``create`` instead."""
-        self._folder = folder
-        self._meta = meta
-        self._next_sequence = 0
-        self._appenders: dict[str, _Appender] = {}
+        self._folder, self._meta, self._next_sequence = folder, meta, 0
+        frames = [SCANS_FILE, ODOMETRY_FILE]
+        if meta.camera is not None:
+            frames.append(IMAGES_FILE)
+            (folder / IMAGES).mkdir(exist_ok=True)
+        with ExitStack() as stack:
+            self._appenders = {
+                name: stack.enter_context(_Appender(folder / name))
+                for name in (*(file.name for file in frames), RANGES, GROUND_TRUTH)
+            }
+            for file in frames:
+                self._appenders[file.name].append(file.header)
+            self._stack = stack.pop_all()
 
     @classmethod
     def create(cls, folder: Path, lasers: Sequence[LaserModel], camera: CameraModel | None = None) -> Self:
@@ -65,31 +76,15 @@ class RecordingWriter:
         """
         try:
             meta = Meta(lasers=tuple(lasers), camera=camera)
-        except ConfigError as error:
-            raise OutputError(f"{folder}: cannot hold these sensors ({error})") from error
+        except ValidationError as error:
+            reason = one_line(error.errors()[0]["msg"])
+            raise OutputError(f"{folder}: cannot hold these sensors ({reason}); correct them") from error
         with _translate_errors(folder):
             folder.mkdir(exist_ok=True)
             if any(folder.iterdir()):
                 raise OutputError(f"{folder}: is not empty; choose another place")
             write_meta(folder, meta)
-        writer = cls(folder, meta)
-        try:
-            with _translate_errors(folder):
-                writer._open_files()
-        except BaseException:
-            writer.close()
-            raise
-        return writer
-
-    @property
-    def lasers(self) -> tuple[LaserModel, ...]:
-        """The lasers of all scans."""
-        return self._meta.lasers
-
-    @property
-    def camera(self) -> CameraModel | None:
-        """The camera of all images."""
-        return self._meta.camera
+            return cls(folder, meta)
 
     def write(self, item: RecordedItem) -> None:
         """Append one record.
@@ -114,25 +109,13 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Close the files."""
-        for appender in self._appenders.values():
-            appender.file.close()
+        self._stack.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _open_files(self) -> None:
-        files = [SCANS_FILE, ODOMETRY_FILE]
-        if self._meta.camera is not None:
-            files.append(IMAGES_FILE)
-            (self._folder / IMAGES).mkdir(exist_ok=True)
-        for frames in files:
-            appender = self._appenders[frames.name] = _Appender(self._folder / frames.name)
-            appender.append(frames.header)
-        for name in (RANGES, GROUND_TRUTH):
-            self._appenders[name] = _Appender(self._folder / name)
 
     def _check(self, item: RecordedItem) -> None:
         if isinstance(item, GnssFix):
@@ -175,15 +158,11 @@ class RecordingWriter:
         self._appenders[frames.name].append(frames.packed(self._next_sequence, *values))
         self._next_sequence += 1
 
-    def _count(self, frames: FrameFile) -> int:
-        """Frames in a file; 0 if the recording has none of this kind."""
-        appender = self._appenders.get(frames.name)
-        return (appender.size - HEADER_BYTES) // frames.frame_bytes if appender else 0
-
     def _append_image(self, image: CameraImage) -> None:
         """Write the file before the frame: a frame without a file is a fault, a file without a frame is overwritten."""
         suffix, encoded = image_suffix(image.encoded), image.encoded
-        image_path(self._folder, self._count(IMAGES_FILE), suffix).write_bytes(encoded)
+        written = (self._appenders[IMAGES_FILE.name].size - HEADER_BYTES) // IMAGES_FILE.frame_bytes
+        image_path(self._folder, written, suffix).write_bytes(encoded)
         pose = _NO_POSE if image.T_odom_base is None else image.T_odom_base
         self._append(IMAGES_FILE, image.stamp, pose, suffix.encode(), len(encoded), crc32(encoded))
 
@@ -203,22 +182,21 @@ def write_recording(
             writer.write(record)
 
 
-class _Appender:
+class _Appender(FileIO):
     """A file that grows by complete records."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+")
-        self.size = os.fstat(self.file.fileno()).st_size
+        super().__init__(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+")
+        self.size = os.fstat(self.fileno()).st_size
 
     def append(self, piece: bytes) -> None:
         """Append the whole piece, or undo a partial write (disk full) and raise OSError."""
         written = 0
         try:
             while written < len(piece):
-                written += os.pwrite(self.file.fileno(), piece[written:], self.size + written)
+                written += os.pwrite(self.fileno(), piece[written:], self.size + written)
         except OSError:
-            self.file.truncate(self.size)
+            self.truncate(self.size)
             raise
         self.size += len(piece)
 

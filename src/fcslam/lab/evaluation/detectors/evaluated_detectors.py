@@ -24,8 +24,7 @@ from fcslam.features.detector import (
 )
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_features, read_grey
-from fcslam.metrics.framing import Framing, Size
-from fcslam.metrics.homography import inside
+from fcslam.metrics.homography import Framing, Size, inside
 
 _CANDIDATES = 1500
 """Most features of ORB and SIFT, as in SuperPoint's evaluation."""
@@ -94,10 +93,8 @@ def choose_detectors(
 ) -> tuple[EvaluatedDetector, ...]:
     """Choose extracted features first, then the named detectors; by default all available detectors.
 
-    Args:
-        names: kinds of detectors.
-        weights: ONNX files, each a detector of its own; empty: the bundled network.
-        folders: folders with extracted features.
+    ``weights``: ONNX files, each a detector of its own; empty: the bundled network. ``folders`` hold extracted
+    features.
 
     Raises:
         FeatureError: a network's weights cannot be used.

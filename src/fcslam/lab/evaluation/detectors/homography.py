@@ -26,16 +26,20 @@ from fcslam.lab.evaluation.detectors.evaluated_detectors import (
     one_thread,
 )
 from fcslam.lab.evaluation.detectors.scenes import Scene, SceneKind
-from fcslam.metrics.framing import HomographyGroundTruth, Size, framed_homography
 from fcslam.metrics.homography import (
+    HomographyGroundTruth,
+    Repeatability,
+    Size,
     corner_error,
     estimate_homography,
+    framed_homography,
+    in_common_view,
     inverse,
     match_errors,
     matching_accuracy,
     matching_score,
+    repeatability,
 )
-from fcslam.metrics.repeatability import Repeatability, in_common_view, repeatability
 from fcslam.records import FloatArray
 
 SMALL: Final[Size] = (320, 240)

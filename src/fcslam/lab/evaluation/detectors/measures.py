@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import OutputError
+from fcslam.errors import writing
 from fcslam.lab.evaluation.detectors.homography import ACCURACY_PX, HomographyReport, MatchingResult, PairResult
 from fcslam.lab.evaluation.detectors.scenes import SceneKind
 from fcslam.metrics.bootstrap import Interval, mean_interval
@@ -59,15 +59,12 @@ def write_pairs(report: HomographyReport, path: Path) -> None:
     """
     rows = [(pair, pair_measures(pair)) for pair in report.pairs]
     names = list(dict.fromkeys(name for _, measures in rows for name in measures))
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["detector", "scene", "kind", "image", *names])
-            for pair, measures in rows:
-                cells = (f"{measures[name]:.6g}" if name in measures else "" for name in names)
-                writer.writerow([pair.detector, pair.scene, pair.kind, pair.image, *cells])
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the table ({error})") from error
+    with writing(path, "choose another place"), path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["detector", "scene", "kind", "image", *names])
+        for pair, measures in rows:
+            cells = (f"{measures[name]:.6g}" if name in measures else "" for name in names)
+            writer.writerow([pair.detector, pair.scene, pair.kind, pair.image, *cells])
 
 
 def _matching_measures(result: MatchingResult) -> dict[str, float]:

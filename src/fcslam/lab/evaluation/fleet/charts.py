@@ -7,7 +7,7 @@ import numpy as np
 
 from fcslam.errors import EvaluationError
 from fcslam.lab.evaluation.fleet.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
-from fcslam.maps.charts import IDENTITY, Chart, FleetCharts, MatchedPlaces, Outline
+from fcslam.maps.fleet_figure import IDENTITY, Chart, FleetCharts, MatchedPlaces, Outline
 from fcslam.metrics.trajectory import align
 from fcslam.records import ClosureStatus, FloatArray
 from fcslam.runs import LOCAL, ClosureRow, LocalMap, Run, open_run
@@ -16,10 +16,8 @@ from fcslam.runs import LOCAL, ClosureRow, LocalMap, Run, open_run
 def fleet_charts(run: Path, truth: Path | None = None, outlines: Sequence[Outline] = ()) -> FleetCharts:
     """Make the charts of a run folder and its ground truth.
 
-    Args:
-        run: the run folder.
-        truth: folder with the ground truth; None searches for it like ``evaluate_fleet``.
-        outlines: walls and furniture of the building, in the coordinate frame of the truth.
+    Without ``truth`` it searches for the truth like ``evaluate_fleet``; ``outlines`` are walls and furniture of the
+    building, in its coordinate frame.
 
     Raises:
         EvaluationError: the run has no maps of single robots, or the truth of a robot or the true map is missing.

@@ -46,10 +46,7 @@ class MatchViews:
 def judge_views(run: Run, known: KnownPoses, folder: Path) -> Mapping[ClosureStatus, MatchViews]:
     """Count the camera closures between robots by the overlap of their views, for each stage.
 
-    Args:
-        run: the run.
-        known: its true poses.
-        folder: folder with the truth; the recording of a robot is a folder of its name there.
+    ``folder`` holds the truth; the recording of a robot is a folder of its name there.
 
     Raises:
         SourceError: a recording is there and cannot be read.

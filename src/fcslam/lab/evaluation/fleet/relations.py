@@ -1,12 +1,11 @@
 """The relations metric of run folders."""
 
 import csv
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import EvaluationError, OutputError
+from fcslam.errors import EvaluationError, writing
 from fcslam.metrics.relations import (
     ACROSS_ROBOTS_GAP_S,
     PoseTable,
@@ -18,24 +17,14 @@ from fcslam.metrics.relations import (
 from fcslam.runs import Metric, Run, metrics_json, open_run
 
 
-@dataclass(frozen=True, slots=True)
-class RelationsQuestion:
-    """Selection of relations."""
-
-    across_robots: bool = False
-    """Only relations whose stamps belong to different robots."""
-    parts: Path | None = None
-    """Run folder that assigns stamps to robots, if not the evaluated one. It lets you evaluate a run of one robot with
-    the same relations as a run of several robots from the same recording."""
-
-    @property
-    def gap_s(self) -> float:
-        """Smallest time between the stamps of a relation that counts."""
-        return ACROSS_ROBOTS_GAP_S if self.across_robots else 0.0
-
-
-def evaluate_relations(run: Path, relations: Path, question: RelationsQuestion) -> RelationErrors:
+def evaluate_relations(
+    run: Path, relations: Path, across_robots: bool = False, parts: Path | None = None
+) -> RelationErrors:
     """Errors of the run folder ``run`` against the file ``relations``.
+
+    ``across_robots``: only relations whose stamps belong to different robots. ``parts`` is a run folder that assigns
+    stamps to robots, if not ``run``: so a run of one robot is evaluated with the same relations as one of several
+    robots from the same recording.
 
     Raises:
         EvaluationError: one of them cannot be read, no relation is selected, or none has both its poses in one map of
@@ -43,14 +32,15 @@ def evaluate_relations(run: Path, relations: Path, question: RelationsQuestion) 
     """
     reference = read_relations(relations)
     poses = pose_table(open_run(run))
-    robots = poses if question.parts is None else pose_table(open_run(question.parts))
-    selected = select(reference, robots, question.gap_s, question.across_robots)
+    robots = poses if parts is None else pose_table(open_run(parts))
+    gap_s = ACROSS_ROBOTS_GAP_S if across_robots else 0.0
+    selected = select(reference, robots, gap_s, across_robots)
     if not len(selected):
-        which = "between different robots" if question.across_robots else "in it"
-        raise EvaluationError(f"{relations}: no relation {which} spans more than {question.gap_s:g} s")
+        which = "between different robots" if across_robots else "in it"
+        raise EvaluationError(f"{relations}: no relation {which} spans more than {gap_s:g} s")
     errors = relation_errors(selected, poses)
     if not errors.used:
-        hint = "; the robots are in different maps, which closures.csv explains" if question.across_robots else ""
+        hint = "; the robots are in different maps, which closures.csv explains" if across_robots else ""
         raise EvaluationError(f"{run}: none of the {errors.total} relations has both its poses in one map{hint}")
     return errors
 
@@ -88,12 +78,9 @@ def write_metrics(metrics: tuple[Metric, ...], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            if path.suffix == ".json":
-                file.write(metrics_json(metrics))
-            else:
-                rows = [(metric.name, f"{metric.value:.9g}", metric.unit) for metric in metrics]
-                csv.writer(file, lineterminator="\n").writerows([("name", "value", "unit"), *rows])
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the table ({error})") from error
+    with writing(path, "choose another place"), path.open("w", encoding="utf-8", newline="") as file:
+        if path.suffix == ".json":
+            file.write(metrics_json(metrics))
+        else:
+            rows = [(metric.name, f"{metric.value:.9g}", metric.unit) for metric in metrics]
+            csv.writer(file, lineterminator="\n").writerows([("name", "value", "unit"), *rows])

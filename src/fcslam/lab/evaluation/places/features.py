@@ -9,8 +9,7 @@ from fcslam.errors import EvaluationError, FeatureError
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
-from fcslam.features.extraction import extract, find_files
-from fcslam.features.files import read_features, read_grey
+from fcslam.features.files import extract, find_files, read_features, read_grey
 from fcslam.lab.evaluation.places.lidar_places import describe_recording
 from fcslam.lab.evaluation.places.scoring import DescribedSet, PlaceFeatures
 from fcslam.lab.evaluation.places.sets import PlaceSet, all_images, read_place_set

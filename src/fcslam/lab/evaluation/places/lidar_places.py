@@ -17,8 +17,7 @@ from fcslam.lab.evaluation.places.scoring import DescribedSet, PlaceFeatures
 from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.lidar.lost import LostConfig
 from fcslam.metrics.retrieval import PairTruth, excluding_recent
-from fcslam.places.hypotheses import rigid_hypotheses
-from fcslam.places.motions import LARGEST_HAMMING
+from fcslam.places.motions import LARGEST_HAMMING, rigid_hypotheses
 from fcslam.records import Channel, FloatArray, Keyscan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source

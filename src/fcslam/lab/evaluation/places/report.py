@@ -4,12 +4,12 @@ import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import OutputError
+from fcslam.errors import writing
 from fcslam.lab.evaluation.places.scoring import DescribedSet, Scorer
 from fcslam.lab.evaluation.places.sets import PlaceSet
 from fcslam.lab.evaluation.places.verification import PairVerifier
@@ -30,6 +30,29 @@ from fcslam.records import FloatArray
 RANKS: Final = (1, 5, 10)
 DRAWS: Final = 300
 """Bootstrap samples of a measure that is no mean."""
+
+COLOURS: Final = (
+    "#000000",
+    "#7f7f7f",
+    "#d95f02",
+    "#7570b3",
+    "#1b9e77",
+    "#e7298a",
+    "#66a61e",
+    "#a6761d",
+    "#1f77b4",
+    "#d62728",
+    "#17becf",
+    "#e6ab02",
+    "#8c564b",
+    "#9edae5",
+    "#ff9896",
+    "#98df8a",
+    "#c5b0d5",
+    "#c49c94",
+    "#f7b6d2",
+    "#dbdb8d",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +94,8 @@ def evaluate_set(
 ) -> SetResult:
     """Evaluate every scorer on every question of a set.
 
-    Args:
-        described: the set.
-        scorers: scorers by name.
-        checker: geometric verification; None: none.
-        seed: seed of the bootstrap.
-        watch: called after each scorer.
+    ``checker`` verifies by geometry; None: nothing does. ``seed`` is that of the bootstrap; ``watch`` is called after
+    each scorer.
     """
     similarities: dict[str, FloatArray] = {}
     verified: dict[str, FloatArray] = {}
@@ -124,15 +143,9 @@ def measure(
 
 
 def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
-    """Percentile bootstrap of any measure of ``count`` samples.
+    """Any measure of ``count`` samples, and its interval by percentile bootstrap.
 
-    Args:
-        measure: computes the measure of the samples whose indices (N,) it is given; draws with NaN are ignored.
-        count: number of samples.
-        rng: random generator.
-
-    Returns:
-        The measure of all samples and its interval.
+    ``measure`` is given the indices (N,) of samples; draws with NaN are ignored.
     """
     whole = measure(np.arange(count))
     drawn = np.array([measure(rng.integers(count, size=count)) for _ in range(DRAWS if count else 0)])
@@ -150,13 +163,11 @@ def write_results(folder: Path, results: Sequence[SetResult]) -> None:
     Raises:
         OutputError: the folder cannot be written.
     """
-    try:
+    with writing(folder, "choose another place"):
         folder.mkdir(parents=True, exist_ok=True)
         _write_table(folder / "places.csv", results)
         for result in results:
             _write_set(folder / result.place_set.name, result)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot write the results ({error}); choose another folder") from error
 
 
 def _write_table(path: Path, results: Sequence[SetResult]) -> None:
@@ -189,3 +200,50 @@ def _write_set(folder: Path, result: SetResult) -> None:
 def _write_curve(path: Path, curve: PrecisionRecall) -> None:
     table = np.column_stack((curve.thresholds, curve.precision, curve.recall))
     np.savetxt(path, table, "%.6g", ",", header="threshold,precision,recall", comments="")
+
+
+def curves_figure(results: Sequence[SetResult]) -> Any:
+    """Draw the curves of the single best matches: solid before geometric verification, dashed after it."""
+    panels = [(result, question) for result in results for question in result.place_set.questions]
+    figure, axes = panel_figure(len(panels), 3, (4.6, 3.8))
+    for axis, (result, question) in zip(axes, panels, strict=True):
+        names = list(result.similarities)
+        for score in (score for score in result.scores if score.question == question and len(score.curve.recall)):
+            curve = score.curve
+            axis.plot(
+                np.concatenate(([0.0], curve.recall)),
+                np.concatenate((curve.precision[:1], curve.precision)),
+                color=COLOURS[names.index(score.scorer) % len(COLOURS)],
+                linestyle="--" if score.is_verified else "-",
+                linewidth=1.2,
+                label=None if score.is_verified else score.scorer,
+            )
+        title = f"{result.place_set.name}, {question}"
+        axis.set(xlabel="recall", ylabel="precision", xlim=(0, 1.02), ylim=(0, 1.02), title=title)
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8, loc="lower left")
+    return figure
+
+
+def panel_figure(panels: int, most_columns: int, size_in: tuple[float, float]) -> tuple[Any, list[Any]]:
+    """A figure without a window, with panels of the given size in inches, row by row."""
+    from matplotlib.figure import Figure
+
+    columns = min(most_columns, panels)
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(columns * size_in[0], rows * size_in[1]), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for empty in axes[panels:]:
+        empty.remove()
+    return figure, axes[:panels]
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a figure as PNG.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with writing(path, "choose another place"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=120, metadata={"Software": None})

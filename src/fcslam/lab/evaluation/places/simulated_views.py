@@ -20,8 +20,8 @@ from fcslam.metrics.trajectory import interpolate
 from fcslam.records import CameraModel, FloatArray, LaserModel, Ranges
 from fcslam.robot.views import EVERY_M, EVERY_RAD
 from fcslam.runs import read_tum
-from fcslam.sources.recording.frames import RangesFile, merged_frames
-from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, SCANS_FILE, image_path, read_meta
+from fcslam.sources.recording.frames import merged_frames, opened
+from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, RANGES, SCANS_FILE, image_path, read_meta
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,19 +70,11 @@ def read_fleet_views(folder: Path) -> FleetViews:
 def lidar_overlap(
     T_building_laser: FloatArray, ranges_m: FloatArray, laser: LaserModel, half_view_rad: float
 ) -> FloatArray:
-    """Overlap of views: share of the returns of one view that the other view sees, the smaller of both directions.
+    """Share of the returns of a view that another one sees, the smaller of both directions, shape (N, N), in [0, 1].
 
-    The other view sees a return if it is in its field of view and its own return in that direction has the same range,
-    to a tenth. Directions without a return in the other view are ignored.
-
-    Args:
-        T_building_laser: true poses, shape (N, 3).
-        ranges_m: shape (N, beams).
-        laser: the laser of all scans.
-        half_view_rad: half of the camera's field of view.
-
-    Returns:
-        Shape (N, N), in [0, 1].
+    The other view sees a return if it is in its field of view, ``half_view_rad`` to each side, and its own return in
+    that direction has the same range, to a tenth. Directions without a return in the other view are ignored. The true
+    poses have shape (N, 3), the ranges (N, beams).
     """
     angles = laser.angles_rad()
     ahead = np.abs(se2.wrap_angle(angles)) <= half_view_rad
@@ -111,7 +103,7 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
     images, stamps, scans = [], [], []
     scan = None
     meta = read_meta(robot)
-    with RangesFile(robot) as ranges:
+    with opened(robot / RANGES) as ranges:
         for frame in merged_frames(robot, [SCANS_FILE, IMAGES_FILE]):
             if frame.fault is not None:
                 continue

@@ -34,13 +34,8 @@ class DepthCamera:
 def view_overlap(depths_m: FloatArray, T_world_camera: FloatArray, camera: DepthCamera) -> FloatArray:
     """Share of the pixels of one image that are visible in the other, the smaller of both directions.
 
-    Args:
-        depths_m: depth along the optical axis, shape (N, H, W); 0 if unknown.
-        T_world_camera: camera poses, shape (N, 4, 4).
-        camera: the camera of all images.
-
-    Returns:
-        Shape (N, N), in [0, 1].
+    Depths (N, H, W) along the optical axis, 0 if unknown; poses (N, 4, 4) of one camera. Returns shares in [0, 1],
+    shape (N, N).
     """
     _, height, width = depths_m.shape
     columns, rows = np.meshgrid(np.arange(0, width, STRIDE_PX), np.arange(0, height, STRIDE_PX))

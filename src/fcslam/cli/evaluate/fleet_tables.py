@@ -1,84 +1,46 @@
-"""`fcslam evaluate fleet`: compare a run with the true trajectories and the true map."""
+"""What `fcslam evaluate fleet` and `relations` print."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from fcslam.cli.evaluate.arguments import RunFolder
-from fcslam.cli.options import Csv
-from fcslam.cli.output import answers, notices, print_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rich.console import Console
-    from rich.table import Table
-
-    from fcslam.lab.evaluation.fleet.closures import ClosureScope
-    from fcslam.lab.evaluation.fleet.report import FleetReport
+from fcslam.cli.output import answers
+from fcslam.cli.progress import ProgressDisplay
+from fcslam.lab.evaluation.fleet.closures import BOTH, LIKE_HEADING_DEG, ClosureScope
+from fcslam.lab.evaluation.fleet.relations import write_metrics
+from fcslam.lab.evaluation.fleet.report import FleetReport, evaluate_fleet, fleet_metrics
+from fcslam.metrics.closures import EVERY_M, RADIUS_M, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
+from fcslam.metrics.grid import TOLERANCE_M
+from fcslam.metrics.relations import RelationErrors
+from fcslam.records import ClosureStatus
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
-def fleet(
-    run: RunFolder,
-    *,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder with ROBOT/ground_truth.tum or ROBOT.tum of each robot and, if known, the true map in "
-            "ground_truth/map.yaml.",
-            show_default="recordings beside the run, else the parent of the run",
-        ),
-    ] = None,
-    csv: Csv = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(help="PNG file to draw: the robots' maps, matched places, the fused map and the truth."),
-    ] = None,
-) -> None:
-    """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.metrics import fleet_metrics
-    from fcslam.lab.evaluation.fleet.relations import write_metrics
-    from fcslam.lab.evaluation.fleet.report import evaluate_fleet
-
-    with ProgressDisplay(notices()) as display:
+def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console, explained: bool = True) -> None:
+    """Compare a run with the truth: print tables, and what they mean if ``explained``; write the numbers to ``csv``."""
+    with ProgressDisplay(notices) as display:
         display.start("evaluating")
         report = evaluate_fleet(run, truth)
-    show_fleet(report, answers())
-    if csv is not None:
-        write_metrics(fleet_metrics(report), csv)
-    if figure is not None:
-        from fcslam.lab.evaluation.fleet.charts import fleet_charts
-        from fcslam.maps.fleet_figure import write_figure
-
-        with ProgressDisplay(notices()) as display:
-            display.start("drawing")
-            write_figure(fleet_charts(run, truth), figure)
-
-
-def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
-    """Print the report as tables and, if ``explained``, the definitions behind them."""
-    from fcslam.lab.evaluation.fleet.closures import ClosureScope
-
-    closures = (_closures(report, within) for within in ClosureScope)
+    console, closures = answers(), (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
     for line in (*_findings(report), *(_explanations(report) if explained else ())):
-        print_line(console, line)
+        typer.echo(line)
+    if csv is not None:
+        write_metrics(fleet_metrics(report), csv)
 
 
-def percent(share: float) -> str:
+def _percent(share: float) -> str:
     """In tenths of a percent, never rounded up to all."""
     return "-" if math.isnan(share) else f"{math.floor(1000.0 * share) / 10.0:.1f}%"
 
 
-def _robots(report: "FleetReport") -> "Table":
-    from rich.table import Table
-
+def _robots(report: FleetReport) -> Table:
     table = Table("robot", "map", "path, m", "ATE, m", "mean", "max", "aligned alone")
     for score in report.robots:
         errors = (score.joint.rmse_m, score.joint.mean_m, score.joint.max_m, score.alone.rmse_m)
@@ -87,9 +49,7 @@ def _robots(report: "FleetReport") -> "Table":
     return table
 
 
-def _relative(report: "FleetReport") -> "Table":
-    from rich.table import Table
-
+def _relative(report: FleetReport) -> Table:
     table = Table("relative poses", "pairs", "in one map", "mean, m", "max, m", "mean, deg", "max, deg")
     for name, errors in (("within robots", report.within), ("across robots", report.across)):
         metres, degrees = errors.translation, errors.rotation
@@ -98,12 +58,8 @@ def _relative(report: "FleetReport") -> "Table":
     return table
 
 
-def _closures(report: "FleetReport", within: "ClosureScope") -> "Table":
+def _closures(report: FleetReport, within: ClosureScope) -> Table:
     """Table of the channels that closed something, and of both together if both did."""
-    from rich.table import Table
-
-    from fcslam.lab.evaluation.fleet.closure_stages import BOTH
-
     table = Table(_KINDS[within], "channel", "all", "wrong", "precision", "recall", "like heading", "at 100 %")
     scores = {(status, channel): score for (kind, status, channel), score in report.closures.items() if kind is within}
     seen = {channel for (_, channel), score in scores.items() if channel != BOTH and score.precision.closures}
@@ -111,13 +67,11 @@ def _closures(report: "FleetReport", within: "ClosureScope") -> "Table":
         if channel in seen or (channel == BOTH and len(seen) != 1):
             found, recalls = score.precision, (score.recall, score.recall_like_heading, score.recall_full_precision)
             shares = (found.precision, *(each.recall for each in recalls))
-            table.add_row(str(status), channel, str(found.closures), str(found.wrong), *map(percent, shares))
+            table.add_row(str(status), channel, str(found.closures), str(found.wrong), *map(_percent, shares))
     return table
 
 
-def _traffic(report: "FleetReport") -> "Table":
-    from rich.table import Table
-
+def _traffic(report: FleetReport) -> Table:
     table = Table("sent", "kB", "kB/s", "kB/m", "places", "kB a place")
     for score in report.robots:
         kilobytes = score.uplink_bytes / 1e3
@@ -130,7 +84,7 @@ def _traffic(report: "FleetReport") -> "Table":
     return table
 
 
-def _findings(report: "FleetReport") -> "Iterator[str]":
+def _findings(report: FleetReport) -> Iterator[str]:
     yield f"Maps: {report.maps}. Pairs of robots in one map: {len(report.joins)}, of them falsely joined: " + (
         ", ".join(f"{j.robot_a} and {j.robot_b} ({j.translation_m:.2f} m, {j.rotation_deg:.1f} deg)" for j in false)
         if (false := report.false_joins)
@@ -146,13 +100,7 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
     )
 
 
-def _explanations(report: "FleetReport") -> "Iterator[str]":
-    from fcslam.lab.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
-    from fcslam.lab.evaluation.fleet.closures import ClosureScope
-    from fcslam.metrics.closures import REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
-    from fcslam.metrics.grid import TOLERANCE_M
-    from fcslam.metrics.revisits import EVERY_M, RADIUS_M
-
+def _explanations(report: FleetReport) -> Iterator[str]:
     scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
     yield f"Truth: {report.truth}, at {covered} of {scans} scans."
     yield "ATE: root mean square, each map moved onto the truth as a whole, no scale; 'alone': each robot by itself."
@@ -173,10 +121,7 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
         )
 
 
-def _revisits(report: "FleetReport", within: "ClosureScope") -> str:
-    from fcslam.lab.evaluation.fleet.closure_stages import BOTH
-    from fcslam.records import ClosureStatus
-
+def _revisits(report: FleetReport, within: ClosureScope) -> str:
     score = report.closures[within, ClosureStatus.ACCEPTED, BOTH]
     return f"{score.recall.revisits} {_KINDS[within]} ({score.recall_like_heading.revisits} with like heading)"
 
@@ -187,3 +132,11 @@ def _ratio(part: float, whole: float) -> float:
 
 def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def show_relations(errors: RelationErrors, what: str) -> None:
+    """Print errors by the relations metric as a table."""
+    table = Table("error", "mean", "std", "max", caption=f"{errors.used} of {errors.total} {what} used")
+    for name, spread, digits in (("translation, m", errors.translation, 4), ("rotation, deg", errors.rotation, 3)):
+        table.add_row(name, *(f"{value:.{digits}f}" for value in (spread.mean, spread.std, spread.maximum)))
+    answers().print(table)

@@ -7,7 +7,7 @@ from fcslam.geometry import se2
 from fcslam.mission.mission_file import as_stored
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import RobotTrajectory
-from fcslam.service.live_poses import live_pose, live_scan
+from fcslam.service.keyscans import live_pose, live_scan
 from fcslam.wire.packets import decode, measure
 from fcslam.wire.quantisation import dequantise
 from tests.scripted import LASER

@@ -1,0 +1,76 @@
+"""One map of a result: its robots, and their graph alone."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fcslam.cloud.result import FleetResult, MappedRobot
+from fcslam.geometry import se2
+from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.records import FloatArray, frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPart:
+    """The robots of one map, and the graph of these alone."""
+
+    robots: tuple[MappedRobot, ...]
+    """With the variables of this graph."""
+    graph: PoseGraph
+
+    def at(self, poses: FloatArray) -> "MapPart":
+        """The same with other poses of the variables, shape (N, 3), metres and radians."""
+        robots = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in self.robots)
+        return MapPart(robots, PoseGraph(poses, list(self.graph.edges)))
+
+
+def part_of(result: FleetResult, k: int) -> MapPart:
+    """Map ``k`` of a result."""
+    members = [robot for robot in result.robots if robot.map_index == k]
+    rows = _variables(members)
+    number = {variable: row for row, variable in enumerate(rows.tolist())}
+    edges = [
+        Edge(number[e.i], number[e.j], e.T_i_j, e.information, e.robust)
+        for e in result.graph.edges
+        if e.i in number and e.j in number
+    ]
+    robots = tuple(
+        replace(robot, variables=frozen(np.searchsorted(rows, robot.variables), np.int64)) for robot in members
+    )
+    return MapPart(robots, PoseGraph(result.graph.poses()[rows], edges))
+
+
+def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
+    """The result with map ``k`` as it is in ``part``."""
+    before = {robot.robot: robot for robot in result.robots}
+    after = {robot.robot: replace(robot, variables=before[robot.robot].variables) for robot in part.robots}
+    rows = _variables(list(after.values()))
+    poses = result.graph.poses()
+    poses[rows] = part.graph.poses()
+    inside = set(rows.tolist())
+    own = iter(part.graph.edges)
+    edges = [
+        Edge(e.i, e.j, (same := next(own)).T_i_j, same.information, e.robust) if {e.i, e.j} <= inside else e
+        for e in result.graph.edges
+    ]
+    T_after_before = {
+        name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1]))
+        for name, robot in after.items()
+    }
+    corrections = tuple(
+        replace(c, T_map_odom=frozen(se2.compose(T_after_before[c.robot], c.T_map_odom))) if c.robot in after else c
+        for c in result.corrections
+    )
+    first = part.robots[0]
+    T = se2.compose(first.T_map_base[0], se2.inverse(before[first.robot].T_map_base[0]))
+    regions = tuple(
+        replace(region, polygon=frozen(se2.transform(T, region.polygon))) if region.map_index == k else region
+        for region in result.regions
+    )
+    robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
+    return replace(result, robots=robots, corrections=corrections, graph=PoseGraph(poses, edges), regions=regions)
+
+
+def _variables(robots: Sequence[MappedRobot]) -> FloatArray:
+    return np.sort(np.concatenate([robot.variables for robot in robots]))

@@ -1,0 +1,225 @@
+"""What `fcslam serve` puts together: the state of a service or of one of its instances, its server, and learning."""
+
+import logging
+import os
+import signal
+import socket
+import ssl
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+import typer
+import uvicorn
+from fastapi import FastAPI
+
+from fcslam.cli.training_options import LEARNING_FILE, require_training_libraries
+from fcslam.cloud.settings import CloudConfig
+from fcslam.config import load
+from fcslam.errors import FcslamError, ServiceError
+from fcslam.learning.federated.settings import DETECTOR, RELEASE, FleetLearningSettings
+from fcslam.service.audit_log import AuditFile
+from fcslam.service.http.authentication import Authenticator, read_tokens
+from fcslam.service.http.events import EventStream, EventStreams
+from fcslam.service.http.limits import RateLimit
+from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
+from fcslam.service.http.state import ServiceState
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.missions import Missions
+from fcslam.service.shared.audit_table import AuditTable
+from fcslam.service.shared.instance import Hooks
+from fcslam.service.shared.mission_tables import Lease
+from fcslam.service.shared.missions import SharedMissions
+from fcslam.service.shared.registry import KnownMission
+from fcslam.service.shared.schema import prepare
+from fcslam.service.shared.spares import Spares
+from fcslam.service.supervisor import WORKER, RunningWorker, Supervisor
+from fcslam.storage.postgres import Postgres, is_server, take_password
+from fcslam.wire.http_transport import is_loopback
+
+MAX_MISSIONS, MAX_ROBOTS = 20, 200
+"""Workers that an instance runs, and robots that may send to it, unless the environment says more."""
+LONGEST_HOST = 58
+"""Characters of the host in an instance's name, which has 64 at most."""
+
+_log = logging.getLogger("fcslam.service")
+
+
+def check_open(host: str, credentials: Path | None) -> None:
+    """Check that a service may go without authentication.
+
+    Raises:
+        ServiceError: others reach it, or credentials are given in vain.
+    """
+    if not is_loopback(host):
+        raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
+    if credentials is not None:
+        raise ServiceError(
+            f"{credentials}: holds no tokens.yaml, so everybody could send and read; `fcslam tools certificates` adds "
+            "it; or give --client-ca or --insecure"
+        )
+
+
+def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, workers: str) -> ServiceState:
+    """The state of a service whose missions are files in the folder ``data``.
+
+    Raises:
+        ServiceError: the folder cannot be used, or another service uses it.
+        StoreError: the mission cannot be opened.
+    """
+    events = EventStream()
+    command = (*WORKER, "--workers", workers)
+
+    def launch(folder: MissionFolder) -> RunningWorker:
+        return Supervisor(folder.path, events.publish, command)
+
+    missions = Missions(data, config, time.monotonic, time.time, launch)
+    return ServiceState(
+        missions, authenticator, RateLimit(time.monotonic), events, AuditFile(data / "audit.jsonl"), data / "learning"
+    )
+
+
+def shared_state(
+    store: str, port: int, data: Path, authenticator: Authenticator, config: CloudConfig, workers: str
+) -> ServiceState:
+    """The state of an instance of the store; who closes its missions closes all that it holds.
+
+    Host and port name the instance; FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit it.
+
+    Raises:
+        ServiceError: the store's address or a limit cannot be used.
+        StoreError: the store cannot be used, or is of a newer version.
+    """
+    name = f"{socket.gethostname()[:LONGEST_HOST]}-{port}"
+    missions_here = _limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS)
+    robots_here = _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS)
+    if not is_server(store):
+        raise ServiceError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
+    url = take_password(store)
+    with ExitStack() as opened:
+        server = opened.enter_context(closing(Postgres(url, name)))
+        prepare(server)
+        spares = opened.enter_context(closing(Spares()))
+        audit = opened.enter_context(closing(AuditTable(server, name)))
+
+        def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
+            folder = MissionFolder(data / "missions" / mission.name)
+            folder.path.mkdir(parents=True, exist_ok=True)
+            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), "--workers", workers)
+            # Events of all instances, this one included, come from the store.
+            return Supervisor(folder.path, lambda *_: None, options, spares.start)
+
+        missions: SharedMissions
+        events = EventStreams(lambda: missions.open_mission.name)
+        hooks = Hooks(launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        missions = SharedMissions(data, config, server, name, missions_here, robots_here, hooks)
+        missions.closing = opened.pop_all().close
+        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit)
+
+
+def _limit(variable: str, least: int, otherwise: int) -> int:
+    """A limit that the environment gives.
+
+    Raises:
+        ServiceError: it is not a number, or too small.
+    """
+    text = os.environ.get(variable) or str(otherwise)
+    if not (text.isdecimal() and int(text) >= least):
+        raise ServiceError(f"{variable}={text}: is not a number from {least} on")
+    return int(text)
+
+
+def reload_on_hangup(state: ServiceState, tokens: Path | None) -> None:
+    """Read the tokens again at SIGHUP; keep the previous ones if the file is bad."""
+
+    def reload(*_: object) -> None:
+        if tokens is None:
+            return
+        try:
+            changed = state.authenticator.replace(read_tokens(tokens))
+        except FcslamError as error:
+            _log.error("%s; keeping the previous tokens", error)
+        else:
+            _log.warning("read the tokens of %s again", tokens)
+            state.audit.record("", "", "tokens read again", 200, {"changed": changed})
+
+    signal.signal(signal.SIGHUP, reload)
+
+
+def make_server(
+    app: FastAPI, certificate: Path | None, key: Path | None, client_ca: Path | None, on_exit: Callable[[], None]
+) -> uvicorn.Server:
+    """The server of an application; ``on_exit`` is called when it is asked to stop."""
+    allow_many_connections()
+    return GuardedServer(
+        uvicorn.Config(
+            app,
+            http=GuardedProtocol,
+            ssl_certfile=certificate,
+            ssl_keyfile=key,
+            ssl_ca_certs=None if client_ca is None else str(client_ca),
+            ssl_cert_reqs=ssl.CERT_NONE if client_ca is None else ssl.CERT_OPTIONAL,
+            backlog=512,
+            log_level="error",  # a line for each request that is no HTTP would fill the disk
+            proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,  # else any program of this machine names the client
+            ws="none",
+            server_header=False,
+            timeout_graceful_shutdown=10,
+            h11_max_incomplete_event_size=64 * 1024,
+        ),
+        on_exit,
+    )
+
+
+def learning_settings(data: Path, store: str | None) -> FleetLearningSettings:
+    """Check all that learning needs, before anything starts.
+
+    Args:
+        data: folder of the missions; it may hold a file of settings.
+        store: database of the missions; None: they are files.
+
+    Raises:
+        ConfigError: the settings cannot be used.
+        ServiceError: options do not fit.
+        TrainingError: a library is missing.
+    """
+    if store is not None:
+        raise ServiceError("--learn works with missions in --data; leave out --store")
+    config = data / LEARNING_FILE
+    settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
+    if not settings.federated.on_revisits:
+        raise ServiceError(f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes")
+    require_training_libraries("flwr", extra="federated")
+    return settings
+
+
+@contextmanager
+def learning_process(settings: FleetLearningSettings, state: ServiceState, output: Path) -> Iterator[Path]:
+    """Run the process in which the fleet learns beside the block; robots get what it releases.
+
+    Gives the Unix socket of the process, in a folder that only this user can open. Its rounds are in ``output``.
+    """
+
+    def announce(event: str, _number: int) -> None:
+        if event != RELEASE:
+            return
+        try:
+            file = state.missions.detectors.announce((output / DETECTOR).read_bytes())
+        except (FcslamError, OSError) as error:
+            _log.error("a release of learning cannot be announced: %s", error)
+        else:
+            _log.warning("robots are to use detector %s from now on", file.version)
+
+    with tempfile.TemporaryDirectory(prefix="fcslam-") as folder:
+        listener = Path(folder) / "learning"
+        command = [sys.executable, "-m", "fcslam.learning.federated.fleet_learning", "--listener", str(listener)]
+        command += ["--settings", settings.model_dump_json(), "--output", str(output)]
+        learner = Supervisor(state.missions.root, announce, command)
+        typer.echo(f"robots learn here; rounds are in {output}")
+        try:
+            yield listener
+        finally:
+            learner.stop()
