@@ -5,6 +5,8 @@ from contextlib import closing
 
 import pytest
 
+from tests import small_fleet
+
 
 @pytest.fixture(scope="module")
 def browser():
@@ -16,3 +18,9 @@ def browser():
         closing(started.chromium.launch(executable_path=executable, args=options)) as chromium,
     ):
         yield chromium
+
+
+@pytest.fixture(scope="module")
+def packets():
+    """Packets of three robots that drive 12 m each, longer than for other tests: their maps hold more to look at."""
+    return small_fleet.in_order(p for robot in small_fleet.draw(3, 12.0).robots for p in small_fleet.sent_by(robot))
