@@ -54,9 +54,10 @@ def main() -> None:
     for folder in arguments.images:
         gathered[Channel.CAMERA] += photographs(folder, arguments.most_images)
         print(folder, len(gathered[Channel.CAMERA]), flush=True)
+    arguments.output.mkdir(parents=True, exist_ok=True)
     for channel, places in gathered.items():
-        arguments.output.mkdir(parents=True, exist_ok=True)
-        np.save(arguments.output / f"{channel}.npy", fit(channel, places))
+        if places:
+            np.save(arguments.output / f"{channel}.npy", fit(channel, places))
 
 
 def places_of(name: str) -> Iterator[Place]:

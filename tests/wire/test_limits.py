@@ -242,7 +242,7 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
 @pytest.mark.parametrize(
     ("name", "fields", "reason"),
     [
-        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 to 8"),
+        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 to 9"),
         ("hello", {"version": 3}, "version 3 of a packet of version 2"),
         ("keyscan", {"version": 3}, "version 3 of a packet of version 2"),
         ("floor_hello", {"version": 2}, "version 2 of a packet of version 3"),

@@ -92,8 +92,10 @@ def play(
                     play_records(robot, opened.records(), pace, watch, stay)
             except KeyboardInterrupt:
                 left = robot.status().waiting
-                size = f"{left.packets} packets ({left.bytes / 1e3:.0f} kB)"
-                print_line(console, f"{size} wait in {state}; to continue, give --resume")
+                print_line(
+                    console,
+                    f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume",
+                )
                 raise
             print_faults(console, {opened.name: opened.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry_jumps)})
             _report(robot, state, cloud.url)

@@ -365,6 +365,10 @@ def _keyscan_version(keyscan: Keyscan) -> int:
     return limits.PROTOCOL_VERSION if keyscan.sweep is None else limits.SWEEP_VERSION
 
 
+def _place_version(place: Place) -> int:
+    return limits.CAMERA_VERSION if place.channel is Channel.CAMERA else limits.PROTOCOL_VERSION
+
+
 def _always(number: int) -> Callable[[Any], int]:
     return lambda _: number
 
@@ -399,7 +403,7 @@ CODECS = {
     PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello, version=_hello_version),
     PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _RANGES),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, unpacked_bytes=_DESCRIBED),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, _place_version, _DESCRIBED),
     PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place, _WORDS, _IN_WORDS),
     PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, _same, _WORDS, _always(limits.BYTES_PER_TILE)),
     PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, _TAG),

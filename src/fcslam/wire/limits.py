@@ -1,4 +1,4 @@
-"""All limits of the format, versions 2 to 8. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 to 9. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
@@ -13,7 +13,9 @@ TAG_VERSION = 7
 """Version of a tag sighting."""
 FIX_VERSION = 8
 """Version of a fix of satellite navigation."""
-VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION)
+CAMERA_VERSION = 9
+"""Version of a place of the camera: the weights that its descriptors are coded by fit the bundled network."""
+VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION, CAMERA_VERSION)
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
