@@ -120,7 +120,6 @@ def drawn(rng, points, channel):
     return bits, worth
 
 
-@CHANNELS
 def test_the_weights_of_the_camera_fit_the_bundled_network():
     # Weights that were fitted to another network need 26 bytes here; without any it is 32.
     rng = np.random.default_rng(1)
@@ -137,6 +136,7 @@ def test_the_weights_of_the_camera_fit_the_bundled_network():
     assert len(packed) < 18 * len(order)
 
 
+@CHANNELS
 def test_a_bit_is_expected_by_earlier_ones_alone(channel):
     predictor = predictor_of(channel)
     assert not np.tril(predictor.own).any()
