@@ -181,8 +181,8 @@ def in_map_of_others(
     run, _ = localized(own, work / f"without-{own.name}")
     T_map_all = align(*(each.trajectories[others[0].name].T_map_base for each in (mapped, together)))
     poses, truth = run.localized[own.name], together.trajectories[own.name]
-    moved = se2.compose(T_map_all, truth.T_map_base[np.searchsorted(truth.stamps, poses.stamps)])
-    return run, se2.between(moved, poses.T_map_base)
+    assert np.array_equal(poses.stamps, truth.stamps), "one pose for each scan"
+    return run, se2.between(se2.compose(T_map_all, truth.T_map_base), poses.T_map_base)
 
 
 def strangers(folder: Path, logs: Sequence[str], mapped: str, work: Path) -> Iterable[tuple]:

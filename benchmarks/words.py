@@ -49,7 +49,7 @@ def vocabulary(folder: Path, fleets: Path) -> Path:
     """Words of another building."""
     fleet = common.simulated(fleets / "other", "--robots", simulated_fleet.ROBOTS, "--seed", OTHER_SEED)
     run, words = folder / "other-run", folder / "shared.words"
-    common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--output", run)
+    common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--config", "paper", "--output", run)
     common.run_fcslam("tools", "vocabulary", run, "--output", words)
     return words
 
