@@ -70,7 +70,13 @@ def test_every_script_has_a_report():
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 @pytest.mark.usefixtures("common")
 def test_imports_without_running(path, capsys):
-    assert callable(load(path).main)
+    try:
+        script = load(path)
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "flwr"):
+            raise
+        pytest.skip("needs fcslam[federated]")
+    assert callable(script.main)
     assert capsys.readouterr().out == ""
 
 

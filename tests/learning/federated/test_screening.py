@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+
 from benchmarks.federated_study.poison import apply_update
 from fcslam.learning.federated.screening import agreements, screen, statistics_distances, update_length
 from fcslam.learning.federated.settings import ScreeningSettings
