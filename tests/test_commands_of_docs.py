@@ -43,7 +43,7 @@ BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGES_WITH_COMMANDS = [page for page in PAGES if page.name not in {"CHANGELOG.md", "CONTRIBUTING.md", "commands.md"}]
 
 ANNA, BEN, CLEO, LONG, MEETS = "anna.clf", "ben.clf", "cleo.clf", "long.clf", "meets.clf"
-SCANS = {ANNA: 45, BEN: 24, CLEO: 45, LONG: 100, MEETS: 45}
+SCANS = {ANNA: 45, BEN: 24, CLEO: 45, LONG: 100, MEETS: 100}
 """Of a sample log that the commands get. ``BEN`` ends before its map joins, which takes longest."""
 OF = {LONG: ANNA, MEETS: BEN}
 """Sample logs of other names. The long one has relations over 20 s."""
@@ -246,8 +246,9 @@ def downloads(port: int) -> set[tuple[str, str]]:
 
 @pytest.mark.slow
 def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys, monkeypatch):
-    (meets := desk / "examples" / "logs" / "ben.clf.xz").unlink()
-    meets.symlink_to(logs / MEETS)
+    for name, long in (("anna", LONG), ("ben", MEETS)):  # after 45 scans, the evidence for a join is at its limit
+        (link := desk / "examples" / "logs" / f"{name}.clf.xz").unlink()
+        link.symlink_to(logs / long)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
 

@@ -16,7 +16,7 @@ from fcslam.learning.federated.relay import learning_router
 @pytest.fixture
 def asked(tmp_path):
     """The status of a request of anna, while no process learns."""
-    state = SimpleNamespace(require=lambda *_: [], rate=SimpleNamespace(wait_s=lambda *_: 0.0))
+    state = SimpleNamespace(require=lambda *_: [], rate=SimpleNamespace(check=lambda _: None))
     app = FastAPI()
     app.include_router(learning_router(state, tmp_path / "nobody"))
 
