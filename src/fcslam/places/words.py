@@ -72,7 +72,8 @@ def train_words(
     building. Only the cloud has the tree of Algorithm 1.
     """
     shape = TreeShape(most_words, 1, 2, _ITERATIONS)
-    centres, _ = k_means(code_words(descriptors), shape, np.array([seed], np.uint64))
+    codes = code_words(descriptors).copy()  # of arrays that cannot be written, numba compiles a version of its own
+    centres, _ = k_means(codes, shape, np.array([seed], np.uint64))
     distinct = np.unique(centres.view(np.uint8).reshape(-1, CODE_BYTES), axis=0)
     return WordVocabulary(channel, detector_version, frozen(distinct, np.uint8))
 
