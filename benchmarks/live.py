@@ -212,7 +212,7 @@ async def _robot(
             path, content = f"/api/v1/robots/{name}/packets", write_batch(due.packets)
             try:
                 answer = await client.post(path, content=content, headers=known)
-            except httpx.ReadError:  # the service closed an idle connection; a robot sends again as well
+            except (httpx.ReadError, httpx.RemoteProtocolError):  # the service closed an idle connection: robots retry
                 answer = await client.post(path, content=content, headers=known)
             answer.raise_for_status()
             sent.append(Sent(name, asked, time.perf_counter(), len(due.packets), due.has_place))

@@ -41,9 +41,9 @@ class FleetConfig(Settings):
         description="number of new closures after which the joint graph is solved; 5 % of all closures if that is more",
     )
     submaps_kept: int = Field(
-        default=100,
+        default=1000,
         gt=1,
-        description="number of submaps in the cache, 0.3 MB each; those beyond it are rebuilt from their keyscans",
+        description="number of submaps in the cache, 0.05 MB each; those beyond it are rebuilt from their keyscans",
     )
     contradiction: float = Field(
         default=0.06,

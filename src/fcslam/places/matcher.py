@@ -8,7 +8,8 @@ the overlap of the two submaps under this motion decides. To the letter of the p
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple, Self
+from functools import lru_cache
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -28,6 +29,8 @@ from fcslam.storage.state_file import State
 START_SHARE = 1.0 / 3.0
 """Share of the points of the loose gate that is enough where known starts predict a closure."""
 NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
+DESCRIPTORS_KEPT: Final = 256
+"""Places whose descriptors are kept together, 10 kB each: the index holds descriptors by word."""
 
 
 class MatchDecision(StrEnum):
@@ -193,7 +196,7 @@ class PlaceMatcher:
         self._verify_pairs = verify_pairs
         self._places: dict[KeyscanId, Place] = {}
         """Without the descriptors that the index holds."""
-        self._index: PlaceIndex[KeyscanId] = PlaceIndex(config.vocabulary, rng)
+        self._use(PlaceIndex(config.vocabulary, rng))
         self._backlog: list[Place] = []
 
     def __len__(self) -> int:
@@ -298,8 +301,12 @@ class PlaceMatcher:
             self._places[identifier] = Place(
                 identifier, channel, detector_version, first, last, points, frozen(codes, np.uint8)
             )
-        self._index = PlaceIndex.restored(self._config.vocabulary, state["index"], ids[:indexed], descriptors[:indexed])
+        self._use(PlaceIndex.restored(self._config.vocabulary, state["index"], ids[:indexed], descriptors[:indexed]))
         self._backlog = list(self._places.values())[indexed:]
+
+    def _use(self, index: PlaceIndex[KeyscanId]) -> None:
+        self._index = index
+        self._descriptors = lru_cache(DESCRIPTORS_KEPT)(index.descriptors)
 
     def _query(self, place: Place) -> QueryResult[KeyscanId]:
         for stored in self._backlog:  # a single robot never needs the vocabulary
@@ -311,7 +318,7 @@ class PlaceMatcher:
     def _stored(self, i: KeyscanId) -> Place:
         """A stored place with its descriptors."""
         place = self._places[i]
-        return replace(place, descriptors=self._index.descriptors(i)) if i in self._index else place
+        return replace(place, descriptors=self._descriptors(i)) if i in self._index else place
 
     def forget(self, place: KeyscanId) -> None:
         """Remove a place.
