@@ -1,5 +1,6 @@
 """Packets are stored once and unchanged, in the order of their arrival, in a file and on a PostgreSQL server."""
 
+import contextlib
 import os
 import secrets
 import sqlite3
@@ -284,3 +285,30 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
         connection.close()
     with pytest.raises(StoreError):
         check_mission(path)
+
+
+def test_the_time_for_a_packet_does_not_grow_with_the_mission(tmp_path):
+    """No statement that a packet or a reply to a robot needs reads all packets; SQLite calls that a scan."""
+    path = tmp_path / "mission.sqlite"
+    store = MissionStore(path)
+    store.put([packet(robot, sequence=k) for robot in "ab" for k in range(20)], 1.0)
+    statements = []
+    for connection in (store._database._connection, store._database._reading):
+        connection.set_trace_callback(statements.append)
+    store.put([packet(sequence=k) for k in range(15, 25)], 2.0)
+    store.progress(40, [correction("a", 1.0)])
+    store.arrivals(30, 10)
+    store.packet("a", 0, 3)
+    store.correction("a", 0)
+    store.newest_hello("a", 0)
+    store.newest_keyscan("a", 0)
+    store.refusal_count("a")
+    store.envelopes(after=30)
+    store.traffic_since(30, 10)
+    store.close()
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.create_function("seal", -1, seal)
+        queries = [statement for statement in statements if "packets" in statement]
+        plans = {query: [row[3] for row in database.execute(f"EXPLAIN QUERY PLAN {query}")] for query in queries}
+    assert len(plans) >= 9
+    assert not {query: plan for query, plan in plans.items() if any("SCAN packets" in step for step in plan)}
