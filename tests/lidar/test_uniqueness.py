@@ -10,11 +10,12 @@ from tests.flats import BACK, ROUND, doors, flat, lookalike, mirrored
 from tests.lidar.worlds import box, drive, scan_at
 
 
-def map_of(segments, waypoints, seed):
-    """A map and the pose of its anchor in the drawing."""
+def map_of(segments, waypoints, seed, T_map_start=(0.0, 0.0, 0.0)):
+    """A map, which the robot begins at a pose, and the pose of its frame in the drawing."""
     poses, rng = drive(waypoints, step_m=0.4, step_rad=0.5), np.random.default_rng(seed)
-    scans = [(scan_at(pose, segments, noise_m=0.015, rng=rng), se2.between(poses[0], pose)) for pose in poses]
-    return build_submap(scans), poses[0]
+    frame = se2.compose(poses[0], se2.inverse(np.array(T_map_start)))
+    scans = [(scan_at(pose, segments, noise_m=0.015, rng=rng), se2.between(frame, pose)) for pose in poses]
+    return build_submap(scans, radius_m=60.0), frame
 
 
 def compared(one, other):
@@ -32,8 +33,9 @@ def test_a_flat_fits_itself_in_one_way_only():
     assert best.violation < 0.01
 
 
-def test_the_search_finds_the_true_transform_when_asked_for_another():
-    (a, anchor_a), (b, anchor_b) = map_of(flat(), ROUND, 0), map_of(flat(), BACK, 1)
+@pytest.mark.parametrize("turn_rad", [0.0, 0.8, 1.6, 2.4, 3.2, 4.0, 4.8, 5.6])
+def test_the_search_finds_the_true_transform_when_asked_for_another(turn_rad):
+    (a, anchor_a), (b, anchor_b) = map_of(flat(), ROUND, 0), map_of(flat(), BACK, 1, (7.0, -4.0, turn_rad))
     found = best_elsewhere(a, b, np.array([50.0, 0.0, 0.0]))
     assert np.allclose(se2.between(se2.between(anchor_a, anchor_b), found.T_a_b), 0.0, atol=0.05)
 

@@ -101,7 +101,8 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
 
 
 def _headings(plan: Submap, building: Submap) -> FloatArray | None:
-    """Headings of the map at which the walls of both are parallel, shape (4,), radians; None: walls of no direction."""
+    """Headings of the map over half a turn at which the walls of both are parallel, shape (2,), radians; None: walls of
+    no direction."""
     directions = []
     for submap in (plan, building):
         normals = submap.surface.normals[np.any(submap.surface.normals != 0.0, axis=1)]
@@ -109,4 +110,4 @@ def _headings(plan: Submap, building: Submap) -> FloatArray | None:
         if abs(mean) < DIRECTED:
             return None
         directions.append(float(np.angle(mean)) / 4.0)
-    return np.asarray(directions[0] - directions[1] + 0.5 * np.pi * np.arange(4), np.float64)
+    return np.asarray(directions[0] - directions[1] + 0.5 * np.pi * np.arange(2), np.float64)

@@ -102,7 +102,7 @@ def two_best(
 
     Args:
         a, b: maps, each in the coordinate frame of its anchor.
-        headings: headings of b in a, shape (H,), radians; None: all.
+        headings: headings of b in a, shape (H,), radians, each of which stands for half a turn farther, too; None: all.
 
     Returns:
         The two alignments; None if a map is empty.
@@ -148,6 +148,10 @@ class _Drawing:
     """Shape (2,), in the map's own coordinates."""
     reach_m: float
     """Distance of the farthest of these points."""
+    low: FloatArray
+    """Least x and y of these points, shape (2,)."""
+    high: FloatArray
+    """Largest x and y of these points, shape (2,)."""
 
 
 def _drawing(submap: Submap) -> _Drawing:
@@ -159,59 +163,61 @@ def _drawing(submap: Submap) -> _Drawing:
     rows, columns = np.nonzero(free.cells & away)
     middle = points.mean(axis=0)
     inside = (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M + free.corner - middle
-    reach_m = float(np.hypot(*np.concatenate((points - middle, inside)).T).max())
-    return _Drawing(points - middle, inside, middle, reach_m)
+    drawn = np.concatenate((points - middle, inside))
+    reach_m = float(np.hypot(*drawn.T).max())
+    return _Drawing(points - middle, inside, middle, reach_m, drawn.min(axis=0), drawn.max(axis=0))
 
 
 def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> Iterator[tuple[float, FloatArray]]:
-    """Score and T_a_b of the best positions for every heading, by correlation of images."""
+    """Score and T_a_b of the best positions for every heading and for half a turn farther, by correlation of images."""
     one, other = _drawing(a), _drawing(b)
-    cells = fft.next_fast_len(int(np.ceil(2.0 * (one.reach_m + other.reach_m) / CELL_M)) + 2, real=True)
-    smear = _smear(cells)
-    surface_a, worth_a = _spectra(one, 0.0, smear)
-    for heading in _all_headings(other) if headings is None else headings:
-        surface_b, worth_b = _spectra(other, heading, smear)
-        scores = fft.irfft2(worth_a * np.conj(surface_b) + surface_a * np.conj(worth_b), (cells, cells))
-        for _ in range(PEAKS):
-            row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
-            shift = np.array([column, row], dtype=np.float64)
-            shift = CELL_M * np.where(shift > cells / 2, shift - cells, shift)
-            T_middle = np.append(shift + one.middle, heading)
-            yield float(scores[row, column]), se2.compose(T_middle, np.append(-other.middle, 0.0))
-            near = np.arange(-4, 5)
-            scores[np.ix_((row + near) % cells, (column + near) % cells)] = -np.inf
+    # Every shift of b at which the images touch has a cell of its own, at its number modulo ``cells``.
+    least, most = np.floor((one.low - other.reach_m) / CELL_M), np.ceil((one.high + other.reach_m) / CELL_M)
+    columns, rows = (fft.next_fast_len(int(extent) + 2, real=True) for extent in most - least)
+    surface_a, inside_a = _spectra(one, 0.0, (rows, columns))
+    worth_a = 2.0 * surface_a * _smear(rows, columns) - inside_a  # surface on surface counts for both maps
+    for heading in _half_headings(other) if headings is None else headings:
+        surface_b, inside_b = _spectra(other, heading, (rows, columns))
+        for half in (0, 1):
+            # Half a turn takes cell i to -1 - i, whose spectrum is the conjugate, shifted by a cell.
+            turned = np.conj if half == 0 else np.positive
+            scores = fft.irfft2(worth_a * turned(surface_b) - surface_a * turned(inside_b), (rows, columns))
+            for _ in range(PEAKS):
+                row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+                shift = least + (np.array([column, row]) + half - least) % (columns, rows)
+                T_middle = np.append(CELL_M * shift + one.middle, heading + half * np.pi)
+                yield float(scores[row, column]), se2.compose(T_middle, np.append(-other.middle, 0.0))
+                near = np.arange(-4, 5)
+                scores[np.ix_((row + near) % rows, (column + near) % columns)] = -np.inf
 
 
-def _all_headings(drawing: _Drawing) -> FloatArray:
+def _half_headings(drawing: _Drawing) -> FloatArray:
+    """Headings over half a turn at which the far walls of a map move by a cell and a half."""
     lever_m = float(np.quantile(np.hypot(*drawing.surface.T), 0.9))
-    count = max(36, int(np.ceil(2.0 * np.pi * lever_m / (1.5 * CELL_M))))
-    return np.asarray(np.arange(count) * (2.0 * np.pi / count), np.float64)
+    count = max(18, int(np.ceil(np.pi * lever_m / (1.5 * CELL_M))))
+    return np.asarray(np.arange(count) * (np.pi / count), np.float64)
 
 
-def _smear(cells: int) -> NDArray[np.float32]:
-    """Spectrum of a Gaussian that is 1 on a straight wall, shape (cells, cells // 2 + 1)."""
-    y, x = np.meshgrid(fft.fftfreq(cells), fft.rfftfreq(cells), indexing="ij")
+def _smear(rows: int, columns: int) -> NDArray[np.float32]:
+    """Spectrum of a Gaussian that is 1 on a straight wall, shape (rows, columns // 2 + 1)."""
+    y, x = np.meshgrid(fft.fftfreq(rows), fft.rfftfreq(columns), indexing="ij")
     spectrum: NDArray[np.float32] = np.exp(-2.0 * np.pi**2 * (x * x + y * y)).astype(np.float32)
     return spectrum * np.float32(np.sqrt(2.0 * np.pi))
 
 
-def _spectra(drawing: _Drawing, heading: float, smear: NDArray[np.float32]) -> tuple[Spectrum, Spectrum]:
-    """Spectra of a turned map: the cells with a surface, and the score of such a cell of another map in each cell.
+def _spectra(drawing: _Drawing, heading: float, shape: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
+    """Spectra of a turned map: of the cells with a surface, and of the free cells well away from any.
 
     Single precision is enough for peaks that are refined later, and takes two thirds of the time.
     """
-    cells = len(smear)
     turn = np.array([0.0, 0.0, heading])
-    surface, inside = np.zeros((2, cells, cells), np.float32)
-    row, column = _cells_of(se2.transform(turn, drawing.surface), cells)
-    surface[row, column] = 1.0
-    row, column = _cells_of(se2.transform(turn, drawing.inside), cells)
-    inside[row, column] = VIOLATION_WEIGHT
-    occupied = fft.rfft2(surface)
-    return occupied, occupied * smear - fft.rfft2(inside)
+    surface, inside = np.zeros((2, *shape), np.float32)
+    surface[_cells_of(se2.transform(turn, drawing.surface), shape)] = 1.0
+    inside[_cells_of(se2.transform(turn, drawing.inside), shape)] = VIOLATION_WEIGHT
+    return fft.rfft2(surface), fft.rfft2(inside)
 
 
-def _cells_of(points: FloatArray, cells: int) -> NDArray[np.int64]:
-    """Row and column of each point, shape (2, N); the origin is in the middle of the image."""
-    at: NDArray[np.int64] = np.floor(points / CELL_M).astype(np.int64) + cells // 2
-    return at[:, ::-1].T
+def _cells_of(points: FloatArray, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of each point (N, 2) in a periodic image of this shape, whose cell (0, 0) begins at the origin."""
+    column, row = np.floor(points / CELL_M).astype(np.int64).T
+    return row % shape[0], column % shape[1]
