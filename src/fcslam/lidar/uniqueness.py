@@ -6,7 +6,6 @@ door farther. So this module aligns both maps at every heading and position, and
 the best one elsewhere.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import distance_transform_edt
 
+from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap, agreement
@@ -121,7 +121,7 @@ def _distinct_peaks(
 ) -> list[FloatArray]:
     """The best transforms of the exhaustive search that are elsewhere than each other and than the ``known`` ones."""
     distinct = list(known)
-    for _, pose in sorted(_coarse_peaks(a, b, headings), key=lambda peak: -peak[0]):
+    for pose in _coarse_peaks(a, b, headings):
         if all(is_elsewhere(pose, other, middle) for other in distinct):
             distinct.append(pose)
         if len(distinct) >= REFINED + len(known):
@@ -168,27 +168,47 @@ def _drawing(submap: Submap) -> _Drawing:
     return _Drawing(points - middle, inside, middle, reach_m, drawn.min(axis=0), drawn.max(axis=0))
 
 
-def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> Iterator[tuple[float, FloatArray]]:
-    """Score and T_a_b of the best positions for every heading and for half a turn farther, by correlation of images."""
+def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> FloatArray:
+    """T_a_b (K, 3) of the best positions for every heading and for half a turn farther, the best ones first.
+
+    The score is a correlation of images: a cell of surface of one map counts by the cell of the other that it lies on,
+    1 on a surface, blurred, and -``VIOLATION_WEIGHT`` in free space.
+    """
     one, other = _drawing(a), _drawing(b)
-    # Every shift of b at which the images touch has a cell of its own, at its number modulo ``cells``.
+    # Every shift of b at which the images touch has a cell of its own, at its number modulo the sides of the image.
     least, most = np.floor((one.low - other.reach_m) / CELL_M), np.ceil((one.high + other.reach_m) / CELL_M)
     columns, rows = (fft.next_fast_len(int(extent) + 2, real=True) for extent in most - least)
     surface_a, inside_a = _spectra(one, 0.0, (rows, columns))
-    worth_a = 2.0 * surface_a * _smear(rows, columns) - inside_a  # surface on surface counts for both maps
+    worth = 2.0 * surface_a * _smear(rows, columns) - VIOLATION_WEIGHT * inside_a  # a surface counts for both maps
+    against, product, near = VIOLATION_WEIGHT * surface_a, np.empty_like(surface_a), np.arange(-4, 5)
+    found: list[tuple[float, float, int, int]] = []
     for heading in _half_headings(other) if headings is None else headings:
         surface_b, inside_b = _spectra(other, heading, (rows, columns))
         for half in (0, 1):
-            # Half a turn takes cell i to -1 - i, whose spectrum is the conjugate, shifted by a cell.
-            turned = np.conj if half == 0 else np.positive
-            scores = fft.irfft2(worth_a * turned(surface_b) - surface_a * turned(inside_b), (rows, columns))
+            _correlate(worth, against, surface_b, inside_b, half == 1, product)
+            scores = fft.irfft2(product, (rows, columns))
             for _ in range(PEAKS):
-                row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
-                shift = least + (np.array([column, row]) + half - least) % (columns, rows)
-                T_middle = np.append(CELL_M * shift + one.middle, heading + half * np.pi)
-                yield float(scores[row, column]), se2.compose(T_middle, np.append(-other.middle, 0.0))
-                near = np.arange(-4, 5)
-                scores[np.ix_((row + near) % rows, (column + near) % columns)] = -np.inf
+                row, column = divmod(int(np.argmax(scores)), columns)
+                found.append((scores[row, column], heading + half * np.pi, column + half, row + half))
+                scores[((row + near) % rows)[:, None], (column + near) % columns] = -np.inf
+    score, heading_a_b, *cell = np.array(found).T
+    shift = least + (np.column_stack(cell) - least) % (columns, rows)
+    T_middle = np.column_stack((CELL_M * shift + one.middle, heading_a_b))
+    return se2.compose(T_middle, np.append(-other.middle, 0.0))[np.argsort(-score, kind="stable")]
+
+
+@njit(allocates=False)
+def _correlate(worth, against, surface, inside, half, product):  # type: ignore[no-untyped-def]
+    """Spectrum of the scores: W S* - A I* with the spectra S and I of a map, or those of the map turned by ``half``.
+
+    Half a turn takes cell i to -1 - i, whose spectrum is the conjugate, shifted by a cell.
+    """
+    for row in range(product.shape[0]):
+        for k in range(product.shape[1]):
+            s, i = surface[row, k], inside[row, k]
+            if not half:
+                s, i = np.conj(s), np.conj(i)
+            product[row, k] = worth[row, k] * s - against[row, k] * i
 
 
 def _half_headings(drawing: _Drawing) -> FloatArray:
@@ -210,14 +230,19 @@ def _spectra(drawing: _Drawing, heading: float, shape: tuple[int, int]) -> tuple
 
     Single precision is enough for peaks that are refined later, and takes two thirds of the time.
     """
-    turn = np.array([0.0, 0.0, heading])
     surface, inside = np.zeros((2, *shape), np.float32)
-    surface[_cells_of(se2.transform(turn, drawing.surface), shape)] = 1.0
-    inside[_cells_of(se2.transform(turn, drawing.inside), shape)] = VIOLATION_WEIGHT
+    _draw(drawing.surface, heading, surface)
+    _draw(drawing.inside, heading, inside)
     return fft.rfft2(surface), fft.rfft2(inside)
 
 
-def _cells_of(points: FloatArray, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of each point (N, 2) in a periodic image of this shape, whose cell (0, 0) begins at the origin."""
-    column, row = np.floor(points / CELL_M).astype(np.int64).T
-    return row % shape[0], column % shape[1]
+@njit(allocates=False)
+def _draw(points, heading, image):  # type: ignore[no-untyped-def]
+    """Set the cells of points (N, 2), turned by a heading, in a periodic image whose cell (0, 0) begins at 0."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    rows, columns = image.shape
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        column = int(np.floor((cos * x - sin * y) / CELL_M))
+        row = int(np.floor((sin * x + cos * y) / CELL_M))
+        image[row % rows, column % columns] = 1.0
