@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
-from fcslam.graph.cluster import count_separate_places, dominant_cluster
+from fcslam.graph.cluster import count_separate_places, dominant_cluster, relative_frame
 from fcslam.graph.consistency import (
     Closures,
     ConsistencySettings,
@@ -311,3 +311,15 @@ def test_clique_of_nothing_and_of_no_edges() -> None:
     assert len(maximum_clique(np.zeros((3, 3), dtype=bool)).members) == 1
     with pytest.raises(ValueError, match="symmetric"):
         maximum_clique(np.triu(np.ones((3, 3), dtype=bool)))
+
+
+@pytest.mark.parametrize("still", ["a", "b"])
+def test_places_that_are_one_place_to_one_robot_give_no_direction(still):
+    """As a robot claims that another one is where it is: the first closure alone gives the frame."""
+    moved = build_trajectory(walk(3, 20), SETTINGS)
+    ends = np.array([0, len(moved) - 1])
+    i, j = (np.zeros_like(ends), ends) if still == "a" else (ends, np.zeros_like(ends))
+    a, b = (STILL, moved) if still == "a" else (moved, STILL)
+    closures = Closures(i, j, np.zeros((2, 3)), np.tile(INFORMATION, (2, 1, 1)))
+    T_a_b = se2.between(se2.inverse(a.poses[i[0]]), se2.inverse(b.poses[j[0]]))
+    assert relative_frame(a, b, closures) == pytest.approx(T_a_b)

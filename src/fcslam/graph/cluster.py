@@ -102,8 +102,8 @@ def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> Float
 def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
     """Estimate ``T_a_b`` of the frames of two trajectories from the two matched places that lie farthest apart.
 
-    Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other to fix a rotation, the first
-    closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only without
+    Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other in a or b to fix a rotation, the
+    first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only without
     others, and then all of them by their information.
 
     Args:
@@ -122,7 +122,7 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     in_a, in_b = T_a_j[:, :2], b.poses[closures.j, :2]
     distance = np.hypot(*np.moveaxis(in_b[:, None] - in_b[None], -1, 0))
     k, m = np.unravel_index(int(np.argmax(distance)), distance.shape)
-    if distance[k, m] < DIRECTION_M:
+    if min(distance[k, m], np.hypot(*(in_a[k] - in_a[m]))) < DIRECTION_M:
         return se2.compose(T_a_j[0], se2.inverse(b.poses[closures.j[0]]))
     return two_point_alignment(in_a[[k, m]], in_b[[k, m]])
 
