@@ -77,13 +77,7 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
     """
     if max(len(a), len(b)) > _MOST_CODES:
         raise ValueError(f"at most {_MOST_CODES} codes a set, not {max(len(a), len(b))}")
-    row_keys, column_keys = _nearest_keys(code_words(a), code_words(b))
-    column_of = (row_keys & np.uint32(_MOST_CODES - 1)).astype(np.int64)
-    distances = (row_keys >> np.uint32(_INDEX_BITS)).astype(np.uint16)
-    rows = np.flatnonzero((row_keys != _UNMATCHED) & (distances <= max_distance))
-    row_of = (column_keys & np.uint32(_MOST_CODES - 1)).astype(np.int64)
-    rows = rows[row_of[column_of[rows]] == rows]
-    return Matches(np.stack((rows, column_of[rows]), axis=1), distances[rows])
+    return Matches(*_mutual_matches(code_words(a), code_words(b), max_distance))
 
 
 def nearest_codes(a: Codes, b: Codes) -> NDArray[np.int64]:
@@ -113,6 +107,20 @@ def _hamming_matrix(a: CodeWords, b: CodeWords) -> NDArray[np.uint16]:
         for j in range(b.shape[0]):
             distances[i, j] = hamming(a[i], b[j])
     return distances
+
+
+@njit
+def _mutual_matches(a: CodeWords, b: CodeWords, max_distance: int) -> tuple[NDArray[np.int64], NDArray[np.uint16]]:
+    row_keys, column_keys = _nearest_keys(a, b)
+    pairs, distances = np.empty((a.shape[0], 2), np.int64), np.empty(a.shape[0], np.uint16)
+    count = 0
+    for row in range(a.shape[0]):
+        column, distance = row_keys[row] & (_MOST_CODES - 1), row_keys[row] >> _INDEX_BITS
+        if row_keys[row] == _UNMATCHED or distance > max_distance or column_keys[column] & (_MOST_CODES - 1) != row:
+            continue
+        pairs[count, 0], pairs[count, 1], distances[count] = row, column, distance
+        count += 1
+    return pairs[:count], distances[:count]
 
 
 @njit
