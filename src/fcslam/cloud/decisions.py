@@ -40,7 +40,7 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 
-EXAMINED_GROWTH = 2.0
+EXAMINED_GROWTH = 1.5
 """The maps of two sessions are compared again when their cluster has grown by this factor: at each place, it would take
 longer than all else."""
 CONTESTED_GROWTH = 1.1
