@@ -193,6 +193,12 @@ def probe(statement: str, folder: Path) -> list[str]:
     return answer
 
 
+def test_mapping_loads_no_transforms_until_maps_are_compared():
+    """They take as long to load as hundreds of scans to map."""
+    code = "import sys, fcslam.mission.mission, fcslam.live; sys.exit('scipy.fft' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("statement", "others"),

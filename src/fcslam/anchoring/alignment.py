@@ -9,7 +9,6 @@ from fcslam.anchoring.lengths import lengths_in_plan
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
 from fcslam.lidar.submap import SPACING_M, Submap, agreement
-from fcslam.lidar.uniqueness import align_map, is_elsewhere, two_best
 from fcslam.records import FloatArray
 
 LEAST_EXPLAINED: Final = 0.7
@@ -75,6 +74,8 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
     It is looked for from all positions, and by the directions of walls or all headings. A map that is ``placed`` lies
     about there in the plan already, and no other place is looked for.
     """
+    from fcslam.lidar.uniqueness import align_map, is_elsewhere, two_best  # SciPy's transforms take long to load
+
     target = plan.submap
     if not len(building.surface):
         return None
