@@ -190,8 +190,13 @@ def tables(
     if rows:
         yield "\n".join(["| key | default | unit | allowed | effect |", "|---|---|---|---|---|", *rows, ""])
     for key, field, value in nested:
-        yield f"{heading} `{path}{key}`\n\n{sentence(field.description)}\n"
+        yield f"{heading} `{path}{key}`\n\n{sentence(field.description)} In the code: {place_of(type(value))}.\n"
         yield from tables(value, f"{path}{key}.", documented, heading)
+
+
+def place_of(kind: type) -> str:
+    """The class and its file, as the architecture page names both."""
+    return f"`{kind.__name__}` in `{kind.__module__.removeprefix('fcslam.').replace('.', '/')}.py`"
 
 
 def row(path: str, field: FieldInfo, value: Any) -> str:
