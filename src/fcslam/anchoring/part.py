@@ -7,7 +7,7 @@ import numpy as np
 
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
-from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, frozen
 
 
@@ -22,23 +22,20 @@ class MapPart:
     def at(self, poses: FloatArray) -> "MapPart":
         """The same with other poses of the variables, shape (N, 3), metres and radians."""
         robots = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in self.robots)
-        return MapPart(robots, PoseGraph(poses, list(self.graph.edges)))
+        return MapPart(robots, PoseGraph.restored(poses, self.graph.given()))
 
 
 def part_of(result: FleetResult, k: int) -> MapPart:
     """Map ``k`` of a result."""
     members = [robot for robot in result.robots if robot.map_index == k]
     rows = _variables(members)
-    number = {variable: row for row, variable in enumerate(rows.tolist())}
-    edges = [
-        Edge(number[e.i], number[e.j], e.T_i_j, e.information, e.robust)
-        for e in result.graph.edges
-        if e.i in number and e.j in number
-    ]
+    edges = result.graph.given()
+    edges = edges.select(np.isin(edges.i, rows) & np.isin(edges.j, rows))
+    edges = replace(edges, i=np.searchsorted(rows, edges.i), j=np.searchsorted(rows, edges.j))
     robots = tuple(
         replace(robot, variables=frozen(np.searchsorted(rows, robot.variables), np.int64)) for robot in members
     )
-    return MapPart(robots, PoseGraph(result.graph.poses()[rows], edges))
+    return MapPart(robots, PoseGraph.restored(result.graph.poses()[rows], edges))
 
 
 def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
@@ -48,12 +45,11 @@ def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
     rows = _variables(list(after.values()))
     poses = result.graph.poses()
     poses[rows] = part.graph.poses()
-    inside = set(rows.tolist())
-    own = iter(part.graph.edges)
-    edges = [
-        Edge(e.i, e.j, (same := next(own)).T_i_j, same.information, e.robust) if {e.i, e.j} <= inside else e
-        for e in result.graph.edges
-    ]
+    edges, own = result.graph.given(), part.graph.given()
+    inside = np.isin(edges.i, rows) & np.isin(edges.j, rows)
+    T_i_j, information = edges.T_i_j.copy(), edges.information.copy()
+    T_i_j[inside], information[inside] = own.T_i_j, own.information
+    graph = PoseGraph.restored(poses, replace(edges, T_i_j=T_i_j, information=information))
     T_after_before = {
         name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1]))
         for name, robot in after.items()
@@ -69,7 +65,7 @@ def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
         for region in result.regions
     )
     robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
-    return replace(result, robots=robots, corrections=corrections, graph=PoseGraph(poses, edges), regions=regions)
+    return replace(result, robots=robots, corrections=corrections, graph=graph, regions=regions)
 
 
 def _variables(robots: Sequence[MappedRobot]) -> FloatArray:

@@ -60,13 +60,12 @@ def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tu
     for number, robot in enumerate(robots):
         owner[robot.variables] = number
     lengths = np.array([found[robot.robot] for robot in robots])[owner]
-    edges = [
-        replace(edge, T_i_j=edge.T_i_j * np.array([lengths[edge.i] ** 0.5 * lengths[edge.j] ** 0.5] * 2 + [1.0]))
-        for edge in graph.edges
-    ]
+    edges = graph.given()
+    T_i_j = edges.T_i_j.copy()
+    T_i_j[:, :2] *= (lengths[edges.i] ** 0.5 * lengths[edges.j] ** 0.5)[:, None]
     poses = se2.compose(T_plan_map, graph.poses())
     poses[:, :2] = middle[:2] + (poses[:, :2] - middle[:2]) * lengths[:, None]
-    fitted = MapPart(tuple(scaled), PoseGraph(poses, edges))
+    fitted = MapPart(tuple(scaled), PoseGraph.restored(poses, replace(edges, T_i_j=T_i_j)))
     scans = [
         (int(robot.variables[row]), keyscan_points(keyscan, robot.lasers).thinned(CELL_M))
         for robot in scaled

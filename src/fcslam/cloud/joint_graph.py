@@ -154,12 +154,10 @@ class JointGraph:
         for robot, T_robot in T_map_base.items():
             variables = self._variables[robot].values
             poses[variables], kept[variables] = T_robot, True
-        edges = [edge for number, edge in enumerate(self.graph.edges) if number not in left_out]
-        if not kept.all():
-            numbers = np.cumsum(kept) - 1
-            inside = (edge for edge in edges if kept[edge.i] and kept[edge.j])
-            edges = [replace(edge, i=int(numbers[edge.i]), j=int(numbers[edge.j])) for edge in inside]
-        return PoseGraph(poses[kept], edges)
+        edges, numbers = self.graph.given(), np.cumsum(kept) - 1
+        counts = np.array([number not in left_out for number in range(len(edges.i))], bool)
+        edges = edges.select(counts & kept[edges.i] & kept[edges.j])
+        return PoseGraph.restored(poses[kept], replace(edges, i=numbers[edges.i], j=numbers[edges.j]))
 
     def held_variables(self, robots: Collection[str]) -> dict[str, NDArray[np.int64]]:
         """Variables of each of these robots in the graph that ``held`` makes of them, in the order of its path."""

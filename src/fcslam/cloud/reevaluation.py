@@ -1,6 +1,6 @@
 """Re-evaluation: decide every closure from all evidence, independent of earlier decisions."""
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -90,7 +90,7 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
     numbers = {tag: number for number, tag in enumerate(dict.fromkeys([None, *(e.closure.tag for e in entries)]))}
     for entry in entries:
         tags[entry.edge] = numbers[entry.closure.tag]
-    certain = {entry.edge for entry in entries if entry.is_certain}
+    certain = [entry.edge for entry in entries if entry.is_certain and entry.edge is not None]
     evident = graph.graph if not certain else _with_certain(graph.graph, certain)
     sessions = graph.robots()
     senders = [robot_of(session) for session in sessions]
@@ -98,10 +98,12 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
     return JointEvidence(evident, tuple(sessions.values()), informative, independent, vetoed, tags, sender_numbers)
 
 
-def _with_certain(graph: PoseGraph, certain: Container[int | None]) -> PoseGraph:
+def _with_certain(graph: PoseGraph, certain: list[int]) -> PoseGraph:
     """The same graph, in which these closures count like odometry."""
-    edges = (replace(edge, robust=False) if k in certain else edge for k, edge in enumerate(graph.edges))
-    return PoseGraph(graph.poses(), list(edges))
+    edges = graph.given()
+    robust = edges.robust.copy()
+    robust[certain] = False
+    return PoseGraph.restored(graph.poses(), replace(edges, robust=robust))
 
 
 def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:

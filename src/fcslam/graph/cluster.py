@@ -103,8 +103,8 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     """Estimate ``T_a_b`` of the frames of two trajectories from the two matched places that lie farthest apart.
 
     Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other in a or b to fix a rotation, the
-    first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only without
-    others, and then all of them by their information.
+    first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only
+    without others, and then all of them by their information.
 
     Args:
         a, b: trajectories, each in its own coordinate frame.

@@ -26,10 +26,10 @@ def g2o_text(graph: PoseGraph, ids: Sequence[int]) -> str:
     if len(ids) != len(graph) or len(set(ids)) != len(ids):
         raise ValueError(f"{len(graph)} variables need as many different ids, not {len(ids)}")
     lines = [f"VERTEX_SE2 {name} {_text(pose)}" for name, pose in sorted(zip(ids, graph.poses().tolist(), strict=True))]
-    upper = np.triu_indices(3)
-    for edge in graph.edges:
-        numbers = [*edge.T_i_j.tolist(), *edge.information[upper].tolist()]
-        lines.append(f"EDGE_SE2 {ids[edge.i]} {ids[edge.j]} {_text(numbers)}")
+    edges, (row, column) = graph.given(), np.triu_indices(3)
+    numbers = np.hstack((edges.T_i_j, edges.information[:, row, column])).tolist()
+    for i, j, values in zip(edges.i.tolist(), edges.j.tolist(), numbers, strict=True):
+        lines.append(f"EDGE_SE2 {ids[i]} {ids[j]} {_text(values)}")
     return "\n".join(lines) + "\n"
 
 

@@ -29,7 +29,7 @@ from fcslam.graph.evidence import Uniqueness, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
-from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode, frozen
@@ -205,15 +205,8 @@ def _solve_own_graph(
     number[robot] = np.arange(len(robot))
     edges = graph.arrays()
     mine = np.flatnonzero((number[edges.i] >= 0) & (number[edges.j] >= 0) & ~evidence.excluded)
-    own_graph = PoseGraph(
-        initial,
-        [
-            e
-            if (number[e.i], number[e.j]) == (e.i, e.j)  # as with one robot: an edge that is checked already
-            else Edge(int(number[e.i]), int(number[e.j]), e.T_i_j, e.information, e.robust)
-            for e in (graph.edges[k] for k in mine.tolist())
-        ],
-    )
+    own = graph.given().select(mine)
+    own_graph = PoseGraph.restored(initial, replace(own, i=number[own.i], j=number[own.j]))
     same = np.array_equal(robot, np.arange(len(graph)))  # then its factors are those of the joint graph
     own_factors = factors.restricted(own_graph, ~evidence.excluded[edges.robust]) if same else None
     solution = solve_single_robot(own_graph, consistency, own_factors)
@@ -332,7 +325,7 @@ def _solve_supported(
     start = graph.poses()
     for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
         start[robot] = se2.compose(frame, path.poses)
-    subgraph = _subgraph(graph, start, supported)
+    subgraph = graph.restricted(start, supported)
     kept = factors.restricted(subgraph, supported[graph.arrays().robust])
     starts = (start, initialize(subgraph)) if joined else (start,)
     solutions = [optimize_gnc(subgraph, poses, factors=kept) for poses in starts]
@@ -343,7 +336,7 @@ def _solve_supported(
 def _refine_inliers(factors: FactorCache, within_maps: NDArray[np.bool_], trusted: Solution) -> Solution:
     """Decide every edge within a map, starting from the inliers of a trusted solution."""
     graph = factors.graph
-    subgraph = _subgraph(graph, trusted.poses, within_maps)
+    subgraph = graph.restricted(trusted.poses, within_maps)
     kept = factors.restricted(subgraph, within_maps[graph.arrays().robust])
     refined = refine_inliers(subgraph, None, trusted.weights[within_maps], factors=kept)
     return _expand_weights(refined, within_maps)
@@ -451,11 +444,6 @@ def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int6
     for number, variables in enumerate(evidence.robots):
         owner[variables], index[variables] = number, np.arange(len(variables))
     return owner, index
-
-
-def _subgraph(graph: PoseGraph, poses: FloatArray, kept: NDArray[np.bool_]) -> PoseGraph:
-    """All variables, at ``poses`` (N, 3), with the edges where ``kept`` (E,) is true."""
-    return PoseGraph(poses, [edge for edge, keep in zip(graph.edges, kept.tolist(), strict=True) if keep])
 
 
 def _expand_weights(solution: Solution, kept: NDArray[np.bool_]) -> Solution:

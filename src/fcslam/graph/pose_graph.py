@@ -59,6 +59,10 @@ class EdgeArrays:
     information: FloatArray
     robust: NDArray[np.bool_]
 
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "EdgeArrays":
+        """The edges at these rows, shape (K,), or where ``rows``, shape (E,), is true."""
+        return EdgeArrays(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows], self.robust[rows])
+
 
 _NO_EDGES = EdgeArrays(
     np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool)
@@ -120,6 +124,10 @@ class PoseGraph:
     def arrays(self) -> EdgeArrays:
         """Edges as arrays."""
         return self._edges.bounded()
+
+    def restricted(self, poses: FloatArray, kept: NDArray[np.bool_]) -> "PoseGraph":
+        """All variables, at ``poses`` (N, 3), with the edges where ``kept`` (E,) is true."""
+        return PoseGraph.restored(poses, self.given().select(kept))
 
     def chi2(self, poses: ArrayLike | None = None, rows: NDArray[np.int64] | None = None) -> FloatArray:
         """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, 3); None: initial poses.

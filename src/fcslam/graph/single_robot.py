@@ -48,9 +48,7 @@ def solve_single_robot(
     closures = Closures(edges.i[robust], edges.j[robust], edges.T_i_j[robust], edges.information[robust])
     path = robot_trajectory(graph, odometry, consistency)
     supported[robust] = count_supporting_closures(path, path, closures, consistency) > 0
-    supported_graph = PoseGraph(
-        graph.poses(), [edge for edge, kept in zip(graph.edges, supported, strict=True) if kept]
-    )
+    supported_graph = graph.restricted(graph.poses(), supported)
     first = optimize_gnc(
         supported_graph,
         _robust_start(supported_graph, factors.chains),

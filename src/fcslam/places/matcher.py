@@ -29,8 +29,8 @@ from fcslam.storage.state_file import State
 START_SHARE = 1.0 / 3.0
 """Share of the points of the loose gate that is enough where known starts predict a closure."""
 NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
-DESCRIPTORS_KEPT: Final = 256
-"""Places whose descriptors are kept together, 10 kB each: the index holds descriptors by word."""
+WHOLE_PLACES: Final = 256
+"""Places that are kept with their descriptors, 10 kB each: the index holds descriptors by word."""
 
 
 class MatchDecision(StrEnum):
@@ -306,7 +306,12 @@ class PlaceMatcher:
 
     def _use(self, index: PlaceIndex[KeyscanId]) -> None:
         self._index = index
-        self._descriptors = lru_cache(DESCRIPTORS_KEPT)(index.descriptors)
+
+        @lru_cache(WHOLE_PLACES)
+        def indexed(i: KeyscanId) -> Place:
+            return replace(self._places[i], descriptors=index.descriptors(i))
+
+        self._indexed = indexed
 
     def _query(self, place: Place) -> QueryResult[KeyscanId]:
         for stored in self._backlog:  # a single robot never needs the vocabulary
@@ -317,8 +322,7 @@ class PlaceMatcher:
 
     def _stored(self, i: KeyscanId) -> Place:
         """A stored place with its descriptors."""
-        place = self._places[i]
-        return replace(place, descriptors=self._descriptors(i)) if i in self._index else place
+        return self._indexed(i) if i in self._index else self._places[i]
 
     def forget(self, place: KeyscanId) -> None:
         """Remove a place.
