@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -41,6 +42,8 @@ def main() -> None:
     parser.add_argument("--processes", nargs="+", type=int, default=[2], help="numbers of processes")
     parser.add_argument("--dask", nargs="*", type=int, default=[2], help="numbers of Dask's local workers")
     chosen = parser.parse_args()
+    if chosen.dask and find_spec("distributed") is None:
+        parser.error('Dask is missing: pip install ".[distributed]", or give --dask without numbers')
     from fcslam.lidar.pair_verification import VerificationPool, verify_here
 
     report = common.Report(__file__, __doc__, chosen)

@@ -1,6 +1,7 @@
 """A laser that is turned or upside down contradicts the odometry, and how it faces is found."""
 
 import math
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import lru_cache
 
@@ -9,7 +10,7 @@ import pytest
 
 import fcslam
 from fcslam.geometry import se2
-from fcslam.lidar.facing import Facing, contradicted_facing
+from fcslam.lidar.facing import Facing, contradicted_facing, wrong_laser
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.live.records import Wiring
 from fcslam.records import LaserModel, LaserScan, frozen
@@ -166,6 +167,32 @@ def test_a_live_robot_says_once_that_its_laser_faces_another_way(turned_deg, sai
     lines = [event.text for event in told if "the laser is turned by about 180 deg" in event.text]
     assert len(lines) == said
     assert all("not corrected" in line for line in lines)
+
+
+class Beside(SameThread):
+    """A worker that is still busy with what it was asked about a laser."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def submit(self, function, /, *arguments):
+        if function is not wrong_laser:
+            return super().submit(function, *arguments)
+        self.asked.append((Future(), arguments))
+        return self.asked[-1][0]
+
+
+def test_no_pose_waits_until_it_is_known_how_the_laser_faces():
+    told, worker, scans = [], Beside(), stated(drive(NARROW), 180)
+    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(worker), on_event=told.append) as robot:
+        for scan in scans[:-1]:
+            robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
+        ((future, arguments),) = worker.asked
+        assert not told
+        future.set_result(wrong_laser(*arguments))
+        robot.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
+    assert ["the laser is turned by about 180 deg" in event.text for event in told] == [True]
 
 
 @pytest.mark.parametrize("distance", [0.8, 1.2])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.lidar.facing import FacingWatch
+from fcslam.lidar.facing import FacingWatch, wrong_laser
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.straightness import excess_of
 from fcslam.records import LaserModel, frozen
@@ -78,6 +78,6 @@ def test_bags_logs_and_live_lasers_say_it_once(tmp_path):
     found = calibrate_bag(open_source(tmp_path / "run.mcap"), LidarConfig())
     assert found.correction.mounting == (0.0, 0.0, 0.0)
     watch = FacingWatch()
-    live = [str(wrong) for scan in scans if (wrong := watch.add(scan))]
+    live = [str(wrong_laser(watched)) for scan in scans if (watched := watch.add(scan))]
     for lines in (found.lines, contradictions_of(open_source(tmp_path / "run.log")), live):
         assert sum("the walls in the scans are bent, as if ranges were too long by 0.3" in line for line in lines) == 1

@@ -6,7 +6,7 @@ right, they have the ranges that were measured there.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import Final, NamedTuple, Self
@@ -227,20 +227,23 @@ def _best(trial: "_Trial") -> tuple[Facing, dict[Facing, FloatArray]]:
     return max(near, key=lambda facing: trial.mean(trial.agreements(facing))), scores
 
 
+def wrong_laser(scans: Sequence[LaserScan]) -> Contradiction | Excess | None:
+    """What is wrong with how a laser measures or faces, by the scans of a ``FacingWatch``."""
+    return excess_of(scans) or contradicted_facing(scans)
+
+
 class FacingWatch:
-    """Decides how a live laser faces and whether it measures distances, once its robot has moved enough."""
+    """Collects scans of a live laser that tell how it faces and whether it measures distances."""
 
     def __init__(self) -> None:
         self._scans: list[LaserScan] = []
 
-    def add(self, scan: LaserScan) -> Contradiction | Excess | None:
-        """Add the next scan of the laser; returns once what is wrong."""
+    def add(self, scan: LaserScan) -> Sequence[LaserScan]:
+        """Add the next scan of the laser; returns the scans once, when its robot has moved enough."""
         if len(self._scans) == SCANS_WATCHED or (self._scans and not any(_moved(self._scans[-1], scan))):
-            return None
+            return ()
         self._scans.append(scan)
-        if len(self._scans) < SCANS_WATCHED:
-            return None
-        return excess_of(self._scans) or contradicted_facing(self._scans)
+        return self._scans if len(self._scans) == SCANS_WATCHED else ()
 
 
 class _Trial:

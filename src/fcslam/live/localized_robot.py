@@ -87,7 +87,7 @@ class LocalizedRobot(LiveTracker):
         self._was_localized = False
         robot = self._config.robot
         with ExitStack() as stack:
-            executor = wiring.started(stack)
+            executor = self._executor = wiring.started(stack)
             try:
                 self._localizer = WorkerLocalizer(self.name, self._map, initial, executor)
             except BrokenExecutor as error:

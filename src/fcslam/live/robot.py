@@ -148,7 +148,7 @@ class Robot(LiveTracker):
         self._news = 0
         """Changes of the fleet that were told."""
         with ExitStack() as stack:
-            executor = wiring.started(stack)
+            executor = self._executor = wiring.started(stack)
             outbox, transport = None, wiring.transport
             access = Server(server) if isinstance(server, str) else server
             folder = _state_folder(state, access is not None or transport is not None, stack)
@@ -357,6 +357,7 @@ class Robot(LiveTracker):
             if not self._is_finished:
                 self._is_finished = True
                 self._take(self._frontend.finish())
+                self._tell_examined()
                 if self._own is not None:
                     self._own.hand_over()
         until_s = math.inf if timeout_s is None else self._clock() + timeout_s

@@ -4,16 +4,18 @@ import logging
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from concurrent.futures import Executor, Future
+from contextlib import ExitStack, suppress
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.errors import InputError
-from fcslam.lidar.facing import FacingWatch
+from fcslam.lidar.facing import Contradiction, FacingWatch, wrong_laser
+from fcslam.lidar.straightness import Excess
 from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
 from fcslam.mission.mission import MissionConfig
@@ -40,6 +42,8 @@ class LiveTracker(ABC):
     """Tracks the scans of one robot in the thread that adds them; a subclass knows where they are in a map."""
 
     _frontend: RobotFrontend
+    _executor: Executor
+    """The worker beside the tracker: for what no pose must wait for."""
     _stack: ExitStack
     """Resources that end with the robot."""
 
@@ -64,6 +68,8 @@ class LiveTracker(ABC):
         self._is_finished = False
         self._facing: defaultdict[tuple[float, float, float], FacingWatch] = defaultdict(FacingWatch)
         """By the mounting of a laser."""
+        self._examined: deque[Future[Contradiction | Excess | None]] = deque()
+        """What the worker finds wrong with each laser: it takes as long as hundreds of scans."""
         self._told: set[str] = set()
         """Failures that were reported."""
 
@@ -176,8 +182,10 @@ class LiveTracker(ABC):
             self._tell_undetermined(pose)
         if self._frontend.odometry_fault is not None:
             self._tell_failure(f"the odometry {self._frontend.odometry_fault}; scan matching alone gives the motion")
-        if (found := self._facing[scan.laser.T_base_laser].add(scan)) is not None:
-            self._tell_failure(f"{found}; not corrected")
+        if watched := self._facing[scan.laser.T_base_laser].add(scan):
+            with suppress(RuntimeError):  # a worker that has ended is told by what needs it
+                self._examined.append(self._executor.submit(wrong_laser, watched))
+        self._tell_examined()
         self._tell()
         return pose
 
@@ -191,6 +199,13 @@ class LiveTracker(ABC):
                 "the scans do not fix the position in every direction, and there is no odometry: the robot may move "
                 "unseen",
             )
+
+    def _tell_examined(self) -> None:
+        """Tell what the worker found wrong with a laser."""
+        while self._examined and self._examined[0].done():
+            examined = self._examined.popleft()
+            if examined.exception() is None and (found := examined.result()) is not None:
+                self._tell_failure(f"{found}; not corrected")
 
     def _tell_failure(self, text: str) -> None:
         """Tell a failure once."""
