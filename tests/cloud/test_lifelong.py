@@ -147,6 +147,17 @@ def test_a_cloud_that_goes_on_from_a_state_builds_no_submap_again(packets, monke
     assert fingerprint(feed(restored, later).finalize()) == fingerprint(feed(cloud, later).finalize())
 
 
+def test_a_cloud_that_goes_on_from_a_state_has_the_state_of_one_that_never_stopped(packets, monkeypatch):
+    """Also where the cache holds more submaps than the state."""
+    monkeypatch.setattr(submaps, "UNPACKED", 3)
+    first, later = packets[: len(packets) // 2], packets[len(packets) // 2 :]
+    cloud = feed(Cloud(ONE_A_SQUARE, 0), first)
+    known = {(number.session, number.sequence): packet for number, packet in cloud._packets.items()}
+    state = parse_state(Path("state"), state_bytes("this", cloud.state()), "this")
+    restored = Cloud.restored(ONE_A_SQUARE, 0, state, {number: p.time for number, p in known.items()}, known.get)
+    assert state_bytes("this", feed(restored, later).state()) == state_bytes("this", feed(cloud, later).state())
+
+
 def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):
     for robot in forgetful.finalize().robots:
         assert len(robot.stamps) == len(robot.T_map_base) == len(robot.T_local_base)

@@ -60,16 +60,14 @@ class SubmapCache:
         return entry.noise
 
     def state(self) -> State:
-        """The submaps that were compared last, so that they need not be built again; for ``restore``."""
-        built = [
-            (key, entry, packed)
-            for key, entry in self._entries.items()
-            if (packed := self._packed(key, entry)) is not None
-        ][-UNPACKED:]
-        content = [packed_bytes(packed) for _, _, packed in built]
+        """The submaps that were compared last, so that they need not be built again; for ``restore``.
+
+        Their noise is left out: whether it was needed depends on what was forgotten since.
+        """
+        built = [key for key, entry in self._entries.items() if entry.packed is not None or key in self._unpacked]
+        content = [packed_bytes(self._packed(key)) for key in built[-UNPACKED:]]
         return {
-            "keys": [(*identifier, channel) for (identifier, channel), _, _ in built],
-            "noise": [entry.noise for _, entry, _ in built],
+            "keys": [(*identifier, channel) for identifier, channel in built[-UNPACKED:]],
             "sizes": [len(data) for data in content],
             "content": np.frombuffer(b"".join(content), np.uint8),
         }
@@ -77,9 +75,9 @@ class SubmapCache:
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         content, begin = state["content"].tobytes(), 0
-        for (robot, number, channel), noise, size in zip(state["keys"], state["noise"], state["sizes"], strict=True):
+        for (robot, number, channel), size in zip(state["keys"], state["sizes"], strict=True):
             packed = read_packed(content[begin : begin + size])
-            self._entries[KeyscanId(robot, number), Channel(channel)] = _Entry(packed, noise)
+            self._entries[KeyscanId(robot, number), Channel(channel)] = _Entry(packed)
             begin += size
 
     def drop(self, place: Place) -> None:
@@ -96,14 +94,11 @@ class SubmapCache:
         return entry
 
     def _pack(self, key: _Key) -> None:
-        entry = self._entries[key]
-        entry.packed = self._packed(key, entry)
+        self._entries[key].packed = self._packed(key)
         del self._unpacked[key]
 
-    def _packed(self, key: _Key, entry: _Entry) -> PackedSubmap | None:
-        if entry.packed is None and key in self._unpacked:
-            return PackedSubmap.of(self._unpacked[key])
-        return entry.packed
+    def _packed(self, key: _Key) -> PackedSubmap:
+        return self._entries[key].packed or PackedSubmap.of(self._unpacked[key])
 
     def _drop(self, key: _Key) -> None:
         self._entries.pop(key, None)
