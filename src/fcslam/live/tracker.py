@@ -204,7 +204,10 @@ class LiveTracker(ABC):
         """Tell what the worker found wrong with a laser."""
         while self._examined and self._examined[0].done():
             examined = self._examined.popleft()
-            if examined.exception() is None and (found := examined.result()) is not None:
+            error = examined.exception()
+            if error is not None:
+                _log.warning("%s: how its laser faces was not examined: %s", self.name, error)
+            elif (found := examined.result()) is not None:
                 self._tell_failure(f"{found}; not corrected")
 
     def _tell_failure(self, text: str) -> None:

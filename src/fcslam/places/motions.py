@@ -214,8 +214,6 @@ def propose_motions(a: Place, b: Place) -> list[Motion]:
     matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     if a.channel is Channel.CAMERA:
         matches = level_matches(a.keypoints, b.keypoints, matches)
-    if len(matches.pairs) < LEAST_INLIERS:
-        return []
     proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
     return [Motion(h.T_a_b, _information(b, h, matches), share) for h in proposed if h.inlier_count >= LEAST_INLIERS]
