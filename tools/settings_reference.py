@@ -179,7 +179,7 @@ PAGES: dict[Path, Callable[[], str]] = {
 def tables(
     settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = (), heading: str = "###"
 ) -> Iterator[str]:
-    """One table of the plain keys of ``settings``, and after it those of the settings nested in it."""
+    """The class, one table of the plain keys of ``settings``, and after it those of the settings nested in it."""
     rows, nested = [], []
     for key, field in type(settings).model_fields.items():
         value = getattr(settings, key)
@@ -188,9 +188,10 @@ def tables(
         elif not isinstance(value, documented):
             nested.append((key, field, value))
     if rows:
+        yield f"In the code: {place_of(type(settings))}.\n"
         yield "\n".join(["| key | default | unit | allowed | effect |", "|---|---|---|---|---|", *rows, ""])
     for key, field, value in nested:
-        yield f"{heading} `{path}{key}`\n\n{sentence(field.description)} In the code: {place_of(type(value))}.\n"
+        yield f"{heading} `{path}{key}`\n\n{sentence(field.description)}\n"
         yield from tables(value, f"{path}{key}.", documented, heading)
 
 

@@ -1,1 +1,1 @@
-"""Text logs: CARMEN, CMU, DP-SLAM, CoreSLAM."""
+"""Text logs: CARMEN, CMU, DP-SLAM, CoreSLAM, csm."""
