@@ -55,7 +55,7 @@ def missing_symbols(text: str) -> list[str]:
         f"{symbol} in {path}"
         for *symbols, path in SYMBOL.findall(text)
         for symbol in filter(None, symbols)
-        if not re.search(rf"^\s*(?:(?:def|class) {symbol}\b|{symbol}: )", read(path), re.MULTILINE)
+        if not re.search(rf"^\s*(?:(?:def|class) {symbol}\b|{symbol}(?:: | = ))", read(path), re.MULTILINE)
     ]
 
 
