@@ -56,7 +56,8 @@ class Deliveries(RuleBasedStateMachine):
 
     @initialize()
     def open(self):
-        self.path = Path(tempfile.mkdtemp()) / "outbox"
+        self.place = tempfile.TemporaryDirectory()
+        self.path = Path(self.place.name) / "outbox"
         self.outbox = Outbox(self.path, "alice", LIMIT)
         self.outbox.begin("r", resume=False)
         self.outbox.synchronize({})
@@ -105,6 +106,7 @@ class Deliveries(RuleBasedStateMachine):
 
     def teardown(self):
         self.outbox.close()
+        self.place.cleanup()
 
 
 Deliveries.TestCase.settings = settings(max_examples=25, stateful_step_count=20)
