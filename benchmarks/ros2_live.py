@@ -17,7 +17,7 @@ from pathlib import Path
 import common
 
 RCLPY = Path(os.environ.get("FCSLAM_RCLPY", common.REPOSITORY / ".venv-ros" / "bin" / "python"))
-PLAYER = common.REPOSITORY / "tests" / "bridges" / "rclpy_player.py"
+PLAYER = common.REPOSITORY / "tests" / "ros" / "rclpy_player.py"
 DOMAIN = 61
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 COLUMNS = {
