@@ -65,6 +65,7 @@ def written(log, seconds, folder):
         ranges=[np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans],
         odometry=[scan.T_odom_base for scan in scans],
         laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
+        beam_s=0.0,
     )
     write_bag(folder / "bag.mcap", scans)
     return laser.T_base_laser
@@ -98,6 +99,9 @@ def drive(speed, mounting, folder):
         while player.poll() is None:
             time.sleep(0.2)
             now, used = time.monotonic(), cpu_s(robot.pid)
+        if player.returncode:
+            robot.kill()
+            raise SystemExit("the player failed; its message is above")
         answer = json.loads(player.stdout.read().splitlines()[-1])
         robot.wait(300.0)
     gaps = np.diff([arrival for arrival in arrivals if arrival < now])
