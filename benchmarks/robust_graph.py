@@ -248,7 +248,7 @@ def csail_row(folder: Path) -> tuple:
 def loop_rows(clean: PoseGraph, chosen: argparse.Namespace) -> list[tuple]:
     truth = optimize_gnc(clean).poses
     solvers: dict[str, Callable[[PoseGraph], Solution]] = {
-        "ours": lambda graph: solve_single_robot(graph, ConsistencySettings()),
+        "ours": solve_single_robot,
         "GNC from odometry": lambda graph: optimize_gnc(graph, odometry(graph)),
         "least squares": lambda graph: optimize(graph, odometry(graph)),
     }

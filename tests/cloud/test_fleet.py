@@ -11,7 +11,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.trajectory import DRIFT
 from fcslam.places.matcher import MatcherConfig
 from fcslam.records import ClosureStatus, ConstraintKind, Correction, KeyscanId, Place, Reason, ReasonCode, Veto
 from fcslam.wire.packets import decode, encode
@@ -186,10 +186,10 @@ def test_a_veto_clears_the_way_for_the_truth_whenever_it_comes(scripted):
 def test_a_turn_on_the_spot_drifts_as_its_odometry_says(scripted):
     """On the way as in the end: a robot that turned much without moving may be off by what its odometry claims."""
     cloud = feed(scripted(closures(A, B, TRUE)), two_robots())
-    path = cloud.fleet._graph.path("a", ConsistencySettings())
+    path = cloud.fleet._graph.path("a")
     steps = np.diag(np.linalg.inv(motion("a", 0, 1, np.zeros(3)).information))
     drift = path.drift(np.array([0]), np.array([1]))[0]
-    assert drift[2, 2] == pytest.approx(steps[2] + ConsistencySettings().heading_drift_rad ** 2, rel=0.01)
+    assert drift[2, 2] == pytest.approx(steps[2] + DRIFT[2] ** 2, rel=0.01)
 
 
 def test_a_veto_of_one_closure_leaves_the_others(scripted):

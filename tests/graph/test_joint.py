@@ -133,7 +133,7 @@ def test_without_the_robust_steps_the_same_world_is_lost(monkeypatch: pytest.Mon
 def test_without_pairwise_consistency_liars_join_two_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other mutation check, on the world of the next test: without it and without the second look at links."""
 
-    def everything_agrees(_a, _b, closures, _settings):
+    def everything_agrees(_a, _b, closures):
         return np.ones((len(closures), len(closures)), dtype=bool)
 
     monkeypatch.setattr("fcslam.graph.cluster.pairwise_consistency", everything_agrees)
@@ -255,7 +255,7 @@ def test_a_link_lasts_on_most_of_its_cluster_from_enough_places(dropped: int, la
     assert link.decision.evidence.separate_places == 4
     weights = np.ones(len(edges))
     weights[len(edges) - dropped :] = 0.0
-    own = [build_trajectory(truth, SETTINGS)] * 2
+    own = [build_trajectory(truth)] * 2
     solution = Solution(graph.poses(), weights, 0, 0.0)
     assert joint._is_confirmed(link, own, solution, ones, SETTINGS) is lasts
     one_place = np.ones(len(edges))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import Solution, optimize, optimize_gnc, refine_inliers
@@ -69,7 +68,7 @@ def test_order_of_edges_does_not_matter_and_repetition_gives_the_same_bytes(solv
 @pytest.mark.parametrize("seed", range(3))
 def test_a_robot_alone_rejects_false_closures(seed: int, share: float) -> None:
     graph, truth, true = manhattan(seed, closures=60, outlier_share=share)
-    solution = solve_single_robot(graph, ConsistencySettings())
+    solution = solve_single_robot(graph)
     clean = optimize(PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known]))
     assert (solution.weights[~true] == 0.0).all()
     assert (solution.weights[true] == 0.0).sum() <= 4
@@ -86,7 +85,7 @@ def test_what_stays_of_the_witnessed_start_is_the_cheaper_solution() -> None:
     ]
     edges.append(Edge(0, 62, se2.between(truth[0], truth[62]), INFORMATION, True))
     graph = PoseGraph(truth, edges)
-    solution = solve_single_robot(graph, ConsistencySettings())
+    solution = solve_single_robot(graph)
     assert solution.weights[-1] == 1.0
     assert np.abs(se2.between(solution.poses[0], solution.poses[62])[:2]).max() < 0.05
 

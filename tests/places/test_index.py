@@ -6,10 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.places.index import PlaceIndex
+from fcslam.places.scoring import NEAR_BITS
 from fcslam.places.similarity import bag_of_words, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, TreeConfig, VocabularyConfig
 
-SMALL = TreeConfig(branching=4, depth=3, smallest_split=8)
+SMALL = TreeConfig(branching=4, depth=3)
 EMPTY = np.empty((0, 32), np.uint8)
 EVERY = pytest.mark.parametrize("strategy", list(Strategy))
 BOTH = pytest.mark.parametrize("scoring", list(Scoring))
@@ -116,9 +117,7 @@ def test_queries_find_what_comparing_with_every_place_finds(strategy, scoring, s
     index, places = filled(strategy, scoring, seed, count, beam=64, leaf_capacity=300)  # the beam sees all words
     for query in (*list(places.values())[::10], *random_places(np.random.default_rng(seed), 3)):
         expected = (
-            words_oracle(index, places, query)
-            if scoring is Scoring.WORDS
-            else matches_oracle(places, query, index._config.near_bits)
+            words_oracle(index, places, query) if scoring is Scoring.WORDS else matches_oracle(places, query, NEAR_BITS)
         )
         found = index.query(query, top_k=1000)
         assert dict(found) == pytest.approx({k: s for k, s in expected.items() if s > 1e-12}, abs=1e-9)

@@ -20,7 +20,7 @@ def places(seed=0):
 def filled(strategy=Strategy.INCREMENTAL, scoring=Scoring.WORDS):
     config = VocabularyConfig(
         strategy=strategy, scoring=scoring, train_batch=4, leaf_capacity=16, rebuild_every=7,
-        tree=TreeConfig(branching=4, smallest_split=8),
+        tree=TreeConfig(branching=4),
     )  # fmt: skip
     index = PlaceIndex[KeyscanId](config, np.random.default_rng(2))
     for number, place in enumerate(places()[:COUNT]):

@@ -326,7 +326,7 @@ class ClosureDecisions:
     def _join(self, members: list[ClosureEntry], a: str, b: str) -> None:
         """Move the younger map into the older one's frame."""
         older, younger = self.map_of(a), self.map_of(b)
-        T_a_b = first_estimate(members, (a, b), self._graph, self._config.consistency)
+        T_a_b = first_estimate(members, (a, b), self._graph)
         if self.maps.index(older) > self.maps.index(younger):
             older, younger, T_a_b = younger, older, se2.inverse(T_a_b)
         self._graph.move(younger, T_a_b)

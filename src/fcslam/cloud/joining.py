@@ -28,18 +28,16 @@ def decide_join(
     examine: ExamineSessions,
 ) -> ClusterDecision:
     """The dominant cluster among the closures of two robots, by the current estimate of their trajectories."""
-    a, b = (graph.path(robot, settings) for robot in robots)
+    a, b = (graph.path(robot) for robot in robots)
     informative, closures = [entry.closure.informative for entry in entries], _closures(entries, robots[0])
     return cluster.decide_cluster(
         a, b, closures, informative, settings, lambda members: examine(robots, a, b, closures.select(members))
     )
 
 
-def first_estimate(
-    members: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
-) -> FloatArray:
+def first_estimate(members: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph) -> FloatArray:
     """T_a_b (3,) of the two robots' maps, from the two matched places that are farthest apart, eqs. (5)-(6)."""
-    a, b = (graph.path(robot, settings) for robot in robots)
+    a, b = (graph.path(robot) for robot in robots)
     return cluster.relative_frame(a, b, _closures(members, robots[0]))
 
 

@@ -13,7 +13,7 @@ from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
 from fcslam.graph.rows import Rows
-from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
+from fcslam.graph.trajectory import Trajectory, build_trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
 from fcslam.storage.state_file import State
 
@@ -59,9 +59,9 @@ class JointGraph:
         trajectory: FloatArray = self._poses.values[variables if numbers is None else variables[numbers]]
         return trajectory
 
-    def path(self, robot: str, settings: DriftSettings) -> Trajectory:
+    def path(self, robot: str) -> Trajectory:
         """The robot's trajectory with the covariance of its odometry, for consistency checks."""
-        return build_trajectory(self.trajectory(robot), settings, self._step_covariance[robot].values)
+        return build_trajectory(self.trajectory(robot), self._step_covariance[robot].values)
 
     def chain(self, robot: str, first: int = 0, last: int | None = None) -> FloatArray:
         """T_odom_base (N, 3) of keyscans first to last (inclusive), by the robot's motions without any closure."""

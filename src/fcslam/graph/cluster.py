@@ -74,13 +74,13 @@ def decide_cluster(
         a, b: trajectories of the robots, each in its own coordinate frame.
         closures: K closures from a to b.
         informative: whether each closure fixes the pose in every direction, shape (K,).
-        settings: drift, and what a cluster needs.
+        settings: what a cluster needs.
         examine: called where only the amount of evidence is open.
 
     Returns:
         The decision; its members are rows of ``closures``.
     """
-    consistent = pairwise_consistency(a, b, closures, settings)
+    consistent = pairwise_consistency(a, b, closures)
     positions = closure_positions(a, b, closures)
     return dominant_cluster(
         consistent, positions, informative, settings, examine, lambda m: closures.select(m).shared_tags()

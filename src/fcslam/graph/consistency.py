@@ -14,13 +14,15 @@ from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
 from fcslam.graph.evidence import EvidenceSettings
-from fcslam.graph.trajectory import DriftSettings, Trajectory, transport_covariance
+from fcslam.graph.trajectory import Trajectory, transport_covariance
 from fcslam.records import FloatArray
 
 _PAIRS_AT_ONCE = 100_000
 """Pairs of closures tested in one go: memory must not grow with the square of the number of closures."""
 PROBABILITY = 0.99
 """Probability with which two true closures pass the chi-square test of consistency."""
+CHI2_LIMIT = float(2.0 * gammaincinv(1.5, PROBABILITY))
+"""The chi-square quantile of ``PROBABILITY`` for the three degrees of freedom of a loop."""
 SUPPORT_M = 10.0
 """Largest path length between the ends of two closures, on both trajectories, at which consistent closures support
 each other, metres."""
@@ -28,17 +30,12 @@ TAG_VIEWS = 2
 """Keyscans of each trajectory from which a tag must be seen to be evidence: a tag misread once is none."""
 
 
-class ConsistencySettings(EvidenceSettings, DriftSettings):
+class ConsistencySettings(EvidenceSettings):
     """When closures between two trajectories are consistent, and when they are enough to join two maps."""
 
     separation_m: float = Field(
         default=3.0, ge=0.0, description="least distance between two separate places, in the maps of both robots [m]"
     )
-
-    @property
-    def limit(self) -> float:
-        """The chi-square quantile of ``PROBABILITY`` for the three degrees of freedom of a loop."""
-        return float(2.0 * gammaincinv(1.5, PROBABILITY))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,15 +78,12 @@ class Closures:
         return sum(count >= TAG_VIEWS for count in views)
 
 
-def pairwise_consistency(
-    a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings
-) -> NDArray[np.bool_]:
+def pairwise_consistency(a: Trajectory, b: Trajectory, closures: Closures) -> NDArray[np.bool_]:
     """Test every pair of closures for consistency.
 
     Args:
         a, b: trajectories, each in its own coordinate frame.
         closures: K closures from a to b.
-        settings: drift and probability of the test.
 
     Returns:
         Which pairs are consistent, shape (K, K), symmetric, true on the diagonal.
@@ -102,13 +96,11 @@ def pairwise_consistency(
     k, m = np.triu_indices(len(closures), 1)
     consistent = np.eye(len(closures), dtype=bool)
     for part in np.array_split(np.arange(len(k)), len(k) // _PAIRS_AT_ONCE + 1):
-        consistent[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= settings.limit
+        consistent[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= CHI2_LIMIT
     return consistent | consistent.T
 
 
-def count_supporting_closures(
-    a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings
-) -> NDArray[np.int64]:
+def count_supporting_closures(a: Trajectory, b: Trajectory, closures: Closures) -> NDArray[np.int64]:
     """Count the closures that support each closure.
 
     Two closures support each other if they are consistent and their ends are near each other along both paths, where
@@ -118,7 +110,6 @@ def count_supporting_closures(
     Args:
         a, b: trajectories; the same object for closures within one robot.
         closures: K closures from a to b.
-        settings: drift, probability of the test, and distance of separate places.
 
     Returns:
         Number of supporting closures of each closure, shape (K,).
@@ -130,7 +121,7 @@ def count_supporting_closures(
         travel_m = path.travel_m[end]
         near &= np.abs(travel_m[:, None] - travel_m[None]) <= SUPPORT_M
     k, m = np.nonzero(np.triu(near, 1))
-    consistent = loop_chi2(a, b, closures, k, m) <= settings.limit
+    consistent = loop_chi2(a, b, closures, k, m) <= CHI2_LIMIT
     return np.bincount(np.concatenate((k[consistent], m[consistent])), minlength=len(closures))
 
 

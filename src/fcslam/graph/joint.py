@@ -148,7 +148,7 @@ def solve_jointly(
     # 1. Optimize each robot's own graph.
     factors = FactorCache(evidence.graph, find_chains(evidence.graph))
     initial = evidence.graph.poses()
-    own = [_solve_own_graph(evidence, robot, initial[robot], consistency, factors) for robot in evidence.robots]
+    own = [_solve_own_graph(evidence, robot, initial[robot], factors) for robot in evidence.robots]
     paths = [path for path, _ in own]
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
@@ -165,7 +165,7 @@ def solve_jointly(
         solution = _solve_supported(evidence, supported, paths, frames, bool(known or joining), factors)
         solution = _refine_inliers(factors, within_maps, solution)
         # 5. Withdraw isolated closures and decide once more.
-        isolated = _isolated_closures(evidence, paths, solution, consistency)
+        isolated = _isolated_closures(evidence, paths, solution, consistency.separation_m)
         if isolated.any():
             trusted = replace(solution, weights=solution.weights * ~isolated)
             solution = _refine_inliers(factors, within_maps, trusted)
@@ -196,7 +196,6 @@ def _solve_own_graph(
     evidence: JointEvidence,
     robot: NDArray[np.int64],
     initial: FloatArray,
-    consistency: ConsistencySettings,
     factors: FactorCache,
 ) -> tuple[Trajectory, NDArray[np.int64]]:
     """Trajectory of one robot from its own measurements and initial poses, and those of its edges that are inliers."""
@@ -209,8 +208,8 @@ def _solve_own_graph(
     own_graph = PoseGraph.restored(initial, replace(own, i=number[own.i], j=number[own.j]))
     same = np.array_equal(robot, np.arange(len(graph)))  # then its factors are those of the joint graph
     own_factors = factors.restricted(own_graph, ~evidence.excluded[edges.robust]) if same else None
-    solution = solve_single_robot(own_graph, consistency, own_factors)
-    return robot_trajectory(own_graph, solution.poses, consistency), mine[solution.weights > INLIER_WEIGHT]
+    solution = solve_single_robot(own_graph, own_factors)
+    return robot_trajectory(own_graph, solution.poses), mine[solution.weights > INLIER_WEIGHT]
 
 
 def _find_links(
@@ -343,7 +342,7 @@ def _refine_inliers(factors: FactorCache, within_maps: NDArray[np.bool_], truste
 
 
 def _isolated_closures(
-    evidence: JointEvidence, own: Sequence[Trajectory], solution: Solution, settings: ConsistencySettings
+    evidence: JointEvidence, own: Sequence[Trajectory], solution: Solution, separation_m: float
 ) -> NDArray[np.bool_]:
     """Inlier closures that no other closure supports and that alone constrain a stretch of the path, shape (E,).
 
@@ -352,12 +351,12 @@ def _isolated_closures(
     predicts it.
     """
     inliers = solution.weights > INLIER_WEIGHT
-    loose = _distance_to_next_closure_m(evidence, own, inliers) >= settings.separation_m
+    loose = _distance_to_next_closure_m(evidence, own, inliers) >= separation_m
     isolated = np.zeros(len(inliers), dtype=bool)
     for a, b, rows, closures in _pairs(evidence, ~evidence.excluded):
         kept = np.flatnonzero(inliers[rows])
         if 2 * len(kept) < len(rows):
-            unsupported = count_supporting_closures(own[a], own[b], closures.select(kept), settings) == 0
+            unsupported = count_supporting_closures(own[a], own[b], closures.select(kept)) == 0
             isolated[rows[kept]] = unsupported & loose[rows[kept]]
     return isolated
 

@@ -3,23 +3,19 @@
 import numpy as np
 
 from fcslam.graph.chains import Chains, find_chains
-from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
+from fcslam.graph.consistency import Closures, count_supporting_closures
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
+from fcslam.graph.trajectory import Trajectory, build_trajectory
 from fcslam.records import FloatArray
 
 _UNMEASURED_VARIANCE = 1e6
 """Variance of a step that no odometry measured, m^2 and rad^2."""
 
 
-def solve_single_robot(
-    graph: PoseGraph,
-    consistency: ConsistencySettings,
-    factors: FactorCache | None = None,
-) -> Solution:
+def solve_single_robot(graph: PoseGraph, factors: FactorCache | None = None) -> Solution:
     """Optimize the graph of one robot robustly; its variables are in the order of its path.
 
     Returns the cheapest of three solutions; the value of the truncated loss, which has many minima, ranks them:
@@ -32,7 +28,6 @@ def solve_single_robot(
 
     Args:
         graph: N variables and E edges of one robot.
-        consistency: when closures support each other.
         factors: those of ``graph``, where they are built already.
 
     Returns:
@@ -46,8 +41,8 @@ def solve_single_robot(
     supported = ~robust
     edges = graph.arrays()
     closures = Closures(edges.i[robust], edges.j[robust], edges.T_i_j[robust], edges.information[robust])
-    path = robot_trajectory(graph, odometry, consistency)
-    supported[robust] = count_supporting_closures(path, path, closures, consistency) > 0
+    path = robot_trajectory(graph, odometry)
+    supported[robust] = count_supporting_closures(path, path, closures) > 0
     supported_graph = graph.restricted(graph.poses(), supported)
     first = optimize_gnc(
         supported_graph,
@@ -74,13 +69,12 @@ def _robust_start(graph: PoseGraph, chains: Chains | None) -> FloatArray:
     return poses
 
 
-def robot_trajectory(graph: PoseGraph, poses: FloatArray, settings: DriftSettings) -> Trajectory:
+def robot_trajectory(graph: PoseGraph, poses: FloatArray) -> Trajectory:
     """The trajectory of one robot, with the covariance that the odometry edges of its graph state.
 
     Args:
         graph: N variables of one robot in the order of its path.
         poses: poses of the variables, shape (N, 3), metres and radians, in one coordinate frame.
-        settings: drift per metre.
 
     Returns:
         The trajectory through ``poses``.
@@ -89,4 +83,4 @@ def robot_trajectory(graph: PoseGraph, poses: FloatArray, settings: DriftSetting
     covariance = np.tile(_UNMEASURED_VARIANCE * np.eye(3), (max(0, len(graph) - 1), 1, 1))
     steps = ~edges.robust & (edges.j == edges.i + 1)
     covariance[edges.i[steps]] = np.linalg.inv(edges.information[steps])
-    return build_trajectory(poses, settings, covariance)
+    return build_trajectory(poses, covariance)

@@ -4,22 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
-
-class DriftSettings(Settings):
-    """Drift of a trajectory on top of the covariance of its odometry: a random walk along the path."""
-
-    position_drift_m: float = Field(
-        default=0.02, gt=0.0, description="standard deviation of the drift in position after one metre of travel [m]"
-    )
-    heading_drift_rad: float = Field(
-        default=0.005, gt=0.0, description="standard deviation of the drift in heading after one metre of travel [rad]"
-    )
+DRIFT = 0.02, 0.02, 0.005
+"""Standard deviation of the drift in x, y (metres) and heading (radians) after one metre of travel, on top of the
+covariance of the odometry: a random walk along the path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,12 +45,11 @@ class Trajectory:
         )
 
 
-def build_trajectory(poses: ArrayLike, settings: DriftSettings, step_covariance: ArrayLike | None = None) -> Trajectory:
-    """Accumulate the covariance along a path.
+def build_trajectory(poses: ArrayLike, step_covariance: ArrayLike | None = None) -> Trajectory:
+    """Accumulate the covariance along a path, that of ``DRIFT`` included.
 
     Args:
         poses: shape (N, 3), metres and radians, in the robot's own coordinate frame.
-        settings: drift per metre, added to the covariance of each step.
         step_covariance: covariance of each step in the tangent space at its end, shape (N - 1, 3, 3); None takes the
             steps as exact.
 
@@ -68,8 +58,7 @@ def build_trajectory(poses: ArrayLike, settings: DriftSettings, step_covariance:
     """
     x = np.asarray(poses, dtype=np.float64).reshape(-1, 3)
     length = np.hypot(*np.diff(x[:, :2], axis=0).T)
-    per_metre = np.array((settings.position_drift_m, settings.position_drift_m, settings.heading_drift_rad)) ** 2
-    spread = length[:, None, None] * np.diag(per_metre)
+    spread = length[:, None, None] * np.diag(np.square(DRIFT))
     if step_covariance is not None:
         spread += np.asarray(step_covariance, dtype=np.float64)
     # Lever arms start at the middle of the path: from a distant origin they would cost precision.

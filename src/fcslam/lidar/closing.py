@@ -56,6 +56,8 @@ LOOP_M, LOOP_PER_M = 0.25, 0.02
 """Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
 LOOP_RAD, LOOP_RAD_PER_M = 0.05, 0.002
 """The same for the heading, in radians and radians per metre."""
+NEARBY_M = 2.0
+"""Side of the squares of the map in which ``most_nearby`` limits the submaps, metres."""
 KNOWN_CANDIDATES = 1
 """Earlier visits that a submap in a square with more than ``most_nearby`` is compared with: one closure ties it to a
 well-known area."""
@@ -90,11 +92,8 @@ class ClosingConfig(Settings):
     most_nearby: int = Field(
         default=10,
         gt=0,
-        description="most submaps in a square of nearby_m that later ones are compared with; beyond, the oldest is "
-        "forgotten, and the newest is compared with one earlier visit instead of `candidates`",
-    )
-    nearby_m: float = Field(
-        default=2.0, gt=0, description="side of the squares of the map in which most_nearby limits the submaps [m]"
+        description="most submaps in a square of 2 m that later ones are compared with; beyond, the oldest is "
+        "forgotten, and the newest is compared with one earlier visit",
     )
 
 
@@ -203,7 +202,7 @@ class LoopCloser:
     def _forget_surplus(self, anchors: FloatArray) -> bool:
         """Forget the oldest submaps around the newest one beyond the limit; returns whether there were any."""
         held = np.array(list(self._held))
-        surplus = surplus_places(anchors[held, :2], self._config.nearby_m, self._config.most_nearby)
+        surplus = surplus_places(anchors[held, :2], NEARBY_M, self._config.most_nearby)
         for row in surplus:
             index = int(held[row])
             del self._held[index]

@@ -163,8 +163,8 @@ class PlaceIndex(Generic[PlaceId]):
         if self._postings.row_count > len(self._buffers.scores):
             self._buffers = empty_buffers(int(GROWTH_FACTOR * self._postings.row_count))
         if self._config.scoring is Scoring.MATCHES:
-            beam, near_bits = self._config.beam, self._config.near_bits
-            rows, scores = score_matches(entries, self._vocabulary.tree, self._buffers, count, codes, beam, near_bits)
+            tree, beam = self._vocabulary.tree, self._config.beam
+            rows, scores = score_matches(entries, tree, self._buffers, count, codes, beam)
         else:
             leaves, weights = self._weigh(codes)
             rows, scores = score_words(entries, self._buffers, count, leaves, weights)

@@ -42,6 +42,9 @@ class MatchDecision(StrEnum):
     """Their similarity alone: Algorithm 1, lines 14-17."""
 
 
+ALIGNED_CANDIDATES = 2
+"""Most similar places of other robots in the same map that are compared although the map puts them elsewhere, to find
+evidence against the join."""
 TOLERANCE_M = 1.0
 """Largest distance at which an image motion confirms a predicted pose, metres."""
 TOLERANCE_RAD = 0.3
@@ -87,12 +90,6 @@ class MatcherConfig(Settings):
     )
     nearby_m: float = Field(
         default=2.0, gt=0.0, description="side of the squares of the map in which the number of places is limited [m]"
-    )
-    aligned_candidates: int = Field(
-        default=2,
-        ge=0,
-        description="most similar places of other robots in the same map that are compared although the map puts them "
-        "elsewhere, to find evidence against the join",
     )
     vocabulary: VocabularyConfig = Field(default=VocabularyConfig(), description="dynamic vocabulary")
     verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
@@ -361,7 +358,7 @@ class PlaceMatcher:
         def is_known(i: KeyscanId) -> bool:
             return i.robot != robot and i not in predicted and not is_unaligned(i)
 
-        return [found.id for found in result.best(self._config.aligned_candidates, is_known)]
+        return [found.id for found in result.best(ALIGNED_CANDIDATES, is_known)]
 
     def _near(self, i: KeyscanId, place: Place, T_i_j: FloatArray) -> _Comparison:
         """The comparison of a predicted pair.

@@ -17,6 +17,8 @@ from fcslam.records import FloatArray
 
 _CODES_AT_ONCE = 32
 """Codes of a query whose words are prefetched together: enough to overlap cache misses, few enough for the cache."""
+NEAR_BITS = 56
+"""Largest Hamming distance of matching descriptors, bits."""
 TINY = 1e-300
 """Smallest divisor, in place of a sum that may be zero."""
 
@@ -86,11 +88,11 @@ def score_words(
 
 @njit
 def score_matches(
-    entries: Entries, tree: Tree, buffers: ScoreBuffers, place_count: int, codes: CodeWords, beam: int, near_bits: int
+    entries: Entries, tree: Tree, buffers: ScoreBuffers, place_count: int, codes: CodeWords, beam: int
 ) -> tuple[NDArray[np.int32], FloatArray]:
     """Weighted share of the query's descriptors that match a descriptor of a place; 1 for the query itself.
 
-    Each descriptor of the query votes for a place with the Epanechnikov kernel 1 - (d / (near_bits + 1))^2 of the
+    Each descriptor of the query votes for a place with the Epanechnikov kernel 1 - (d / (NEAR_BITS + 1))^2 of the
     distance d to its nearest descriptor there. Its weight is ln((N + 1) / n), where n is the sum of its votes: a
     descriptor that many places have says little (idf). A place with m > 1 times as many descriptors as the query has
     more chances to match. So its score is divided by sqrt(m), which gives the geometric mean of the shares of both.
@@ -102,13 +104,12 @@ def score_matches(
         place_count: N, number of stored places.
         codes: shape (K, 4), of the query.
         beam: words that are searched for each code.
-        near_bits: largest Hamming distance of matching codes.
 
     Returns:
         Rows (M,) with a match and their scores (M,), in [0, 1].
     """
-    scores, closeness, touched, here = buffers  # closeness: near_bits + 1 - distance
-    gives = 1.0 - ((near_bits + 1.0 - np.arange(near_bits + 2)) / (near_bits + 1.0)) ** 2
+    scores, closeness, touched, here = buffers  # closeness: NEAR_BITS + 1 - distance
+    gives = 1.0 - ((NEAR_BITS + 1.0 - np.arange(NEAR_BITS + 2)) / (NEAR_BITS + 1.0)) ** 2
     total, whole = 0, 0.0
     leaves = near_leaves(tree, codes, beam)
     for k in range(codes.shape[0]):
@@ -121,7 +122,7 @@ def score_matches(
             block, filled = newest_block(entries, leaf)
             while block >= 0:
                 for place in range(filled):
-                    close = near_bits + 1 - _distance(codes, k, entries.blocks, block, place)
+                    close = NEAR_BITS + 1 - _distance(codes, k, entries.blocks, block, place)
                     if close > 0:
                         row = entries.numbers[block, ROWS + place]
                         if closeness[row] == 0:
@@ -131,8 +132,8 @@ def score_matches(
                 block, filled = entries.numbers[block, OLDER], BLOCK
         votes = 0  # whole numbers: the sum must not depend on the order of the entries in memory
         for row in here[:found]:
-            votes += closeness[row] * (2 * near_bits + 2 - closeness[row])
-        weight = np.log((place_count + 1) / max(votes / (near_bits + 1.0) ** 2, 1.0))
+            votes += closeness[row] * (2 * NEAR_BITS + 2 - closeness[row])
+        weight = np.log((place_count + 1) / max(votes / (NEAR_BITS + 1.0) ** 2, 1.0))
         whole += weight
         for row in here[:found]:
             if scores[row] == 0.0:

@@ -34,6 +34,12 @@ class Scoring(StrEnum):
     MATCHES = "matches"
 
 
+SMALLEST_SPLIT = 20
+"""Smallest cluster that training splits further, descriptors."""
+ITERATIONS = 8
+"""Most rounds of k-means for one cluster."""
+
+
 class TreeConfig(Settings):
     """Shape of the k-means tree when it is trained."""
 
@@ -41,15 +47,11 @@ class TreeConfig(Settings):
     depth: int = Field(
         default=4, ge=1, le=8, description="levels of the tree below the root; at most branching ** depth words"
     )
-    smallest_split: int = Field(
-        default=20, ge=2, description="smallest cluster that training splits further [descriptors]"
-    )
-    iterations: int = Field(default=8, ge=1, le=100, description="most rounds of k-means for one cluster")
 
     @property
     def shape(self) -> TreeShape:
         """The same limits for compiled code."""
-        return TreeShape(self.branching, self.depth, self.smallest_split, self.iterations)
+        return TreeShape(self.branching, self.depth, SMALLEST_SPLIT, ITERATIONS)
 
 
 class VocabularyConfig(Settings):
@@ -80,9 +82,6 @@ class VocabularyConfig(Settings):
     )
     beam: int = Field(
         default=4, ge=1, le=64, description="words that are searched for each descriptor of a query, scoring matches"
-    )
-    near_bits: int = Field(
-        default=56, ge=0, le=256, description="largest Hamming distance of matching descriptors, scoring matches [bits]"
     )
 
 

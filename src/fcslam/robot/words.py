@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import solve_single_robot
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -152,7 +151,7 @@ class WordSender:
         for edge in self._edges:
             if not edge.robust:  # odometry comes in the order of the keyscans
                 chain.append(se2.compose(chain[-1], edge.T_i_j))
-        return solve_single_robot(PoseGraph(chain, self._edges), ConsistencySettings()).poses
+        return solve_single_robot(PoseGraph(chain, self._edges)).poses
 
 
 def without_ranges(keyscan: Keyscan) -> Keyscan:
