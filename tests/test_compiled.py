@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 WITHOUT_FOLDER = """
 import numpy as np
 from fcslam import compiled

@@ -22,6 +22,8 @@ from tests import small_fleet
 from tests.mission.test_mission_file import contents
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def alike():

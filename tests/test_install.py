@@ -13,6 +13,8 @@ import pytest
 import fcslam
 from tools.dockerfile_in_root import steps
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 LOGS = ROOT / "examples" / "logs"

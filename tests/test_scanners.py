@@ -14,6 +14,8 @@ from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, ranges, ring, ring_drive
 
+pytestmark = pytest.mark.slow
+
 HALF = LaserModel(181, -np.pi / 2, np.deg2rad(1.0), 20.0)
 TURN = LaserModel(360, -np.pi, np.deg2rad(1.0), 20.0)
 

@@ -17,6 +17,8 @@ from fcslam.sources.faults import Fault
 from tests.anchoring.test_plan import placed
 from tests.planned_building import LASER, WALLS, mapped, ranges_at, sides, true_poses
 
+pytestmark = pytest.mark.slow
+
 pyproj = pytest.importorskip("pyproj")
 
 ORIGIN = (47.3769, 8.5417, 400.0)

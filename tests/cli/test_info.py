@@ -10,6 +10,8 @@ from fcslam.records import LaserModel, LaserScan
 from fcslam.sources import write_carmen
 from tests.sources.bag_messages import drive, save, scan
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def bag(tmp_path):

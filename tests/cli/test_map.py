@@ -20,6 +20,8 @@ from fcslam.runs import read_tum
 from tests.small_fleet import truth_at
 from tests.sources.carmen_text import drive, flaser, odom, pose_at, save
 
+pytestmark = pytest.mark.slow
+
 RUN_FILES = {
     "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "mission.fcslam",
     "quality.json", "quality.png", "mission.state", "pose_graph.g2o", "robots.csv", "trajectories",

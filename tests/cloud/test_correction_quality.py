@@ -11,6 +11,8 @@ from fcslam.wire.packets import decode, encode
 from tests.scripted import ALIAS, closures, rectangle, stream
 from tests.small_fleet import feed
 
+pytestmark = pytest.mark.slow
+
 POSES = rectangle()
 A, B = ("a", POSES), ("b", POSES)
 PAIRS = [(k, k) for k in range(0, 48, 4)]

@@ -31,6 +31,8 @@ from fcslam.wire.messages import Hello
 from tests.scripted import ALIAS, closures, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
+pytestmark = pytest.mark.slow
+
 POSES = rectangle()
 A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)
 PAIRS = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]

@@ -19,6 +19,8 @@ from tests import small_fleet
 from tests.scripted import ALIAS, ScriptedMatcher, closures, motion, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
+pytestmark = pytest.mark.slow
+
 POSES = rectangle()
 A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)
 LATER = 1000.0

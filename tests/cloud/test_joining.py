@@ -16,6 +16,8 @@ from fcslam.records import Channel, ClosureStatus, LoopClosure, Reason, ReasonCo
 from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, stream, verified
 from tests.small_fleet import feed, map_of
 
+pytestmark = pytest.mark.slow
+
 POSES = rectangle(31)
 SETTINGS = ConsistencySettings()
 T_A_B = np.array([3.0, -2.0, 1.1])

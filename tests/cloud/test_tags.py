@@ -33,6 +33,8 @@ from fcslam.wire.quantisation import dequantise, quantise
 from tests.planned_building import LASER, OTHER_WALLS, WALLS, ranges_at, sides
 from tests.small_fleet import fingerprint, map_of
 
+pytestmark = pytest.mark.slow
+
 TAG = Tag(TagFamily.APRILTAG_36H11, 7)
 AT = np.array((9.9, 2.0, np.pi))
 """On a wall, where it faces west."""

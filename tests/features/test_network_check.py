@@ -8,6 +8,8 @@ from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.features.network_check import check_network
 from tests.features.networks import tiny_network
 
+pytestmark = pytest.mark.slow
+
 
 def test_own_networks_pass(tmp_path):
     check_network(BUNDLED_NETWORK)

@@ -17,6 +17,8 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.records import ReasonCode
 from tests.scripted import CLOSURE_INFORMATION, MOTION_INFORMATION, rectangle
 
+pytestmark = pytest.mark.slow
+
 TRUTH = rectangle()
 LIMIT = 0.08
 

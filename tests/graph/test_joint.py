@@ -14,6 +14,8 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import build_trajectory
 from tests.graph.graph_worlds import INFORMATION, measured, walk
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = ConsistencySettings()
 STEPS = 100
 ROBOTS = 3

@@ -13,6 +13,8 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import solve_single_robot
 from tests.graph.graph_worlds import INFORMATION, gauss_newton, manhattan
 
+pytestmark = pytest.mark.slow
+
 
 def apart(a: np.ndarray, b: np.ndarray) -> float:
     """Largest coordinate of the motions between two sets of poses."""

@@ -17,6 +17,8 @@ from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, layer_
 from fcslam.learning.network import KeypointNetwork, sample_codes  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 SMALL = TrainingSettings(steps=40)
 SIZE, SHIFT = 96, 8

@@ -20,6 +20,8 @@ from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
 from fcslam.learning.training_step import LegacyDetector, reduced_precision  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 SMALL = TrainingSettings(steps=40, pairs=1, side_px=64, points=32)
 CPU = torch.device("cpu")
 

@@ -20,6 +20,8 @@ from fcslam.sources.logs.carmen_writer import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 
+pytestmark = pytest.mark.slow
+
 NARROW = LaserModel(91, -math.pi / 2, math.radians(2.0), 5.0, (0.2, 0.05, 0.0))
 WIDE = LaserModel(180, -math.pi, math.radians(2.0), 12.0, (0.2, 0.05, 0.0))
 

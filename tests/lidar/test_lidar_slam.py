@@ -15,6 +15,8 @@ from fcslam.lidar.tracker import TrackedScan
 from fcslam.records import Constraint, ConstraintKind
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
 
+pytestmark = pytest.mark.slow
+
 DRIFT = {"scale": 1.03, "veer_rad_m": 0.015, "noise": 0.02}
 
 

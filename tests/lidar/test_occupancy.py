@@ -9,6 +9,8 @@ from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, cast_periods,
 from fcslam.records import LaserModel
 from fcslam.runs.map_files import Occupancy
 
+pytestmark = pytest.mark.slow
+
 CELL_M = 0.0625  # a power of two: moving by whole cells is exact
 CONFIG = OccupancyConfig(resolution_m=CELL_M)
 ONE_BEAM = LaserModel(1, 0.0, 0.01, 1000.0)

@@ -24,6 +24,8 @@ from fcslam.lidar.verification import VerificationConfig
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
 
+pytestmark = pytest.mark.slow
+
 
 class LastFirst(Executor):
     """Runs its tasks in reverse and late; arguments pass as between processes."""

@@ -15,6 +15,8 @@ from fcslam.sources import open_source, write_bag
 from fcslam.sources.logs.carmen_writer import write_carmen
 from tests.lidar import worlds
 
+pytestmark = pytest.mark.slow
+
 LASER = LaserModel(360, -math.pi, math.radians(1.0), 12.0, (0.2, 0.0, 0.0))
 POSES = worlds.drive(3 * [(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.15)
 SCANS = worlds.recording(POSES, POSES, worlds.room(), LASER)

@@ -13,6 +13,8 @@ from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
 from fcslam.lidar.scan import point_scan, rays_of
 from fcslam.records import LaserModel, Sweep
 
+pytestmark = pytest.mark.slow
+
 LASER = LaserModel(360, -np.pi, 2.0 * np.pi / 360, 20.0, (0.12, -0.05, 0.2))
 HALF_M = np.array((3.0, 2.2))
 """Half the sides of the room around the origin."""

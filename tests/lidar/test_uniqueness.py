@@ -9,6 +9,8 @@ from fcslam.lidar.uniqueness import align_map, best_elsewhere
 from tests.flats import BACK, ROUND, doors, flat, lookalike, mirrored
 from tests.lidar.worlds import box, drive, scan_at
 
+pytestmark = pytest.mark.slow
+
 
 def map_of(segments, waypoints, seed, T_map_start=(0.0, 0.0, 0.0)):
     """A map, which the robot begins at a pose, and the pose of its frame in the drawing."""

@@ -27,6 +27,8 @@ from tests.robot.fake_cloud import FakeCloud, Network, content
 from tests.robot.kidnapping import kidnapping
 from tests.wire.examples import CORRECTION
 
+pytestmark = pytest.mark.slow
+
 AS_FAST_AS_POSSIBLE = PlaybackPace(None, lambda: 0.0, lambda _: None)
 
 

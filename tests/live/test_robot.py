@@ -19,6 +19,8 @@ from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 from tests.robot.kidnapping import drives, kidnapping
 
+pytestmark = pytest.mark.slow
+
 CAMERA = fcslam.CameraModel(64, 48, 60.0, 60.0, 31.5, 23.5, fcslam.Transform((0.1, 0.0, 0.4), (-0.5, 0.5, -0.5, 0.5)))
 
 

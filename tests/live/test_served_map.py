@@ -21,6 +21,8 @@ from fcslam.runs.map_files import Occupancy, OccupancyMap, map_stem, map_yaml, p
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.http_transport import Server
 
+pytestmark = pytest.mark.slow
+
 NOBODY = "http://127.0.0.1:9"
 
 

@@ -20,6 +20,8 @@ from fcslam.maps.drawing import (
 )
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
+pytestmark = pytest.mark.slow
+
 SIDE_M = 0.05
 ROBOTS = tuple((rgb & 255, rgb >> 8 & 255, rgb >> 16) for rgb in palette.ROBOTS)
 

@@ -28,6 +28,8 @@ from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_tum
 
+pytestmark = pytest.mark.slow
+
 SIDE_M = 0.05
 SIZE_M = np.array((6.0, 4.0))
 ROBOTS = ("a", "b", "c")

@@ -21,6 +21,8 @@ from fcslam.sources import open_source
 from fcslam.sources.faults import Fault, Faults
 from tests.wire.examples import same
 
+pytestmark = pytest.mark.slow
+
 
 class Broken:
     """A recording that ends its reader."""

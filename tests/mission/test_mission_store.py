@@ -21,6 +21,8 @@ from fcslam.service.shared.registry import Registry
 from fcslam.storage.database import SealedConnection, seal
 from fcslam.wire.messages import PacketKind
 
+pytestmark = pytest.mark.slow
+
 NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))
 BATCHES = st.lists(st.lists(NUMBERS, max_size=8), max_size=12)
 

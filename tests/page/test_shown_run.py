@@ -33,6 +33,8 @@ from fcslam.service.http.app import PREFIX
 from fcslam.wire.packets import decode, measure
 from tests.service.http.desk import A
 
+pytestmark = pytest.mark.slow
+
 ASKED = (
     *("fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "quality.json", "config.yaml"),
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),

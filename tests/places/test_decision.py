@@ -13,6 +13,8 @@ from fcslam.places.index import PlaceIndex
 from fcslam.places.matcher import PlaceMatcher
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
 
+pytestmark = pytest.mark.slow
+
 PAPER = load(MissionConfig, Preset.PAPER.file).fleet.matcher
 PLACES = 26
 L = PAPER.vocabulary.train_batch

@@ -10,6 +10,8 @@ from fcslam.places.scoring import NEAR_BITS
 from fcslam.places.similarity import bag_of_words, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, TreeConfig, VocabularyConfig
 
+pytestmark = pytest.mark.slow
+
 SMALL = TreeConfig(branching=4, depth=3)
 EMPTY = np.empty((0, 32), np.uint8)
 EVERY = pytest.mark.parametrize("strategy", list(Strategy))

@@ -23,6 +23,8 @@ from fcslam.wire.packets import decode, encode
 from tests.robot.fake_cloud import said
 from tests.wire.examples import HELLO, KEYSCAN, LIDAR_PLACE
 
+pytestmark = pytest.mark.slow
+
 LIMIT = 10_000_000
 BODIES = [HELLO, KEYSCAN, LIDAR_PLACE]
 

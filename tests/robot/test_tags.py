@@ -15,6 +15,8 @@ from fcslam.records import CameraImage, KeyscanId, TagFamily
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.tags import TagDetector, TagsConfig
 
+pytestmark = pytest.mark.slow
+
 CAMERA = CameraSettings(width=640, height=480).model()
 TAG = WallTag(7, (0.0, 0.0, 0.0))
 NO_WALLS = np.zeros((0, 4))

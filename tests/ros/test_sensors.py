@@ -31,6 +31,8 @@ from tests.ros.ros_messages import (
 )
 from tests.sources.clouds import PERIOD_S, VELODYNE, at_rest, cloud, depth_image, plan_ranges, rotation, spinning
 
+pytestmark = pytest.mark.slow
+
 RANGES = np.full(180, 5.0)
 
 

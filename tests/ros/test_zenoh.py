@@ -18,6 +18,8 @@ pytest.importorskip("zenoh", reason="no eclipse-zenoh: make ros-test")
 
 from tests.ros import zenoh_peer
 
+pytestmark = pytest.mark.slow
+
 STRING = "std_msgs/String"
 HELLO, WORLD = (encoded(STRING, CODEC.make(STRING, data=word)) for word in ("hello", "world"))
 

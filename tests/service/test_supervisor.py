@@ -10,6 +10,8 @@ from fcslam.cloud.stage_times import StageTotal
 from fcslam.service import supervisor as module
 from fcslam.service.supervisor import Supervisor
 
+pytestmark = pytest.mark.slow
+
 SAYS = 'import sys; print(\'{"event": "live", "number": 7}\', flush=True);'
 STAYS = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
 """As a worker that is ready."""

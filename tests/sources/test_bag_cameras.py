@@ -12,6 +12,8 @@ from fcslam.records import CameraImage, GroundTruth, LaserScan, frozen
 from fcslam.sources import BagOptions, Fault, open_source, write_bag, write_recording
 from tests.sources.camera_records import CAMERA, drive, image, png, same, scan
 
+pytestmark = pytest.mark.slow
+
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
 PIXELS = np.arange(CAMERA.height * CAMERA.width * 3, dtype=np.uint8).reshape(CAMERA.height, CAMERA.width, 3)

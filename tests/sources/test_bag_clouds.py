@@ -29,6 +29,8 @@ from tests.sources.clouds import (
     spinning,
 )
 
+pytestmark = pytest.mark.slow
+
 START = 1_700_000_000.0
 OPTICAL_XYZW = (-0.5, 0.5, -0.5, 0.5)
 """z forward, x right, y down: a turn of -90 degrees about z after one of -90 degrees about x."""

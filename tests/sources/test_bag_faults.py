@@ -29,6 +29,8 @@ from tests.sources.bag_messages import (
 )
 from tests.sources.carmen_text import scans_of
 
+pytestmark = pytest.mark.slow
+
 FILES = ["run.bag", "run.mcap", "run.db3"]
 KINDS = [*FILES, "run"]
 

@@ -10,6 +10,8 @@ from tests.sources.bag_messages import drive, odom, pose_at, save, scan
 from tests.sources.carmen_text import scans_of
 from tests.sources.test_bag_faults import refusal
 
+pytestmark = pytest.mark.slow
+
 
 def parts(folder, suffix, count=3, scans=60):
     """A drive cut into files; tf_static is in the first one only."""

@@ -34,6 +34,8 @@ from tests.sources.carmen_text import drive as drive_log
 from tests.sources.carmen_text import save as save_log
 from tests.sources.carmen_text import scans_of
 
+pytestmark = pytest.mark.slow
+
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
 
 

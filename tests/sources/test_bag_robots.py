@@ -13,6 +13,8 @@ from fcslam.sources.inspection import inspect
 from tests.sources.bag_messages import BEAMS, drive, odom, pose_at, quaternion, save, scan, tf
 from tests.sources.test_bag_faults import refusal
 
+pytestmark = pytest.mark.slow
+
 MOUNTINGS = (0.2, 0.05, 0.1), (-0.1, 0.0, 2.0)
 
 

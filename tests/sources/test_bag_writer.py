@@ -15,6 +15,8 @@ from fcslam.sources import open_source, write_bag
 from tests.sources.bag_messages import BEAMS, ROS1, ROS2, drive, save
 from tests.sources.carmen_text import pose_at
 
+pytestmark = pytest.mark.slow
+
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
 SICK = LaserModel(181, -90 * math.radians(1.0), math.radians(1.0), 50.0, (0.25, 0.0, 0.0))
 ROUND = LaserModel(12, -math.pi, math.tau / 12, 12.5, (-0.1, 0.05, 0.4))

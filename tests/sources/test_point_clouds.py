@@ -33,6 +33,8 @@ from tests.sources.clouds import (
     spinning,
 )
 
+pytestmark = pytest.mark.slow
+
 BAND = CloudBand()
 
 

@@ -17,6 +17,8 @@ from tests.robot.fake_cloud import said
 from tests.robot.http_cloud import serving
 from tests.wire.examples import LIDAR_PLACE
 
+pytestmark = pytest.mark.slow
+
 PACKETS = [encode(said(0)), encode(said(1, LIDAR_PLACE))]
 
 

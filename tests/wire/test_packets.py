@@ -15,6 +15,8 @@ from fcslam.wire.packets import Label, decode, encode, read_label, unpacked_size
 from tests.wire.examples import EXAMPLES, GOLDEN, LIDAR_PLACE, ODOMETRY, packet, same
 from tests.wire.strategies import informations, packets
 
+pytestmark = pytest.mark.slow
+
 
 @settings(max_examples=200)
 @given(packets())

@@ -15,6 +15,8 @@ from fcslam.lab.evaluation.fleet.report import Join, evaluate_fleet, fleet_metri
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 
+pytestmark = pytest.mark.slow
+
 STEPS = 151
 """Of each robot: 15 m, 0.5 m/s."""
 T_BUILDING_MAP = np.array([3.0, -1.0, 0.7])

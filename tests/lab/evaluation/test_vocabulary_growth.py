@@ -17,6 +17,8 @@ from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from tests.lab.evaluation import place_folders
 
+pytestmark = pytest.mark.slow
+
 GROUPS, SEED = 12, 3
 
 

@@ -16,6 +16,8 @@ from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
 from fcslam.runs.map_files import Occupancy
 from tests.lab.simulation.driving import distances
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=30.0, camera=None, lidar=LidarSettings(max_range_m=6.0, rate_hz=5.0)
 )

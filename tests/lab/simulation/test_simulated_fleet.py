@@ -19,6 +19,8 @@ from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSett
 from fcslam.records import GroundTruth, LaserModel, LaserScan
 from tests.lab.simulation.driving import drive, route
 
+pytestmark = pytest.mark.slow
+
 TINY = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=4.0, camera=None, lidar=LidarSettings(beams=60, rate_hz=4.0)
 )

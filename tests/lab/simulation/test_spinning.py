@@ -19,6 +19,8 @@ from fcslam.sources.motion import moving_sweep
 from tests.lab.simulation.driving import distances
 from tests.sources.camera_records import same
 
+pytestmark = pytest.mark.slow
+
 SPINNING = [scanner for scanner, lidar in SCANNERS.items() if lidar.spin]
 EXACT = {"range_noise_m": 0.0, "dropout": 0.0}
 

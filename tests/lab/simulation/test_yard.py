@@ -19,6 +19,8 @@ from fcslam.lab.simulation.yard import draw_yard, move_cars
 from fcslam.records import LaserModel
 from tests.lab.simulation.driving import distances, drive
 
+pytestmark = pytest.mark.slow
+
 SICK = LidarSettings(beams=181, field_of_view_rad=np.pi, max_range_m=81.9, rate_hz=0.5)
 TINY = SimulationSettings(building=Building.YARD, robots=2, path_length_m=60.0, camera=None, lidar=SICK)
 HERE = np.array([20.0, 20.0, 0.0])

@@ -15,6 +15,8 @@ from fcslam.learning.federated.history import ROUNDS_FILE
 from fcslam.learning.federated.settings import FederatedSettings
 from tests.learning.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
 
+pytestmark = pytest.mark.slow
+
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
 """For where statistics are frozen and fakes would move them."""
 

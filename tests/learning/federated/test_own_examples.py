@@ -28,6 +28,8 @@ from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes  # noqa:
 from fcslam.wire.packets import decode, encode  # noqa: E402
 from tests.robot.test_views import records_of  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 CODE_LAYER, POINT_BIAS = "body.code_head.0.0.weight", "body.refine.4.bias"
 SETTINGS = RobotLearningSettings(held_out=HeldOutSettings(side_m=3.0))
 

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 from tests.service.http.desk import A, Desk, put_detector
 
+pytestmark = pytest.mark.slow
+
 OPEN = {"/healthz", "/readyz", "/openapi.json"}
 VALUES = {
     "layer": "changes",

@@ -15,6 +15,8 @@ from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode
 from tests.service.http.desk import A, B, Desk
 
+pytestmark = pytest.mark.slow
+
 NOW = datetime.datetime.now(datetime.UTC)
 ROBOTS = {"a": Role.ROBOT, "b": Role.ROBOT, "boss": Role.ROBOT}
 

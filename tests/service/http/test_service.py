@@ -35,6 +35,8 @@ from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER, ScriptedMatcher
 from tests.service.http.desk import POSES, SCRIPT, A, B, Desk, put_detector
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 
 API = "/api/v1"
