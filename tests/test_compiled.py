@@ -29,7 +29,6 @@ def run(script, *arguments, **environment):
     )  # fmt: skip
 
 
-@pytest.mark.slow
 def test_without_a_folder_every_process_compiles_and_says_so():
     done = run(WITHOUT_FOLDER)
     assert done.returncode == 0, done.stderr

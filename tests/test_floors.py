@@ -87,7 +87,6 @@ def mapped(logs, tmp_path_factory):
     return folder / "whole", recordings
 
 
-@pytest.mark.slow
 def test_a_run_folder_names_the_floors(mapped):
     run = open_run(mapped[0])
     assert {name: trajectory.floor for name, trajectory in run.trajectories.items()} == {"a": "1", "b": "1", "c": "2"}
@@ -95,7 +94,6 @@ def test_a_run_folder_names_the_floors(mapped):
     assert separations(run) == []
 
 
-@pytest.mark.slow
 def test_a_mission_goes_on_with_another_floor(mapped, tmp_path):
     whole, recordings = mapped
     below, above = {name: recordings[name] for name in "ab"}, recordings["c"]
@@ -104,7 +102,6 @@ def test_a_mission_goes_on_with_another_floor(mapped, tmp_path):
     assert contents(tmp_path / "both") == contents(whole)
 
 
-@pytest.mark.slow
 def test_a_robot_is_localized_in_the_map_of_its_floor(mapped):
     whole, recordings = mapped
     found = fcslam.localize(recordings["c"], whole, floor="2").trajectories.values()
@@ -121,7 +118,6 @@ def test_a_robot_is_localized_in_the_map_of_its_floor(mapped):
         read_map(whole / "map.yaml", "1")
 
 
-@pytest.mark.slow
 def test_no_closure_by_hand_joins_floors(mapped):
     whole, _ = mapped
     run = open_run(whole)

@@ -67,7 +67,6 @@ def odometry(truth):
     return drifting(truth, np.random.default_rng(4), scale=1.03, veer_rad_m=0.015, noise=0.02)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("laser_of", [interleaved, jittering])
 def test_a_scanner_whose_beams_vary_maps_as_well_as_one_whose_do_not(truth, odometry, laser_of):
     steady = laser_of(4)
@@ -80,7 +79,6 @@ def test_a_scanner_whose_beams_vary_maps_as_well_as_one_whose_do_not(truth, odom
     assert errors["varying"] < 0.05
 
 
-@pytest.mark.slow
 def test_more_beams_than_the_noise_can_tell_apart_map_as_well_as_fewer(truth, odometry):
     errors = {}
     for beams in (400, 3200):

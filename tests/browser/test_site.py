@@ -18,8 +18,6 @@ pytest.importorskip("mkdocstrings_handlers.python", reason="no mkdocstrings: mak
 ROOT = Path(__file__).parents[2]
 PAGES = ("index", "start/first-map", "concepts/places", "troubleshooting", "reference/commands", "results/mapping")
 
-LONGEST_MS = 120_000
-"""Time that a busy machine may take to read the index."""
 CUT_WORDS = """() => [...document.querySelectorAll("article code .word")]
     .filter((word) => word.getClientRects().length > 1).map((word) => word.textContent)"""
 """Options of which a part stands on the next line."""
@@ -64,10 +62,10 @@ def test_search_finds_a_setting(site, browser):
     page = browser.new_page(viewport={"width": 1280, "height": 800})
     page.goto(f"{site}/index.html")
     page.locator(".md-search-result__meta", has_text="Type to start searching").wait_for(
-        state="attached", timeout=LONGEST_MS
+        state="attached", timeout=30_000
     )
     page.locator("input.md-search__input").press_sequentially("minimum_evidence")
-    page.locator(".md-search-result__item").first.wait_for(timeout=LONGEST_MS)
+    page.locator(".md-search-result__item").first.wait_for(timeout=30_000)
     assert "Settings" in page.locator(".md-search-result__list").inner_text()
     page.close()
 

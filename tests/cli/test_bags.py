@@ -54,7 +54,6 @@ def from_log(logs, tmp_path_factory):
     return read_tum(output / "trajectories" / "robot.tum")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.bag", "run.mcap"])
 def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path, name):
     assert run("record", logs[0], "-o", tmp_path / name) == 0
@@ -64,7 +63,6 @@ def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path,
     assert np.hypot(*(poses - from_log[1])[:, :2].T).max() < 1e-3
 
 
-@pytest.mark.slow
 def test_a_recording_made_of_a_log_gives_the_same_trajectory_to_the_bit(logs, from_log, tmp_path):
     assert run("record", logs[0], "-o", tmp_path / "robot.fcslam") == 0
     assert run("map", tmp_path / "robot.fcslam", "-o", tmp_path / "out") == 0
@@ -106,7 +104,6 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 # Names
 
 
-@pytest.mark.slow
 def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
     twin = save(tmp_path / "run1.mcap", drive(15))
     assert "NAME=LOG" in refused(capsys, "map", bag, twin, "-o", tmp_path / "out")
@@ -191,7 +188,6 @@ def test_bad_bags_leave_nothing(tmp_path, capsys):
 # fcslam record, of a recording
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["a.clf", "a.log.gz", "a.clf.xz", "a.clf.bz2", "a.bag", "a.mcap", "a.db3", "folder", "a.fcslam"]
 )
@@ -211,7 +207,6 @@ def test_options_choose_what_is_converted(tmp_path):
     assert open_source(tmp_path / "other.clf").survey().scan_count == 7
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder", "a.fcslam"])
 def test_only_force_replaces(tmp_path, bag, capsys, name):
     output = tmp_path / name

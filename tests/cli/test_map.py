@@ -107,7 +107,6 @@ def test_the_truths_relations_agree(run, logs, capsys):
     assert mean < 0.05
 
 
-@pytest.mark.slow
 def test_what_came_out_is_said(logs, tmp_path, capsys):
     assert run_map(logs[0], "--output", tmp_path / "a[bold]" / "run") == 0
     out, err = capsys.readouterr()
@@ -117,7 +116,6 @@ def test_what_came_out_is_said(logs, tmp_path, capsys):
     assert "Traceback" not in err
 
 
-@pytest.mark.slow
 def test_one_recording_split_into_robots(logs, tmp_path, drawn):
     assert run_map(logs[0], "--split", 2, "--output", tmp_path / "run") == 0
     rows = rows_of(tmp_path / "run" / "robots.csv")
@@ -127,7 +125,6 @@ def test_one_recording_split_into_robots(logs, tmp_path, drawn):
     assert max(counts) - min(counts) <= 1
 
 
-@pytest.mark.slow
 def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsys):
     run = tmp_path / "run"
     assert run_map(*logs, "--config", "fleet.join_maps=false", "--output", run) == 0
@@ -139,7 +136,6 @@ def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsy
     assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["join_maps"] is False
 
 
-@pytest.mark.slow
 def test_the_configuration_goes_round(logs, run, tmp_path, capsys):
     """A dumped configuration is a valid one, and the run's own gives the run again, byte for byte."""
     assert main(["tools", "config"]) == 0
@@ -194,7 +190,6 @@ TOLERATED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("lines", "reports"), TOLERATED.values(), ids=TOLERATED)
 def test_little_damage_is_tolerated_and_reported(tmp_path, capsys, lines, reports):
     log = save(tmp_path / "healthy.log", lines)
@@ -204,7 +199,6 @@ def test_little_damage_is_tolerated_and_reported(tmp_path, capsys, lines, report
     assert names_in(tmp_path / "run") == RUN_FILES
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ranges", [(float("nan"),) * 8, (-1.0,) * 8, (81.91,) * 8, (0.0,) * 8])
 def test_a_laser_that_never_sees_anything_is_no_traceback(tmp_path, capsys, ranges):
     log = save(tmp_path / "blind.log", [flaser(100 + 0.2 * k, pose_at(k), ranges=ranges) for k in range(40)])
@@ -261,7 +255,6 @@ def refused(capsys, tmp_path, *arguments):
     return error
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("make", "reason"), BAD_LOGS.values(), ids=BAD_LOGS)
 @pytest.mark.parametrize("first", [True, False])
 def test_a_bad_recording_is_refused(tmp_path, log, capsys, make, reason, first):

@@ -55,7 +55,6 @@ def cloud():
         yield cloud
 
 
-@pytest.mark.slow
 def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     state = tmp_path / "state"
     (tmp_path / "token").write_text("s3cret\n")
@@ -147,7 +146,6 @@ def heeded():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.slow
 def test_a_robot_that_is_stopped_twice_says_what_is_left_and_goes_on_later(
     log, cloud, tmp_path, monkeypatch, capsys, heeded
 ):

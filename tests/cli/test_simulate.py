@@ -80,7 +80,6 @@ def test_a_scanner_is_as_asked_and_a_file_overrides_it(tmp_path):
     assert "turn_rate_rad_s: 2.0" in (tmp_path / "other" / "simulation.yaml").read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
 def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
     recordings = [str(simulated / name) for name in ("robot_1", "robot_2")]
     assert main(["map", *recordings, "--output", str(tmp_path / "run")]) == 0
@@ -112,7 +111,6 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]
 
 
-@pytest.mark.slow
 def test_without_a_gl_library_one_line_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(engine, "_BACKENDS", ("none",))
     monkeypatch.delenv("MUJOCO_GL", raising=False)

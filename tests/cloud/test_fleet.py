@@ -169,7 +169,6 @@ def test_a_veto_parts_what_only_liars_joined(scripted):
     assert fingerprint(feed(before, two_robots()).finalize()) == fingerprint(result)
 
 
-@pytest.mark.slow
 def test_a_veto_clears_the_way_for_the_truth_whenever_it_comes(scripted):
     """Four aliases keep six true closures from joining; vetoed, before or after, they do so no more."""
     alias = closures(A, B, OTHERS[:4], shift=ALIAS)
@@ -295,7 +294,6 @@ def test_a_robots_own_closure_may_be_revoked_too(scripted):
     assert np.allclose(se2.between(result.robots[0].T_map_base, POSES), 0.0, atol=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("names", ["abcd", "acbd", "bdac", "dbca"])
 def test_maps_of_several_robots_join_whoever_came_first(scripted, names):
     """Two pairs of robots join first, then the pairs: each map moves as a whole, into the older one's frame."""
@@ -339,7 +337,6 @@ def test_nothing_received_is_nothing_mapped():
     assert result.closures == ()
 
 
-@pytest.mark.slow
 def test_robots_in_two_buildings_stay_in_two_maps():
     """Real scans, real matching: two offices with corridors of one width are full of places that look the same."""
     packets = [
@@ -352,7 +349,6 @@ def test_robots_in_two_buildings_stay_in_two_maps():
     assert not between(result, ClosureStatus.ACCEPTED)
 
 
-@pytest.mark.slow
 def test_robots_that_met_lie_as_they_drove(drawn, packets):
     """Across robots, every pair of keyscans within sight is measured to the centimetre."""
     result = feed(Cloud(FleetConfig(), seed=0), packets).finalize()
@@ -381,7 +377,6 @@ def test_the_result_is_a_function_of_the_set_of_packets(reference, packets):
     assert fingerprint(feed(Cloud(FleetConfig(), seed=0), shuffled).finalize()) == reference
 
 
-@pytest.mark.slow
 def test_looking_at_the_result_does_not_change_it(scripted):
     script = [*closures(A, B, TRUE), *closures(A, B, OTHERS[:3], shift=ALIAS)]
     packets = in_order([*stream(*A, start_s=0.0), *stream(*B, start_s=5.5)])
@@ -401,7 +396,6 @@ def test_duplicates_change_nothing(scripted):
     assert fingerprint(doubled.finalize()) == fingerprint(once.finalize())
 
 
-@pytest.mark.slow
 def test_every_beginning_of_a_recording_has_a_result(scripted):
     """A connection may break after any packet."""
     packets = in_order([*stream("a", POSES[:12], start_s=0.0), *stream("b", POSES[:12], start_s=0.5)])
@@ -423,7 +417,6 @@ def places_kept(cloud):
     return {robot: [k for k in range(0, 301, 4) if KeyscanId(robot, k) in matcher] for robot in ("a", "b")}
 
 
-@pytest.mark.slow
 def test_of_many_places_of_one_robot_at_one_spot_the_oldest_are_forgotten():
     settings = MatcherConfig(most_nearby=2, nearby_m=1.0)
     cloud = feed(Cloud(FleetConfig(matcher=settings), 0), rounds(5))

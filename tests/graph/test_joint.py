@@ -105,7 +105,6 @@ def lying_world(seed: int, share: float) -> World:
     return world
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("share", [0.1, 0.7])
 def test_false_closures_are_found_out_and_true_ones_kept(seed: int, share: float) -> None:
@@ -204,7 +203,6 @@ def test_robots_that_never_met_are_mapped_each_in_its_own_frame() -> None:
         assert np.allclose(solution.poses[world.variable(robot, 0)], STARTS[robot])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("column", ["informative", "independent", "excluded"])
 def test_evidence_that_does_not_count_joins_nobody(column: str) -> None:
     world = World(2)

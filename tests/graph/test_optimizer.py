@@ -65,7 +65,6 @@ def test_order_of_edges_does_not_matter_and_repetition_gives_the_same_bytes(solv
     assert first.weights.tobytes() == again.weights.tobytes()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_robot_alone_rejects_false_closures(seed: int, share: float) -> None:

@@ -52,7 +52,6 @@ def test_a_leg_does_its_steps_and_says_so(examples, start):
     assert any(not torch.equal(start[name], tensor) for name, tensor in network.state_dict().items())
 
 
-@pytest.mark.slow
 def test_a_leg_learns(examples, start):
     longer = SMALL.model_copy(update={"pairs": 2})
     first = local_training(start, examples, LocalTrainingPlan(longer, first_step=0, steps=5)).losses
@@ -61,7 +60,6 @@ def test_a_leg_learns(examples, start):
     assert last["detector"] < 0.9 * first["detector"]
 
 
-@pytest.mark.slow
 def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, start):
     whole = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 3))
     first = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS))
@@ -117,7 +115,6 @@ def test_a_network_is_not_pulled_away_from_its_own_codes(examples, start):
     assert LegacyDetector(1.0, network).loss(maps._replace(code_logits=-logits), nothing) == 0.0
 
 
-@pytest.mark.slow
 def test_codes_are_kept_to_those_of_a_former_network(examples, start):
     torch.manual_seed(2)
     former = KeypointNetwork("light").state_dict()

@@ -121,7 +121,6 @@ def test_submaps_cover_the_drive(mapped):
     assert mapped.submaps[-1].last == len(travel) - 1
 
 
-@pytest.mark.slow
 def test_the_same_recording_gives_the_same_bytes(scans, mapped):
     again = Mapped(scans)
     assert again.poses.tobytes() == mapped.poses.tobytes()
@@ -174,7 +173,6 @@ def guest():
     return truth, recording(truth, odometry, hotel(spacing, rooms=4))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("drift", [0.03, 1.0])
 def test_rooms_that_look_alike_stay_apart(guest, drift):
     """With the default drift, and with so much allowed for that every twin lies inside the search."""

@@ -74,7 +74,6 @@ def test_looking_leaves_no_trace(around):
         assert step.pose.keyscan == other.pose.keyscan
 
 
-@pytest.mark.slow
 def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
     frontend = mapped(around[:60])
     doubts = []
@@ -158,7 +157,6 @@ def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):
     assert not judged(frontend, torn[:20])
 
 
-@pytest.mark.slow
 def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
     poses = ring_drive()
     changed = recording(poses, poses, np.vstack((ring(), box(13.6, 6.0, 14.1, 6.5))))

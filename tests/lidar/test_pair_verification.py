@@ -234,7 +234,6 @@ def test_a_fleet_with_a_pool_is_the_same(packets, pool):
     assert results[0] == results[1]
 
 
-@pytest.mark.slow
 def test_processes_find_what_is_found_here(pairs, monkeypatch):
     """One of them is killed."""
     monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)

@@ -86,7 +86,6 @@ def contents(packets):
     return [encode(packet) for packet in packets]
 
 
-@pytest.mark.slow
 def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     cloud = FakeCloud(correction=CORRECTION.version)
     robot = drive(tmp_path, Network(cloud), scans)
@@ -102,7 +101,6 @@ def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_an_outage_leaves_no_trace(scans, alone, tmp_path):
     """The cloud is away until the recording is over; the front end never waits for it."""
     cloud, back = FakeCloud(), threading.Event()
@@ -121,7 +119,6 @@ def test_an_outage_leaves_no_trace(scans, alone, tmp_path):
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("stop", [1, 40])
 def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_path, stop):
     cloud = FakeCloud()
@@ -136,7 +133,6 @@ def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_pa
     assert seen[-1] is False
 
 
-@pytest.mark.slow
 def test_a_robot_that_starts_anew_has_a_new_epoch_and_the_old_one_is_not_lost(scans, alone, tmp_path):
     cloud = FakeCloud()
     with pytest.raises(KeyboardInterrupt):
@@ -156,7 +152,6 @@ def test_another_recording_cannot_be_resumed(scans, tmp_path):
         drive(tmp_path, Network(FakeCloud()), scans[1:], resume=True)
 
 
-@pytest.mark.slow
 def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone, tmp_path, monkeypatch):
     """The cloud is away until the outbox is full."""
     cloud = FakeCloud()
@@ -182,7 +177,6 @@ def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone
     assert list(cloud.stored) == [(0, k) for k in range(len(sent))]
 
 
-@pytest.mark.slow
 def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
@@ -193,7 +187,6 @@ def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     assert len(cloud.stored) == len(alone) - 1
 
 
-@pytest.mark.slow
 def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
@@ -205,7 +198,6 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     outbox.close()
 
 
-@pytest.mark.slow
 def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-2")
     file = describe_detector_file(tmp_path / "tiny.onnx")
@@ -251,7 +243,6 @@ def test_a_robot_on_another_floor_was_not_lost(scans, tmp_path):
     assert [(hello.epoch, hello.floor) for hello in hellos] == [(0, "1"), (1, "2")]
 
 
-@pytest.mark.slow
 def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     """Put down elsewhere and, after another while, stopped and resumed: each part travels in an epoch of its own."""
     scans, moment = kidnapping()
@@ -280,7 +271,6 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     assert np.array_equal(robot.trajectory().stamps, stamps), "not even if it was called the same map then"
 
 
-@pytest.mark.slow
 def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):
     class Closed(Network):
         def state(self):

@@ -80,7 +80,6 @@ def test_the_covariance_is_one_in_the_axes_of_the_map(robot, scans):
         assert math.sqrt(covariance[0, 0]) < 0.2
 
 
-@pytest.mark.slow
 def test_the_finished_run_is_that_of_the_recording(scans, tmp_path):
     write_carmen(tmp_path / "anna.clf", scans)
     mapped = fcslam.map_recordings(tmp_path / "anna.clf")
@@ -152,7 +151,6 @@ def test_a_run_can_be_saved_before_the_end(robot, scans, tmp_path):
     assert len(robot.save(tmp_path / "run", force=True).trajectories["anna"].stamps) == len(scans)
 
 
-@pytest.mark.slow
 def test_a_lost_robot_says_so_and_finds_its_place_again():
     scans, moment = kidnapping()
     events = []
@@ -168,7 +166,6 @@ def test_a_lost_robot_says_so_and_finds_its_place_again():
     assert all(pose.is_localized == (not lost.stamp <= pose.stamp < found.stamp) for pose in poses if settled(pose))
 
 
-@pytest.mark.slow
 def test_a_robot_that_starts_again_finds_its_earlier_map(tmp_path):
     first, again = drives()
     with fcslam.Robot("anna", first[0].laser, state=tmp_path, wiring=Wiring(SameThread())) as robot:
@@ -325,7 +322,6 @@ def test_nothing_comes_after_the_end(robot, scans):
     assert len(robot.trajectory().stamps) == 3
 
 
-@pytest.mark.slow
 def test_another_thread_may_ask_meanwhile(scans):
     with fcslam.Robot("anna", scans[0].laser) as robot:  # with a process of its own
         stop, drawn = threading.Event(), []

@@ -52,7 +52,6 @@ def way(*points):
     return np.array([(x, y, 0.0) for x, y in points])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(60, 90), (300, 500), (700, 800), (3000, 1400), (4000, 5000)])
 def test_the_long_side_is_about_1600_pixels_and_walls_are_crisp(shape):
     image = seen(map_png(walled(*shape), {}, []))

@@ -193,7 +193,6 @@ def test_single_beams_do_not_widen_a_chart():
     assert lost.bounds()[1][0] == pytest.approx(12.0 + RAY_M)
 
 
-@pytest.mark.slow
 def test_maps_of_nothing_are_still_a_figure(tmp_path):
     nothing = LabelledGrid(np.zeros((1, 1), np.bool_), np.zeros((1, 1), np.bool_), SIDE_M, np.zeros(3))
     stands = Chart(nothing, {"a": np.zeros((1, 3))})
@@ -201,7 +200,6 @@ def test_maps_of_nothing_are_still_a_figure(tmp_path):
     assert cv2.imread(str(tmp_path / "figure.png")).shape[1] == WIDTH_PX
 
 
-@pytest.mark.slow
 def test_the_same_charts_make_the_same_file(charts, tmp_path):
     for name in ("one.png", "two.png"):
         write_figure(charts, tmp_path / name)
@@ -269,7 +267,6 @@ def test_what_is_missing_is_told(run_folder):
         fleet_charts(run_folder)
 
 
-@pytest.mark.slow
 def test_the_command_draws_it(run_folder):
     drawn = run_folder.parent / "figure.png"
     assert main(["evaluate", "fleet", str(run_folder), "--figure", str(drawn)]) == 0

@@ -74,7 +74,6 @@ def stored(store):
     return [packet for _, packet in store.arrivals(0, 1000)]
 
 
-@pytest.mark.slow
 @given(batches=BATCHES)
 @pytest.mark.parametrize("kind", ["file", "server"])
 def test_packets_are_stored_once_in_the_order_of_their_arrival(kind, batches, tmp_path_factory, request):

@@ -275,7 +275,6 @@ def test_a_run_without_trajectories_has_no_archive_of_them(tmp_path):
 CHROMIUM = shutil.which("chromium")
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
     (tmp_path / "report.html").write_text(report_html(shown))

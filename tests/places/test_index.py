@@ -111,7 +111,6 @@ def check_stored(index, places):
         np.testing.assert_array_equal(index.descriptors(number), places[number])
 
 
-@pytest.mark.slow
 @EVERY
 @BOTH
 @pytest.mark.parametrize(("seed", "count"), [(0, 5), (1, 40), (2, 90)])
@@ -130,7 +129,6 @@ def test_queries_find_what_comparing_with_every_place_finds(strategy, scoring, s
         assert not index._buffers.marks.any()
 
 
-@pytest.mark.slow
 @EVERY
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**16), steps=st.lists(st.sampled_from("aaaf"), max_size=80), equal=st.booleans())
@@ -205,7 +203,6 @@ def test_eq_4_of_two_places_is_that_of_their_bags(strategy):
         assert index.similarity(places[2], places[other]) == pytest.approx(expected[other], abs=1e-9)
 
 
-@pytest.mark.slow
 @EVERY
 @BOTH
 @pytest.mark.parametrize(
@@ -229,7 +226,6 @@ def test_poor_places_are_stored_and_harm_nothing(strategy, scoring, codes):
     check_stored(index, places)
 
 
-@pytest.mark.slow
 @BOTH
 def test_ten_thousand_identical_places_are_one_to_any_query(scoring):
     place = random_places(np.random.default_rng(3), 1)[0][:5]
@@ -326,7 +322,6 @@ def test_words_stay_under_their_capacity_and_all_others_stay_as_they_are():
     assert touched
 
 
-@pytest.mark.slow
 def test_forgetting_gives_words_and_memory_back():
     index, places = filled(Strategy.INCREMENTAL, count=60)
     words, blocks, vertices = index.word_count, len(index._postings.entries.blocks), len(index._vocabulary.words)

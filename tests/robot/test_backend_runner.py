@@ -74,7 +74,6 @@ def test_poses_are_known_while_the_back_end_is_busy(scans):
     assert robot.backlog == 0
 
 
-@pytest.mark.slow
 def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
     scans, _ = kidnapping()
     executor = Held()
@@ -134,7 +133,6 @@ def contents_of(bodies):
     return [(type(body), getattr(body, "id", None), getattr(body, "j", None)) for body in bodies]
 
 
-@pytest.mark.slow
 def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans):
     expected = driven(scans)[1]
     with backend_process("r", CONFIG) as backend:

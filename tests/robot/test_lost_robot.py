@@ -27,7 +27,6 @@ def driven(records, config=ROBOT):
     return robot, packets + robot.finish()
 
 
-@pytest.mark.slow
 def test_a_kidnapped_robot_begins_anew_where_it_was_put_down():
     scans, moment = kidnapping()
     robot, packets = driven(scans)
@@ -45,7 +44,6 @@ def test_a_kidnapped_robot_begins_anew_where_it_was_put_down():
     assert [pose.stamp for track in robot.tracks for pose in track] == [scan.stamp for scan in scans]
 
 
-@pytest.mark.slow
 def test_both_sessions_are_what_two_robots_would_have_said():
     scans, moment = kidnapping()
     _, packets = driven(scans)
@@ -59,7 +57,6 @@ def replace_epoch(packet):
     return encode(replace(packet, epoch=0, body=body))
 
 
-@pytest.mark.slow
 def test_who_cannot_be_lost_ties_the_two_places_together():
     scans, moment = kidnapping()
     robot, packets = driven(scans, BLIND)
@@ -82,7 +79,6 @@ def test_a_robot_that_drove_on_unseen_begins_anew():
     assert max(np.hypot(x, y) for x, y, _ in motions) < 1.0
 
 
-@pytest.mark.slow
 def test_a_drive_without_surprises_says_the_same_whether_it_is_watched_or_not():
     for scans in drives():
         robot, watched = driven(scans)
@@ -90,7 +86,6 @@ def test_a_drive_without_surprises_says_the_same_whether_it_is_watched_or_not():
         assert [encode(packet) for packet in watched] == [encode(packet) for packet in driven(scans, BLIND)[1]]
 
 
-@pytest.mark.slow
 def test_doubt_that_passes_leaves_no_trace():
     """Somebody stands before the laser for three scans."""
     scans = list(drives()[0])
@@ -106,7 +101,6 @@ def test_doubt_that_passes_leaves_no_trace():
     assert [encode(packet) for packet in packets] == [encode(packet) for packet in driven(scans, BLIND)[1]]
 
 
-@pytest.mark.slow
 def test_a_recording_that_ends_in_doubt_is_whole():
     scans, moment = kidnapping()
     end = next(k for k, scan in enumerate(scans) if scan.stamp > moment) + 3

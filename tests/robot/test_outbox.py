@@ -303,7 +303,6 @@ def test_an_outbox_of_another_version_is_told_as_such(path):
         Outbox(path, "anna", LIMIT)
 
 
-@pytest.mark.slow
 def test_a_killed_robot_has_all_that_it_put(path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     most = -1

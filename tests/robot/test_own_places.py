@@ -137,7 +137,6 @@ class VeeringTracker:
         pass
 
 
-@pytest.mark.slow
 def test_the_map_closes_with_its_loop():
     """25 m of drift and more bend into shape: the robust solve must not take the loop for the outlier."""
     truth = lap(225.0, FINE_M)

@@ -46,7 +46,6 @@ def places(packets, version):
     return [p.body for p in packets if isinstance(p.body, Place) and p.body.detector_version == version]
 
 
-@pytest.mark.slow
 def test_old_places_are_described_again_and_new_ones_by_the_new_detector_alone(seen):
     half = len(seen) // 2
     robot = RobotFrontend("r", WITH_ORB)
@@ -93,7 +92,6 @@ def test_a_detector_that_comes_before_the_first_scan_is_announced_once(seen):
     assert hello.detector_versions == {Channel.CAMERA: SHIPPED.version}
 
 
-@pytest.mark.slow
 def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
     """A release that was withdrawn: places of the version before are there already."""
     tiny_network(tmp_path / "tiny.onnx", version="tiny-1")
@@ -134,7 +132,6 @@ def test_what_is_not_the_file_that_was_announced_changes_nothing(seen, tmp_path)
     assert [encode(packet) for packet in driven(robot, seen[:40])] == [encode(packet) for packet in untouched]
 
 
-@pytest.mark.slow
 def test_no_image_leaves_with_what_is_described_again(seen):
     pieces = {record.encoded[k : k + 12] for record in seen if isinstance(record, CameraImage)
               for k in range(640, len(record.encoded) - 12)}  # fmt: skip
@@ -166,7 +163,6 @@ def between(result):
     return [closure for closure in result.closures if closure.i.robot != closure.j.robot]
 
 
-@pytest.mark.slow
 def test_places_of_before_match_what_others_see_once_they_are_described_again(fleet):
     joined = received([*fleet["switched"], *fleet["new"]])
     assert {robot.map_index for robot in joined.robots} == {0}
@@ -179,7 +175,6 @@ def test_places_of_before_match_what_others_see_once_they_are_described_again(fl
     assert fingerprint(other_way) == fingerprint(joined)
 
 
-@pytest.mark.slow
 def test_codes_of_different_versions_are_not_compared(fleet):
     apart = received([*fleet["stayed"], *fleet["new"]])
     assert {robot.map_index for robot in apart.robots} == {0, 1}

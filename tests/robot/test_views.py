@@ -63,7 +63,6 @@ def places(bodies, channel=Channel.CAMERA):
     return [body for body in bodies if isinstance(body, Place) and body.channel is channel]
 
 
-@pytest.mark.slow
 def test_camera_places_come_every_metre_with_heights(seen):
     bodies, packets = bodies_of(seen[0])
     found = places(bodies)
@@ -171,7 +170,6 @@ def test_without_odometry_at_the_image_the_robot_stands(seen):
     assert len(places(bodies_of(blind)[0])) >= 7
 
 
-@pytest.mark.slow
 def test_no_packet_holds_a_piece_of_an_image(seen):
     """Every packet that a robot with a camera sends, whatever its kind: not 12 bytes of a file, nor 12 grey levels."""
     records, _ = seen
@@ -188,7 +186,6 @@ def test_no_packet_holds_a_piece_of_an_image(seen):
         assert not any(data[k : k + 12] in pieces for k in range(len(data) - 11))
 
 
-@pytest.mark.slow
 def test_what_cameras_saw_joins_two_maps():
     """Two robots that drive the same way, from unknown starts: camera places alone tell how they lie."""
     ways = [(1.5, 1.5), (12.5, 1.5)], [(3.0, 1.6), (12.5, 1.6)]
@@ -242,7 +239,6 @@ def corridor_of_one_pattern(period_m):
     return np.vstack((*south, *north)), len(ends)
 
 
-@pytest.mark.slow
 def test_corridors_that_repeat_themselves_join_nothing_by_their_images_alone():
     """Two robots in stretches 24 m apart that look the same: no wall fixes a match, so nobody guesses."""
     walls, count = corridor_of_one_pattern(8.0)

@@ -108,7 +108,6 @@ def expected(robots="ab"):
     return found
 
 
-@pytest.mark.slow
 def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs, rng_order):
     config = MissionConfig(seed=3)
     packets = in_order(packet for log in logs[:2] for packet in sent(open_source(log), config.robot))
@@ -145,7 +144,6 @@ def rng_order():
     return batches
 
 
-@pytest.mark.slow
 def test_a_worker_that_starts_again_goes_on_as_if_nothing_had_been(cloud, tmp_path, scripted):
     packets = two_robots()
     undisturbed = Cloud(tmp_path / "undisturbed")
@@ -463,7 +461,6 @@ def told(process, event):
         assert said == PROGRESS or said.startswith((STAGE_RUNS, STAGE_MS))
 
 
-@pytest.mark.slow
 def test_a_worker_waits_until_the_one_before_is_gone_and_ends_with_one_line_when_its_service_was_killed(cloud):
     command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
     cloud.put(stream("a", POSES, start_s=0.0))
@@ -495,7 +492,6 @@ def test_a_worker_that_is_told_to_stop_while_it_compiles_does_so_at_once(cloud):
         assert process.wait(60) == -signal.SIGTERM
 
 
-@pytest.mark.slow
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
     cloud.put(two_robots())
     assert {t.map_index for t in cloud.finalize().trajectories.values()} == {0}
@@ -615,7 +611,6 @@ def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
     assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories.values()) == 2 * len(POSES)
 
 
-@pytest.mark.slow
 def test_more_robots_join_a_mission_that_was_finished(cloud):
     packets = two_robots()
     half = [p for p in packets if p.robot == "a"]
@@ -626,7 +621,6 @@ def test_more_robots_join_a_mission_that_was_finished(cloud):
     assert content(cloud.finalize()) == expected()
 
 
-@pytest.mark.slow
 def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scripted):
     scripted(closures(("a", POSES), ("a+1", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)]))
     first, again = stream("a", POSES, start_s=0.0), stream("a", POSES, start_s=600_000.0)
@@ -640,7 +634,6 @@ def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scr
     assert {"map.pgm", "map.yaml", "map.png"} == set(run.map_files)
 
 
-@pytest.mark.slow
 def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
     """The worker reads from the store again what it replays in the end."""
 
@@ -656,7 +649,6 @@ def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
     assert in_memory() == before
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step_m", [1e6, 25.0])
 def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same(cloud, step_m):
     far = np.cumsum(np.full((13, 3), (step_m, 0.0, 0.0)), axis=0)
@@ -667,7 +659,6 @@ def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same
     assert cloud.folder.live.exists()
 
 
-@pytest.mark.slow
 def test_corrections_number_maps_as_the_live_run_does(cloud):
     alone = stream("c", POSES, start_s=-500.0)
     cloud.put(in_order([*alone, *two_robots()]))

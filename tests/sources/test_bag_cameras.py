@@ -116,7 +116,6 @@ def as_raw(encoding, pixels, padding=0):
     return change
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("padding", [0, 5])
 @pytest.mark.parametrize(
     ("encoding", "pixels", "expected_bgr"),
@@ -156,7 +155,6 @@ def unmounted(topic, kind, message):
     return topic, kind, message
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -222,7 +220,6 @@ def test_the_camera_heard_most_is_chosen_and_said_and_the_user_may_choose(tmp_pa
         open_source(bag, BagOptions(camera_topic="/scan")).survey()
 
 
-@pytest.mark.slow
 def test_the_truth_is_never_taken_for_odometry(tmp_path):
     """Not even where it is the only topic of its type: then odometry is read from tf."""
 

@@ -372,7 +372,6 @@ def test_the_metadata_of_a_bag_are_no_bag(tmp_path):
 # Files
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kept", [0.01, 0.3, 0.9, 0.999])
 def test_a_truncated_database_is_refused_wherever_it_ends(tmp_path, kept):
     bag = save(tmp_path / "run.db3", drive(400))
@@ -454,7 +453,6 @@ def test_a_database_that_is_no_bag(tmp_path):
 fuzz = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 @fuzz
 @given(data=st.data())

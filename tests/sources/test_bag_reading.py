@@ -104,7 +104,6 @@ def test_parts_and_copies_are_read_side_by_side(tmp_path, name):
     assert len(list(zip(source.records(), copy(source).records(), strict=True))) > 40
 
 
-@pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(tmp_path):
     def peak(path):
         source = open_source(path)

@@ -199,7 +199,6 @@ def test_unpacking_ends_at_the_limit(compression):
     assert unpack(packed, compression, 9_000_000) == bytes(5_000_000)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.bag", "run.mcap"])
 def test_damage_anywhere_never_breaks_the_reader(tmp_path, name):
     good = cut(saved(tmp_path / name, scans=60), 0.8).read_bytes()

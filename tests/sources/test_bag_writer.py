@@ -47,7 +47,6 @@ def recordings(draw):
     return records
 
 
-@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(recordings(), st.sampled_from(KINDS))
 def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records, name):

@@ -181,7 +181,6 @@ def test_a_token_is_not_shown_to_the_network():
     HttpTransport("http://cloud.example", "r", "ab" * 16).close()
 
 
-@pytest.mark.slow
 def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_path):
     ours, others = tmp_path / "ours", tmp_path / "others"
     for folder in (ours, others):

@@ -42,7 +42,6 @@ def test_keypoints_travel_in_ascending_order_and_their_descriptors_with_them():
     assert received == sorted(rows, key=lambda row: row[:2]), "those at one point stay in their order"
 
 
-@pytest.mark.slow
 @given(packets())
 def test_a_packet_counts_for_what_it_unpacks_to(sent):
     data, body = encode(sent), sent.body
@@ -57,7 +56,6 @@ def test_a_packet_counts_for_what_it_unpacks_to(sent):
     assert unpacked_size(data + b"!") == len(data) + 1
 
 
-@pytest.mark.slow
 @given(packets())
 def test_what_was_received_is_sent_on_unchanged(sent):
     data = encode(sent)

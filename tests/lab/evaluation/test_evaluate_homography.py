@@ -55,7 +55,6 @@ def report(scenes):
     return evaluate_homography(find_scenes([scenes]), choose_detectors(kinds, [], []))
 
 
-@pytest.mark.slow
 def test_what_can_be_matched_is(report):
     for name in ("orb", "sift"):
         pairs = report.of(name)
@@ -85,7 +84,6 @@ def test_differences_are_those_of_the_pairs(report):
     assert gain.low <= gain.mean <= gain.high
 
 
-@pytest.mark.slow
 def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path):
     paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
     for seed, path in enumerate(paths):
@@ -205,7 +203,6 @@ def test_nothing_found_scores_nothing(scenes, tmp_path):
     assert [len(points) for points in matched_points(none, none)] == [0, 0]
 
 
-@pytest.mark.slow
 def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     arguments = ["evaluate", "homography", str(scenes), "--detector", "orb", "--detector", "fast"]
@@ -220,7 +217,6 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
     assert {row["accuracy_3px_nms8"] == "" for row in rows if row["detector"] == "fast"} == {True}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

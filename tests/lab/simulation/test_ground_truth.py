@@ -44,7 +44,6 @@ def is_inside(points, outline):
     return np.all(along[:, 0] * offsets[..., 1] - along[:, 1] * offsets[..., 0] > 0.0, axis=1)
 
 
-@pytest.mark.slow
 def test_occupied_cells_are_surfaces_and_free_ones_are_not_inside_anything(fleet, seen):
     half_diagonal = seen.resolution_m * np.sqrt(0.5)
     occupied, free = centres(seen, Occupancy.OCCUPIED), centres(seen, Occupancy.FREE)

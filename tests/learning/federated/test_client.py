@@ -58,7 +58,6 @@ def same(first, second):
     return all(np.array_equal(first[name], second[name]) for name in first)
 
 
-@pytest.mark.slow
 def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
     whole = robot(folder, tmp_path / "labels").train(start, 0, "run", settings())
     kept = {name: array.copy() for name, array in start.items()}
@@ -73,7 +72,6 @@ def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
     assert {array.dtype for array in whole.weights.values()} == {np.dtype(np.float32)}
 
 
-@pytest.mark.slow
 def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     first = robot(folder, tmp_path)
     first.train(start, 0, "run", settings())
@@ -90,7 +88,6 @@ def test_a_robot_labels_no_more_images_than_asked(folder, start, tmp_path):
     assert len(labels_in(tmp_path)) == 2
 
 
-@pytest.mark.slow
 def test_the_optimizer_goes_on_from_the_robots_last_round(folder, start, tmp_path):
     def train(cache, round_number, run="run"):
         return robot(folder, tmp_path / cache).train(start, round_number, run, settings(rounds=9)).weights
@@ -111,7 +108,6 @@ def test_the_optimizer_goes_on_from_the_robots_last_round(folder, start, tmp_pat
     assert same(train("a", 3), second), "a run that begins anew does not know what came later"
 
 
-@pytest.mark.slow
 def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
     robot(folder, tmp_path).train(start, 0, "run", settings())
     (moments,) = tmp_path.glob("moments-*.npz")
@@ -134,7 +130,6 @@ def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
         robot(folder, tmp_path).train(start, 0, "run", settings())
 
 
-@pytest.mark.slow
 def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_path):
     chosen = settings(compatible=100.0)
     torch.manual_seed(4)
@@ -154,7 +149,6 @@ def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_p
     assert same(restarted.train(moved, 1, "run", chosen).weights, later)
 
 
-@pytest.mark.slow
 def test_a_robot_that_cannot_keep_the_first_weights_says_so(folder, start, tmp_path):
     robot(folder, tmp_path).train(start, 0, "run", settings(compatible=1.0))
     (former,) = tmp_path.glob("former-*.npz")

@@ -41,7 +41,6 @@ def by_hand(strategy, answers, before):
     return {name: merge(np.stack([answer[name].astype(np.float64) for answer in answers]), axis=0) for name in before}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["fedavg", "fedmedian"])
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
@@ -295,7 +294,6 @@ def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
     assert same(state.weights, shifted(START, 1.0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
 def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
     """The others end where they would have ended without it."""

@@ -46,7 +46,6 @@ def driven(tmp_path_factory):
     return folder, [body for body in bodies if isinstance(body, Place)]
 
 
-@pytest.mark.slow
 def test_keyframes_come_back_with_the_poses_of_the_robots_own_map(driven):
     folder, places = driven
     frames = read_keyframes(folder, 1000)
@@ -55,7 +54,6 @@ def test_keyframes_come_back_with_the_poses_of_the_robots_own_map(driven):
     assert [frame.image.keyscan for frame in read_keyframes(folder, 3)] == [f.image.keyscan for f in frames[-3:]]
 
 
-@pytest.mark.slow
 def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
     (driven[0] / SPLIT_FILE).unlink(missing_ok=True)
     _, held_out = own_examples(driven[0], SETTINGS)
@@ -75,7 +73,6 @@ def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
     assert np.nansum(rows["blind"][:, 1]) == 0.0
 
 
-@pytest.mark.slow
 def test_a_keyframe_that_is_held_out_is_never_trained_on(driven):
     folder, _ = driven
     (folder / SPLIT_FILE).unlink(missing_ok=True)

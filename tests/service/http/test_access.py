@@ -64,7 +64,6 @@ def test_the_routes_are_all_there(routes):
     assert {path for _, path, route in routes if not isinstance(route.route, APIRoute)} <= OPEN
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("who", [None, "nobody", "a", "b", "eye", "boss"])
 def test_who_has_no_right_gets_nothing_and_changes_nothing(desk, routes, who):
     desk.told(desk.send("a", A[:9]))
@@ -120,7 +119,6 @@ def test_nothing_is_read_of_a_body_before_it_is_known_who_sends_it(desk, routes)
     assert {path: asyncio.run(ask("POST", path)) for path in posts} == dict.fromkeys(posts, 401)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("who", ["a", "eye", "boss"])
 def test_who_has_the_right_is_not_turned_away(desk, routes, who):
     desk.told(desk.send("a", A[:9]))
@@ -179,7 +177,6 @@ def fuzzed(tmp_path_factory):
         yield desk
 
 
-@pytest.mark.slow
 @given(
     path=st.sampled_from(["robots/a/packets", "detectors", "missions/import?name=new", "vetoes", "missions"]),
     body=st.one_of(st.binary(min_size=1, max_size=300), st.sampled_from([b"{}", b"[]", b'{"name": 3}', b"\0" * 4])),

@@ -127,7 +127,6 @@ def test_a_body_that_is_too_long_is_not_read(desk, announced):
     assert desk.state.mission.store.envelopes() == []
 
 
-@pytest.mark.slow
 def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
     statuses = [desk.ask("POST", PACKETS, "a", content=b"").status_code for _ in range(200)]
     limit = statuses.index(429)
@@ -619,7 +618,6 @@ def test_the_age_is_that_of_the_oldest_packet_without_effect(desk):
     assert age() == 0.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("at_once", [1, 7, 10_000])
 def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted, monkeypatch, at_once):
     monkeypatch.setattr(measures, "_AT_ONCE", at_once)
