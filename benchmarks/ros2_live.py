@@ -12,9 +12,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import common
+
+sys.path.insert(0, str(common.REPOSITORY))
+from tests.ros.played import for_player
 
 RCLPY = Path(os.environ.get("FCSLAM_RCLPY", common.REPOSITORY / ".venv-ros" / "bin" / "python"))
 PLAYER = common.REPOSITORY / "tests" / "ros" / "rclpy_player.py"
@@ -59,14 +63,8 @@ def written(log, seconds, folder):
     scans = [record for record in open_source(log).records() if isinstance(record, LaserScan)]
     scans = [scan for scan in scans if scan.stamp < scans[0].stamp + seconds]
     laser = scans[0].laser
-    np.savez(
-        folder / "scans.npz",
-        stamps=[scan.stamp for scan in scans],
-        ranges=[np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans],
-        odometry=[scan.T_odom_base for scan in scans],
-        laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
-        beam_s=0.0,
-    )
+    ranges_m = (np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans)
+    for_player(folder / "scans.npz", [replace(s, ranges_m=r) for s, r in zip(scans, ranges_m, strict=True)])
     write_bag(folder / "bag.mcap", scans)
     return laser.T_base_laser
 

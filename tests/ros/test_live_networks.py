@@ -24,6 +24,7 @@ from fcslam.runs.map_files import Occupancy, parse_map
 from fcslam.sources import write_bag
 from tests import small_fleet
 from tests.robot import spinning
+from tests.ros.played import for_player
 
 ROOT = Path(__file__).parents[2]
 RCLPY = Path(os.environ.get("FCSLAM_RCLPY", ROOT / ".venv-ros" / "bin" / "python"))
@@ -68,19 +69,6 @@ def mapped(scans, folder):
     write_bag(folder / "bag.mcap", scans)
     ended(fcslam("map", f"robot1={folder / 'bag.mcap'}", "-o", folder / "expected", "-q"))
     return folder
-
-
-def for_player(path, scans):
-    laser, sweep = scans[0].laser, scans[0].sweep
-    np.savez(
-        path,
-        stamps=[scan.stamp for scan in scans],
-        ranges=[scan.ranges_m for scan in scans],
-        odometry=[scan.T_odom_base for scan in scans],
-        laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
-        beam_s=0.0 if sweep is None else sweep.duration_s / (laser.beam_count - 1),
-        mounting_x=laser.T_base_laser[0],
-    )
 
 
 def fcslam(*arguments, cwd=None, **environment):
