@@ -41,12 +41,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.consistency import PROBABILITY, ConsistencySettings
+from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.factors import FactorCache, from_values, to_values
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.joint import JointEvidence, solve_jointly
 from fcslam.graph.optimizer import Solution, optimize, optimize_gnc
-from fcslam.graph.pose_graph import Edge, PoseGraph, anchors
+from fcslam.graph.pose_graph import PROBABILITY, Edge, PoseGraph, anchors
 from fcslam.graph.single_robot import solve_single_robot
 from fcslam.records import FloatArray
 

@@ -9,13 +9,13 @@ from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.cluster import count_separate_places, dominant_cluster, relative_frame
 from fcslam.graph.consistency import (
-    CHI2_LIMIT,
     Closures,
     ConsistencySettings,
     count_supporting_closures,
     loop_chi2,
     pairwise_consistency,
 )
+from fcslam.graph.pose_graph import CHI2_LIMIT
 from fcslam.graph.trajectory import DRIFT, Trajectory, build_trajectory
 from fcslam.records import Reason, ReasonCode
 from tests.graph.graph_worlds import INFORMATION, manhattan, measured, walk

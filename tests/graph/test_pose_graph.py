@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
-from fcslam.graph.pose_graph import MAXIMUM_INFORMATION, Edge, PoseGraph
+from fcslam.graph.pose_graph import CHI2_LIMIT, MAXIMUM_INFORMATION, PROBABILITY, Edge, PoseGraph
 from tests.graph.graph_worlds import INFORMATION, manhattan
 
 
@@ -86,3 +89,21 @@ def test_components_are_numbered_by_their_first_variable() -> None:
     assert graph.components([True, False, True]).tolist() == [0, 1, 2, 0, 1, 3]
     assert PoseGraph(np.zeros((2, 3))).components().tolist() == [0, 1]
     assert PoseGraph().components().tolist() == []
+
+
+def test_components_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        count = int(rng.integers(2, 40))
+        graph = PoseGraph(np.zeros((count, 3)))
+        pairs = [rng.choice(count, 2, replace=False).tolist() for _ in range(int(rng.integers(0, count)))]
+        for i, j in pairs:
+            graph.add_edge(edge(i, j))
+        links = coo_array((np.ones(len(pairs)), np.array(pairs, int).reshape(-1, 2).T), shape=(count, count))
+        label = connected_components(links, directed=False)[1]
+        first = [label.tolist().index(own) for own in label]
+        assert graph.components().tolist() == [sorted(set(first)).index(variable) for variable in first]
+
+
+def test_limit_of_chi_square_is_its_quantile() -> None:
+    assert pytest.approx(float(2.0 * gammaincinv(1.5, PROBABILITY)), rel=1e-12) == CHI2_LIMIT

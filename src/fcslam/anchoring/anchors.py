@@ -4,12 +4,11 @@ import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fcslam.anchoring.alignment import PlanAlignment, align_to_plan
-from fcslam.anchoring.deviations import Comparison, compare_with_plan
 from fcslam.anchoring.gnss import Georeference, georeferenced
 from fcslam.anchoring.part import part_of, with_part
 from fcslam.anchoring.plan import BuildingPlan
@@ -26,6 +25,9 @@ from fcslam.maps.drawing import highlighted_png
 from fcslam.maps.exports import outlines
 from fcslam.records import StrPath
 from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
+
+if TYPE_CHECKING:
+    from fcslam.anchoring.deviations import Comparison
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
 TAGS_JSON = "tags.json"
@@ -99,6 +101,8 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
                 alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
                 part, scales = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
+                from fcslam.anchoring.deviations import compare_with_plan  # few have a plan, and SciPy is large
+
                 compared = compare_with_plan(alignment.plan.submap, map_submap(part.robots))
                 reports.append(_plan_report(k, alignment, compared, scales))
                 pictures.append(fuse(part.robots))
@@ -136,7 +140,7 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
 
 
 def _plan_report(
-    k: int, alignment: PlanAlignment, compared: Comparison, scales: Mapping[str, float]
+    k: int, alignment: PlanAlignment, compared: "Comparison", scales: Mapping[str, float]
 ) -> dict[str, object]:
     deviations = [
         {

@@ -14,7 +14,6 @@ from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.certificate import MappedPath, certificate_json, certificate_png, certify
 from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
 from fcslam.processes import trim_memory
@@ -187,6 +186,8 @@ def _map_files(
 
 def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict[int, dict[str, Any]]:
     """How good each map is where; of the maps that get a picture."""
+    from fcslam.maps.certificate import MappedPath, certify  # a live robot has no use for it, and SciPy is large
+
     certificates = {}
     for k, fused in maps.items():
         members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
@@ -199,6 +200,8 @@ def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict
 def _quality_files(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]) -> dict[str, bytes]:
     if not certificates:
         return {}
+    from fcslam.maps.certificate import certificate_json, certificate_png
+
     pictures = {
         f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
         for k, one in certificates.items()

@@ -10,19 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
 from fcslam.graph.evidence import EvidenceSettings
+from fcslam.graph.pose_graph import CHI2_LIMIT
 from fcslam.graph.trajectory import Trajectory, transport_covariance
 from fcslam.records import FloatArray
 
 _PAIRS_AT_ONCE = 100_000
 """Pairs of closures tested in one go: memory must not grow with the square of the number of closures."""
-PROBABILITY = 0.99
-"""Probability with which two true closures pass the chi-square test of consistency."""
-CHI2_LIMIT = float(2.0 * gammaincinv(1.5, PROBABILITY))
-"""The chi-square quantile of ``PROBABILITY`` for the three degrees of freedom of a loop."""
 SUPPORT_M = 10.0
 """Largest path length between the ends of two closures, on both trajectories, at which consistent closures support
 each other, metres."""

@@ -7,8 +7,6 @@ diagonal information and one component at a time.
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import splu
 
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import PoseGraph, anchors
@@ -99,6 +97,9 @@ def _least_squares(
     fixed: tuple[NDArray[np.int64], _Complex],
 ) -> _Complex:
     """The z with least ``sum |k (z_j - turn z_i - step)|^2``, each component's gauge set by its ``fixed`` value."""
+    from scipy.sparse import csr_array  # a live robot has no use for it, and it is large
+    from scipy.sparse.linalg import splu
+
     (i, j), (anchor, value) = ends, fixed
     edge_row = np.arange(len(i))
     anchor_row = len(i) + np.arange(len(anchor))

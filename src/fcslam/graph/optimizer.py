@@ -9,11 +9,10 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
-from fcslam.graph.pose_graph import PoseGraph, anchors
+from fcslam.graph.pose_graph import CHI2_LIMIT, PoseGraph, anchors
 from fcslam.records import FloatArray, frozen
 
 _TOLERANCE = 1e-6
@@ -26,8 +25,6 @@ _TRUSTED_WEIGHT = 0.5
 """A closure of a larger weight is trusted at the start of a refinement."""
 _REFINEMENT_ROUNDS = 200
 """Limit of alternating solves and decisions, which end by themselves."""
-_LIMIT = float(2.0 * gammaincinv(1.5, 0.99))
-"""Chi-square of three degrees of freedom that a true closure keeps with a probability of 0.99."""
 _FIRST_ITERATIONS, _STEP_ITERATIONS = 5, 1
 """Solver iterations of graduated non-convexity, with all closures before the first step, and in each step."""
 _CONTROL_STEP = 1.4
@@ -120,7 +117,7 @@ def optimize_gnc(
     steps = _Steps(cache, start)
     steps.solve(np.ones(int(robust.sum())), _FIRST_ITERATIONS)
     _graduate(steps)
-    weights = _alternate(steps, (steps.chi2() <= _LIMIT).astype(np.float64))
+    weights = _alternate(steps, (steps.chi2() <= CHI2_LIMIT).astype(np.float64))
     return _with_truncated_cost(graph, start, steps, weights)
 
 
@@ -188,9 +185,9 @@ def _graduate(steps: _Steps) -> None:
     """Sharpen the loss from almost squared to truncated, with few iterations per step."""
     chi2 = steps.chi2()
     largest = chi2.max(initial=0.0)
-    if largest <= _LIMIT:
+    if largest <= CHI2_LIMIT:
         return
-    mu = _LIMIT / (2.0 * largest - _LIMIT)
+    mu = CHI2_LIMIT / (2.0 * largest - CHI2_LIMIT)
     for _ in range(_MAXIMUM_STEPS):
         weights = _truncated_weights(chi2, mu)
         if np.all((weights < _BINARY) | (weights > 1.0 - _BINARY)):
@@ -207,7 +204,7 @@ def _alternate(steps: _Steps, weights: FloatArray) -> FloatArray:
     """
     for _ in range(_REFINEMENT_ROUNDS):
         steps.solve(weights, _MAXIMUM_ITERATIONS)
-        decided = (steps.chi2() <= _LIMIT).astype(np.float64)
+        decided = (steps.chi2() <= CHI2_LIMIT).astype(np.float64)
         if np.array_equal(decided, weights):
             return weights
         weights = decided
@@ -225,12 +222,12 @@ def _with_truncated_cost(graph: PoseGraph, start: FloatArray, steps: _Steps, wei
 def _truncated_weights(chi2: FloatArray, mu: float) -> FloatArray:
     """Weights of the surrogate of the truncated squared loss at ``mu`` (Yang et al. 2020, eq. 14)."""
     with np.errstate(divide="ignore"):
-        between = np.sqrt(_LIMIT * mu * (mu + 1.0) / chi2) - mu
+        between = np.sqrt(CHI2_LIMIT * mu * (mu + 1.0) / chi2) - mu
     return np.clip(between, 0.0, 1.0)
 
 
 def _truncated(chi2: FloatArray, robust: ArrayLike) -> float:
-    return 0.5 * float(np.where(robust, np.minimum(chi2, _LIMIT), chi2).sum())
+    return 0.5 * float(np.where(robust, np.minimum(chi2, CHI2_LIMIT), chi2).sum())
 
 
 def _levenberg_marquardt(problem: Any, values: Any, iterations: int) -> tuple[Any, int]:

@@ -6,9 +6,8 @@ from typing import Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.graph.rows import Rows
 from fcslam.records import FloatArray, frozen
@@ -21,6 +20,11 @@ _MINIMUM_INFORMATION = 1e-4
 
 _ASYMMETRY = 1e-6
 """Largest relative asymmetry of an information matrix that counts as rounding."""
+
+CHI2_LIMIT = 11.344866730144373
+"""The chi-square of a motion, with its three degrees of freedom, stays below with ``PROBABILITY``."""
+PROBABILITY = 0.99
+"""Probability with which the error of a true closure passes the chi-square test."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,12 +153,28 @@ class PoseGraph:
         """
         edges = self.arrays()
         mask = np.ones(len(edges.i), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)
-        i, j = edges.i[mask], edges.j[mask]
-        links = coo_array((np.ones(len(i)), (i, j)), shape=(len(self), len(self)))
-        labels = connected_components(links, directed=False)[1] if len(self) else np.zeros(0)
-        first, number = np.unique(labels, return_index=True)[1], np.empty(len(np.unique(labels)), dtype=np.int64)
-        number[np.argsort(first)] = np.arange(len(first))
-        return number[labels.astype(np.int64)]
+        return np.unique(_first_connected(edges.i[mask], edges.j[mask], len(self)), return_inverse=True)[1]
+
+
+@njit
+def _first_connected(i, j, count):  # type: ignore[no-untyped-def]
+    """First variable of the component of each variable, shape (count,): union-find, whose roots are the least."""
+    first = np.arange(count)
+    for k in range(len(i)):
+        a, b = _root(first, i[k]), _root(first, j[k])
+        first[max(a, b)] = min(a, b)
+    for variable in range(count):  # what comes before is final
+        first[variable] = first[first[variable]]
+    return first
+
+
+@njit(allocates=False)
+def _root(first, variable):  # type: ignore[no-untyped-def]
+    """The root of a variable; the path to it is halved."""
+    while first[variable] != variable:
+        first[variable] = first[first[variable]]
+        variable = first[variable]
+    return variable
 
 
 def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
