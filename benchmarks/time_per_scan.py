@@ -9,14 +9,16 @@
   free cores the wall time includes that of the other process: CPU is that of the front end's thread.
 
 Inline, a pass over mit-csail before compiles (or loads) every kernel and is not counted; live, the warm-up of
-`fcslam robot` does. Memory inline is the resident set, with
-the reader, the robot and its map. Live it is the proportional set of each process: of a page that both share, each
-counts half, so their sum is what both hold. Run it while no other Python program runs, which would share pages too.
+`fcslam robot` does. Memory inline is the resident set, with the reader, the robot and its map. Live it is the
+proportional set of each process: of a page that both share, each counts half, so their sum is what both hold. The code
+of `fcslam robot` is loaded, and the log is not in memory: the scans come from a file, some hundred at a time, as a
+driver would send them. Run it while no other Python program runs, which would share pages too.
 """
 
 import gc
 import os
 import re
+import tempfile
 import time
 from collections.abc import Iterator
 from multiprocessing import active_children
@@ -30,7 +32,7 @@ from scaling import Repeated, alone, back_to_the_start, scan_poses
 from fcslam.cloud.cloud import Cloud
 from fcslam.live.robot import LARGEST_BACKLOG
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import LaserScan
+from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.warmup import warm_up_tracking
@@ -40,6 +42,8 @@ from fcslam.wire.packets import encode, read_label
 
 TENTHS = {"tenth": "", "scans": "", "odometry so far, m": ".0f", "keyscans so far": "", "mean CPU, ms": ".3f",
           "median CPU, ms": ".3f", "99 %, ms": ".2f", "max, ms": ".1f", "memory at its end, MB": ".1f"}  # fmt: skip
+READ_AT_ONCE = 200
+"""Scans that the live robot's driver has in memory."""
 FEW_ROUNDS = 5
 """Memory is compared with that after so many rounds."""
 QUANTILES = (50, 95, 99, 99.9, 100)
@@ -92,15 +96,16 @@ def report_live(report: common.Report, log: Path, rounds: int) -> None:
 
 def drive_live(log: Path, rounds: int, back: Any) -> tuple[list[tuple], list[tuple]]:
     """Rows of all scans and of each round; ``back``: as in ``Repeated``."""
-    source, repeated = open_source(log), Repeated()
+    repeated = Repeated()
     repeated.back = back
     warm_up_tracking(RobotConfig())
     timed, rows = [], []
-    with backend_process("robot", RobotConfig()) as backend:
+    with tempfile.TemporaryDirectory() as folder, backend_process("robot", RobotConfig()) as backend:
+        laser = alone(save_scans, log, Path(folder))
         robot = RobotFrontend("robot", RobotConfig(), backend)
         (worker,) = active_children()
         for number in range(1, rounds + 1):
-            part = np.array(list(live(repeated.scans(source.records()), robot)))
+            part = np.array(list(live(repeated.scans(driver(laser, Path(folder))), robot)))
             repeated.end_round()
             timed.append(part)
             wall = part[:, 1]
@@ -109,6 +114,30 @@ def drive_live(log: Path, rounds: int, back: Any) -> tuple[list[tuple], list[tup
             rows.append((number, len(part), keyscans, wall.mean(), np.percentile(wall, 99), wall.max(), *memory))
     cpu_ms, wall_ms = np.concatenate(timed).T
     return [scan_row("CPU", cpu_ms), scan_row("wall", wall_ms)], rows
+
+
+def save_scans(log: Path, folder: Path) -> LaserModel:
+    """Write stamp, ranges and odometry of each scan into one file each; returns their laser."""
+    scans = [record for record in open_source(log).records() if isinstance(record, LaserScan)]
+    np.save(folder / "stamps.npy", np.array([scan.stamp for scan in scans]))
+    np.save(folder / "ranges.npy", np.array([scan.ranges_m for scan in scans]))
+    np.save(folder / "poses.npy", np.array([scan.T_odom_base for scan in scans]))
+    return scans[0].laser
+
+
+def driver(laser: LaserModel, folder: Path) -> Iterator[LaserScan]:
+    """The scans of ``save_scans``, some at a time."""
+    files = [folder / f"{name}.npy" for name in ("stamps", "ranges", "poses")]
+    begin = 0
+    while True:
+        mapped = [np.load(file, mmap_mode="r")[begin : begin + READ_AT_ONCE] for file in files]
+        stamps, ranges, poses = (np.array(part) for part in mapped)
+        del mapped  # pages of a mapped file would count
+        if not len(stamps):
+            return
+        for stamp, ranges_m, pose in zip(stamps.tolist(), ranges, poses, strict=True):
+            yield LaserScan(stamp, frozen(ranges_m, np.float32), laser, frozen(pose))
+        begin += READ_AT_ONCE
 
 
 def live(records: Any, robot: RobotFrontend) -> Iterator[tuple[float, float]]:

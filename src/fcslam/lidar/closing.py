@@ -32,7 +32,7 @@ NARROW_M = 0.8
 DISTANCE_PENALTY, ANGLE_PENALTY = 0.2, 0.1
 """Shares of a search's score that are lost at the edges of its window: of equal poses, the one near the prediction
 counts."""
-UNPACKED = 32
+UNPACKED = 16
 """Submaps that are kept ready for comparison, 0.2 MB each."""
 PENDING_M = 60.0
 """Travel after which a pending closure without enough support is dropped, metres."""
