@@ -193,12 +193,32 @@ def probe(statement: str, folder: Path) -> list[str]:
     return answer
 
 
+@pytest.mark.slow
 def test_a_live_robot_does_not_load_scipy(tmp_path):
-    """It takes 30 MB, and as long to load as hundreds of scans to map. numba asks for its version alone."""
-    parts = "[name for name in sys.modules if name.startswith('scipy.') and not name.startswith('scipy._')]"
-    code = f"import sys, fcslam.mission.mission, fcslam.live.robot; print(*{parts})"
-    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    """It takes 50 MB, and as long to load as a thousand scans to map. numba asks for its version alone."""
+    program = [
+        "import sys, fcslam.mission.mission, fcslam.live.robot",
+        "from fcslam.robot.frontend import RobotConfig",
+        "fcslam.live.robot.warm_up_tracking(RobotConfig())",
+        "print(*(name for name in sys.modules if name.startswith('scipy.') and not name.startswith('scipy._')))",
+    ]
+    command = [sys.executable, "-c", "\n".join(program)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["scipy.version"]
+
+
+@pytest.mark.slow
+def test_code_of_users_finds_the_blas_of_scipy(tmp_path):
+    program = [
+        "import numba, numpy as np",
+        "from fcslam.lidar.field import SurfelField",
+        "SurfelField(np.zeros(3)).nearest(np.zeros((1, 2)))",
+        "product = numba.njit(lambda a: np.dot(a, a))(2.0 * np.eye(2))",
+        "print(product.tolist())",
+    ]
+    command = [sys.executable, "-c", "\n".join(program)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert result.stdout == "[[4.0, 0.0], [0.0, 4.0]]\n"
 
 
 @pytest.mark.slow
