@@ -188,6 +188,8 @@ def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], floa
     worse, weakest = aligned.worse, aligned.weakest
     asymmetric = _asymmetry(aligned.gap)
     symmetric = asymmetric is None
+    if asymmetric is not None:
+        noise = no_noise  # it takes two submaps, and decides nothing
     informative = weakest >= INFORMATIVE
     one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, INFORMATIVE)
     strict, loose = _shortfall(worse, config.strict, "strict", noise), _shortfall(worse, config.loose, "loose", noise)

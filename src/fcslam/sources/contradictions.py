@@ -71,10 +71,7 @@ class OdometryWatch:
             known.rest = seen
         moved_m, turned_rad = _motion(known.turn, seen)
         turned_without_change = turned_rad > TURN_RAD and _changed_share(known.turn.scan, scan) < UNCHANGED
-        is_same = known.last.scan.ranges_m.tobytes() == scan.ranges_m.tobytes()
-        has_returns = np.count_nonzero(np.isfinite(scan.ranges_m) & (scan.ranges_m > 0.0)) >= FEWEST_RETURNS
-        repeated = is_same and has_returns and not _is_still(known.last, seen)
-        if turned_without_change or repeated:
+        if turned_without_change or (not _is_still(known.last, seen) and _is_repeated(known.last.scan, scan)):
             self._audit.add(Fault.FROZEN_SCAN, number)
         if turned_rad > TURN_RAD or moved_m > CHANGE_M:
             known.turn = seen
@@ -84,6 +81,13 @@ class OdometryWatch:
 def _is_still(before: _Seen, after: _Seen) -> bool:
     moved_m, turned_rad = _motion(before, after)
     return moved_m < STILL_M and turned_rad < STILL_RAD
+
+
+def _is_repeated(before: LaserScan, after: LaserScan) -> bool:
+    """Whether both scans have the same ranges to the last bit, with enough returns."""
+    if before.ranges_m.tobytes() != after.ranges_m.tobytes():
+        return False
+    return bool(np.count_nonzero(np.isfinite(after.ranges_m) & (after.ranges_m > 0.0)) >= FEWEST_RETURNS)
 
 
 def _motion(before: _Seen, after: _Seen) -> tuple[float, float]:

@@ -137,10 +137,14 @@ def check_file(path: Path, schema: str, version: int) -> None:
 
 def seal(*values: Any) -> bytes:
     """Checksum of a row: a BLAKE2b hash of the table's name and the row's values."""
-    # SQLite stores -0.0 as 0.0.
-    plain = [value + 0.0 if isinstance(value, float) else value for value in values]
-    blobs = [value for value in plain if isinstance(value, bytes)]
-    sizes = [len(value) if isinstance(value, bytes) else value for value in plain]
+    sizes, blobs = list(values), []
+    for k, value in enumerate(values):
+        kind = type(value)
+        if kind is bytes:
+            sizes[k] = len(value)
+            blobs.append(value)
+        elif kind is float:
+            sizes[k] = value + 0.0  # SQLite stores -0.0 as 0.0
     checksum = blake2b(repr(sizes).encode(), digest_size=16)
     for blob in blobs:  # joined, they would be copied
         checksum.update(blob)
