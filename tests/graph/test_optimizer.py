@@ -130,12 +130,33 @@ def test_robust_losses_weigh_false_closures_down() -> None:
     assert (cauchy.weights[~graph.arrays().robust] == 1.0).all()
 
 
-def test_components_are_solved_apart_each_in_its_own_gauge() -> None:
+def two_components(T: np.ndarray) -> tuple[PoseGraph, PoseGraph, PoseGraph]:
+    """Two graphs, and one of both, the second moved by T (3,)."""
     one, _, _ = manhattan(0, steps=40, closures=15)
     two, _, _ = manhattan(1, steps=50, closures=15)
-    offset, T = len(one), np.array([100.0, 5.0, 1.0])
+    offset = len(one)
     second = [Edge(e.i + offset, e.j + offset, e.T_i_j, e.information, e.robust) for e in two.edges]
-    both = PoseGraph(np.concatenate((one.poses(), se2.compose(T, two.poses()))), [*one.edges, *second])
+    return one, two, PoseGraph(np.concatenate((one.poses(), se2.compose(T, two.poses()))), [*one.edges, *second])
+
+
+@pytest.mark.parametrize("loss", Loss)
+def test_some_components_are_solved_and_the_others_stay(loss: Loss) -> None:
+    one, two, both = two_components(np.array([100.0, 5.0, 1.0]))
+    kept = np.ones(len(both.edges), bool)
+    kept[[len(one.edges) - 1, len(both.edges) - 1]] = False
+    solved = np.arange(len(both)) >= len(one)
+    poses = optimize(both, loss=loss, kept=kept, solved=solved).poses
+    assert poses[~solved] == pytest.approx(both.poses()[~solved], abs=1e-12)
+    assert apart(poses[solved], both.poses()[solved]) > 0.1
+    assert apart(poses[solved], optimize(both, loss=loss, kept=kept).poses[solved]) < 1e-3
+    alone = optimize(two, loss=loss, kept=kept[len(one.edges) :]).poses
+    assert apart(se2.between(poses[len(one)], poses[solved]), se2.between(alone[0], alone)) < 1e-3
+
+
+def test_components_are_solved_apart_each_in_its_own_gauge() -> None:
+    T = np.array([100.0, 5.0, 1.0])
+    one, two, both = two_components(T)
+    offset = len(one)
     for poses in (optimize(both).poses, optimize_gnc(both).poses):
         assert apart(poses[:offset], optimize(one).poses) < 1e-3
         assert apart(poses[offset:], se2.compose(T, optimize(two).poses)) < 1e-3

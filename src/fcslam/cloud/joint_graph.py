@@ -37,6 +37,8 @@ class JointGraph:
         self._left_out: set[int] = set()
         self._closures = self._unsolved = 0
         """Closures in the graph, and those that came in since the last solve."""
+        self._changed: set[int] = set()
+        """Edges of the closures that came in since the last solve, or count since, or no longer do."""
 
     def variable(self, keyscan: KeyscanId) -> int:
         """Number of the keyscan's variable."""
@@ -104,7 +106,9 @@ class JointGraph:
         """A closure; returns the number of its edge."""
         self._unsolved += 1
         self._closures += 1
-        return self.graph.add_edge(Edge(self.variable(i), self.variable(j), T_i_j, information, robust=True))
+        edge = self.graph.add_edge(Edge(self.variable(i), self.variable(j), T_i_j, information, robust=True))
+        self._changed.add(edge)
+        return edge
 
     def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> FloatArray:
         """Difference of a measurement T_i_j (3,) and the estimate: (x, y, theta), in metres and radians."""
@@ -126,12 +130,16 @@ class JointGraph:
     def count(self, edge: int, *, holds: bool) -> None:
         """Include the closure in the next solves, or exclude it."""
         (self._left_out.discard if holds else self._left_out.add)(edge)
+        self._changed.add(edge)
 
     def optimize(self) -> None:
-        """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures)."""
+        """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures) of the maps whose closures changed."""
         with self._stages.measure("solve"):
-            start = self._poses.values
-            self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=self._kept(), factors=self._factors).poses)
+            start, kept, edges, changed = self._poses.values, self._kept(), self.graph.arrays(), list(self._changed)
+            component = self.graph.components(kept)
+            solved = np.isin(component, component[np.concatenate((edges.i[changed], edges.j[changed]))])
+            solution = optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors, solved=solved)
+            self.take(solution.poses)
 
     def is_strained(self, limit: float) -> bool:
         """Whether closures between two robots, or the path of one, are strained by more than the limit."""
@@ -144,6 +152,7 @@ class JointGraph:
         """Replace the estimate by a solution, shape (N, 3)."""
         self._poses.values[: len(poses)] = poses
         self._unsolved = 0
+        self._changed.clear()
 
     def held(self, T_map_base: Mapping[str, FloatArray], left_out: Container[int | None]) -> PoseGraph:
         """These robots at poses (N, 3), with the constraints that are not left out: the graph of a finished run.
@@ -184,6 +193,7 @@ class JointGraph:
             },
             "left_out": sorted(self._left_out),
             "unsolved": self._unsolved,
+            "changed": sorted(self._changed),
             "robots": list(self._variables),
             "paths": {
                 robot: {
@@ -201,6 +211,7 @@ class JointGraph:
         self._factors = FactorCache(self.graph)
         self._poses = Rows(state["poses"])
         self._left_out, self._unsolved = set(state["left_out"]), state["unsolved"]
+        self._changed = set(state["changed"])
         self._closures = int(state["edges"]["robust"].sum())
         for robot in state["robots"]:
             path = state["paths"][robot]

@@ -63,13 +63,19 @@ class FactorCache:
         part._built = len(graph.edges)
         return part
 
-    def values(self, poses: FloatArray) -> Any:
-        """GTSAM values of the poses (N, 3) that the factors measure."""
-        return to_values(poses, None if self.chains is None else self.chains.kept.tolist())
+    def values(self, poses: FloatArray, solved: NDArray[np.bool_] | None = None) -> Any:
+        """GTSAM values of the poses (N, 3) that the factors measure; ``solved`` as in ``robust``."""
+        rows = self._rows(solved)
+        return to_values(poses, None if rows is None else rows.tolist())
 
-    def read(self, values: Any, poses: FloatArray) -> None:
-        """Write GTSAM values into ``poses`` (N, 3); poses inside of chains stay."""
-        poses[... if self.chains is None else self.chains.kept] = from_values(values)
+    def read(self, values: Any, poses: FloatArray, solved: NDArray[np.bool_] | None = None) -> None:
+        """Write GTSAM values into ``poses`` (N, 3); poses inside of chains, and those not ``solved``, stay."""
+        rows = self._rows(solved)
+        poses[... if rows is None else rows] = from_values(values)
+
+    def _rows(self, solved: NDArray[np.bool_] | None) -> NDArray[np.int64] | None:
+        """Variables that the factors measure; None: all."""
+        return np.flatnonzero(solved) if solved is not None else None if self.chains is None else self.chains.kept
 
     def complete(self, poses: FloatArray) -> None:
         """Set the poses inside of chains, in ``poses`` (N, 3), by those at their ends."""
@@ -100,16 +106,26 @@ class FactorCache:
                 graph.push_back(next(scaled))
         return graph
 
-    def robust(self, loss: Loss, kept: NDArray[np.bool_], poses: FloatArray) -> Any:
-        """Factor graph with closures under ``loss`` where ``kept``, shape (K,), is true; anchored as in ``squared``."""
-        if loss is Loss.SQUARED:
+    def robust(
+        self, loss: Loss, kept: NDArray[np.bool_], poses: FloatArray, solved: NDArray[np.bool_] | None = None
+    ) -> Any:
+        """Factor graph with closures under ``loss`` where ``kept``, shape (K,), is true; anchored as in ``squared``.
+
+        ``solved``, shape (N,), marks the variables of whole components that it has, without chains; None: all.
+        """
+        if loss is Loss.SQUARED and solved is None:
             return self.squared(kept.astype(np.float64), poses)
         self._update()
-        graph = gtsam.NonlinearFactorGraph(self._trusted)
+        graph = gtsam.NonlinearFactorGraph(self._trusted) if solved is None else gtsam.NonlinearFactorGraph()
+        if solved is not None:
+            edges = self.graph.arrays()
+            for number in np.flatnonzero(solved[edges.i[~edges.robust]]).tolist():
+                graph.push_back(self._trusted.at(number))
+            kept = kept & solved[edges.i[edges.robust]]
         for factor, keep in zip(self._closures_under(loss), kept.tolist(), strict=True):
             if keep:
                 graph.push_back(factor)
-        self._anchor(graph, kept, poses)
+        self._anchor(graph, kept, poses, solved)
         return graph
 
     def _closures_under(self, loss: Loss) -> list[Any]:
@@ -129,12 +145,15 @@ class FactorCache:
         for i, j, T_i_j, root in columns:
             yield _between(i, j, gtsam.Pose2(*T_i_j), _under(loss, _gaussian(root)))
 
-    def _anchor(self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray) -> None:
-        """Add a prior on the first variable of every connected component."""
+    def _anchor(
+        self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray, solved: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Add a prior on the first variable of every connected component that is ``solved``."""
         connects = np.ones(len(self.graph.edges), dtype=bool)
         connects[self.graph.arrays().robust] = kept
         noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
-        for variable in anchors(self.graph.components(connects)).tolist():
+        firsts = anchors(self.graph.components(connects))
+        for variable in (firsts if solved is None else firsts[solved[firsts]]).tolist():
             graph.push_back(gtsam.PriorFactorPose2(variable, gtsam.Pose2(*poses[variable].tolist()), noise))
 
     def _update(self) -> None:

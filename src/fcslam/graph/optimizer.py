@@ -8,7 +8,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
@@ -54,6 +54,7 @@ def optimize(
     loss: Loss = Loss.SQUARED,
     kept: ArrayLike | None = None,
     factors: FactorCache | None = None,
+    solved: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Optimize a pose graph by Levenberg-Marquardt.
 
@@ -63,6 +64,8 @@ def optimize(
         loss: loss of the closures.
         kept: closures that count, shape (E,); None: all.
         factors: a cache that makes repeated solves of a growing graph cheaper.
+        solved: variables of the connected components to solve, shape (N,); others stay, and do not count in the cost.
+            None: all.
 
     Returns:
         Poses (N, 3) and weights (E,).
@@ -75,10 +78,10 @@ def optimize(
         return _solution(graph, start, start, np.ones(0), 0, 0.0)
     robust = graph.arrays().robust
     counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
-    problem, values = cache.robust(loss, counts, start), cache.values(start)
+    problem, values = cache.robust(loss, counts, start, solved), cache.values(start, solved)
     result, iterations = _levenberg_marquardt(problem, values, _MAXIMUM_ITERATIONS)
     poses = start.copy()
-    cache.read(result, poses)
+    cache.read(result, poses, solved)
     cache.complete(poses)
     weights = counts * loss.weights(graph.chi2(poses)[robust])
     return _solution(graph, start, poses, weights, iterations, problem.error(result))
