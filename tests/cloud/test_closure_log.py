@@ -27,3 +27,4 @@ def test_ties_are_what_is_accepted_between_a_place_and_those_of_others():
     assert list(ledger.ties_at(KeyscanId("a", 1))) == entries[1:2]
     assert list(ledger.ties_at(KeyscanId("c", 3))) == entries[3:]
     assert list(ledger.ties_at(KeyscanId("d", 0))) == []
+    assert [ledger.tied(robot) for robot in "abcd"] == [[1, 2], [1, 3], [2, 3], []]

@@ -68,8 +68,9 @@ class ClosureLog:
         self._entries: list[ClosureEntry] = []
         self._between: dict[frozenset[str], list[ClosureEntry]] = {}
         """Entries by pair of robots, because every place queries its pairs."""
-        self._at: dict[KeyscanId, list[ClosureEntry]] = {}
-        """Verified entries between robots, by each of their two places; a candidate never changes its status."""
+        self._at: dict[str, dict[int, list[ClosureEntry]]] = {}
+        """Verified entries between robots, by robot and keyscan of each of their two places; a candidate never changes
+        its status."""
 
     def __iter__(self) -> Iterator[ClosureEntry]:
         return iter(self._entries)
@@ -85,7 +86,7 @@ class ClosureLog:
         places = {match.i, match.j}
         if match.channel is Channel.TAG:  # each is a measurement of its own
             return False
-        found = (entry.closure for entry in self._at.get(match.j, ()))
+        found = (entry.closure for entry in self._at.get(match.j.robot, {}).get(match.j.number, ()))
         return any({closure.i, closure.j} == places and closure.channel is match.channel for closure in found)
 
     def add(self, match: PlaceMatch) -> ClosureEntry:
@@ -123,7 +124,7 @@ class ClosureLog:
         self._between.setdefault(frozenset((i.robot, j.robot)), []).append(entry)
         if entry.closure.status is not ClosureStatus.CANDIDATE:
             for place in (i, j):
-                self._at.setdefault(place, []).append(entry)
+                self._at.setdefault(place.robot, {}).setdefault(place.number, []).append(entry)
         return entry
 
     def state(self) -> State:
@@ -189,4 +190,12 @@ class ClosureLog:
 
     def ties_at(self, place: KeyscanId) -> Iterator[ClosureEntry]:
         """The accepted closures between this place and those of other robots."""
-        return (entry for entry in self._at.get(place, ()) if entry.closure.status is ClosureStatus.ACCEPTED)
+        return filter(_is_accepted, self._at.get(place.robot, {}).get(place.number, ()))
+
+    def tied(self, robot: str) -> list[int]:
+        """Numbers of the robot's keyscans with ``ties_at``, ascending."""
+        return sorted(number for number, entries in self._at.get(robot, {}).items() if any(map(_is_accepted, entries)))
+
+
+def _is_accepted(entry: ClosureEntry) -> bool:
+    return entry.closure.status is ClosureStatus.ACCEPTED

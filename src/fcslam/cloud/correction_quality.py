@@ -67,8 +67,8 @@ class CorrectionQuality:
             return 0.0
         since_m = self._graph.travel_since(session)
         tied = 0.0
-        for number in np.flatnonzero(since_m < RECENT_M)[::-1].tolist():
-            if tied < MOST_TIES and any(closures.ties_at(KeyscanId(session, number))):
+        for number in reversed(closures.tied(session)):
+            if tied < MOST_TIES and since_m[number] < RECENT_M:
                 tied += 0.5 ** (since_m[number] / TIE_HALVED_M)
         weight = 0.5 ** (max(since_m[newest.last] - FRESH_M, 0.0) / HALVED_M)
         return newest.share * float(weight * (1.0 - 0.5**tied))
