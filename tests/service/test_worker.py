@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam.cloud import report
+from fcslam.maps import certificate
 from fcslam.maps.certificate import certify
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
@@ -578,7 +578,7 @@ def test_the_live_run_follows_and_is_always_whole(cloud):
 def test_the_live_run_has_a_certificate_which_is_computed_seldom_or_when_maps_join(cloud, monkeypatch):
     certified = []
     monkeypatch.setattr(worker_module, "QUALITY_EVERY_S", 500.0)  # the clock moves at every look
-    monkeypatch.setattr(report, "certify", lambda *given: certified.append(cloud.now) or certify(*given))
+    monkeypatch.setattr(certificate, "certify", lambda *given: certified.append(cloud.now) or certify(*given))
     packets = two_robots()
     parts = np.array_split(np.arange(len(packets)), len(packets) // 4)
     for part in parts:

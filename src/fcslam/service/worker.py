@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import blake2b
+from importlib import import_module
 from pathlib import Path
 from typing import IO
 
@@ -88,6 +89,9 @@ LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
 QUALITY_EVERY_S = 30.0
 """Its certificate is not computed more often than this, unless maps join or part."""
+
+LATE = "fcslam.lidar.uniqueness", "fcslam.maps.certificate"
+"""Modules with SciPy, which a robot loads late or never; no packet and no copy of the worker should wait for them."""
 
 _log = logging.getLogger(__name__)
 
@@ -509,6 +513,8 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # a copy of this process would wait for threads that it does not have
     warm_up_fleet()
+    for late in LATE:
+        import_module(late)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
