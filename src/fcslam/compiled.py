@@ -57,7 +57,8 @@ def _load_array_functions() -> None:
     """
     from numba.np import linalg
 
-    ensure_blas, linalg.ensure_blas = linalg.ensure_blas, lambda: None
+    ensure_blas = getattr(linalg, "ensure_blas", None)  # not a public name
+    linalg.ensure_blas = lambda: None
     try:
         import_module("numba.np.arraymath")
     finally:

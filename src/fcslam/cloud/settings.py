@@ -38,7 +38,7 @@ class FleetConfig(Settings):
     solve_every: int = Field(
         default=40,
         gt=0,
-        description="number of new closures after which the joint graph is solved; 5 % of all closures if that is more",
+        description="new closures after which their maps are solved again; 5 % of all closures if that is more",
     )
     submaps_kept: int = Field(
         default=1000,
