@@ -12,7 +12,8 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Channel, ClosureStatus, LoopClosure, Reason, ReasonCode, frozen
+from fcslam.records import Channel, ClosureStatus, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
+from fcslam.storage.state_file import read_state, write_state
 from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, stream, verified
 from tests.small_fleet import feed, map_of
 
@@ -140,3 +141,25 @@ def test_sessions_that_meet_for_long_without_a_join_are_not_decided_at_every_pla
     assert (grown[1:] >= 1.05 * grown[:-1]).all()
     assert len(vague) < grown[-1] < 1.06 * len(vague), "they join soon after closures say where"
     assert set(map_of(cloud.finalize()).values()) == {0}
+
+
+def test_a_solve_is_of_the_maps_whose_closures_changed_also_after_a_restart(tmp_path):
+    graph = graph_of(a=POSES, b=POSES, c=POSES)
+    a, b = (graph.trajectory(robot) for robot in "ab")
+    bent = se2.compose(se2.between(POSES[0], POSES[20]), np.array([0.3, 0.1, 0.02]))
+    for robot in "bc":
+        graph.close(KeyscanId(robot, 0), KeyscanId(robot, 20), bent, np.eye(3))
+    graph.optimize()
+    solved = graph.trajectory("c")
+    assert np.allclose(graph.trajectory("a"), a, atol=1e-9)
+    assert not np.allclose(graph.trajectory("b"), b, atol=1e-3)
+    graph.close(KeyscanId("a", 0), KeyscanId("a", 20), bent, np.eye(3))
+    graph.count(graph.close(KeyscanId("b", 0), KeyscanId("b", 20), bent, np.eye(3)), holds=False)
+    write_state(tmp_path / "state", "test", graph.state())
+    again = JointGraph()
+    again.restore(read_state(tmp_path / "state", "test"))
+    for each in (graph, again):
+        each.optimize()
+    assert not np.allclose(graph.trajectory("a"), a, atol=1e-3)
+    assert np.allclose(graph.trajectory("c"), solved, atol=1e-9)
+    assert all(np.array_equal(graph.trajectory(robot), again.trajectory(robot)) for robot in "abc")
