@@ -193,18 +193,22 @@ def probe(statement: str, folder: Path) -> list[str]:
     return answer
 
 
+def printed(program: list[str], folder: Path) -> str:
+    """What the lines of a program print in a fresh interpreter."""
+    command = [sys.executable, "-c", "\n".join(program)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.slow
 def test_a_live_robot_does_not_load_scipy(tmp_path):
-    """It takes 50 MB, and as long to load as a thousand scans to map. numba asks for its version alone."""
+    """It takes 46 MB, and as long to load as a thousand scans to map. numba asks for its version alone."""
     program = [
         "import sys, fcslam.mission.mission, fcslam.live.robot",
         "from fcslam.robot.frontend import RobotConfig",
         "fcslam.live.robot.warm_up_tracking(RobotConfig())",
         "print(*(name for name in sys.modules if name.startswith('scipy.') and not name.startswith('scipy._')))",
     ]
-    command = [sys.executable, "-c", "\n".join(program)]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert result.stdout.split() == ["scipy.version"]
+    assert printed(program, tmp_path).split() == ["scipy.version"]
 
 
 @pytest.mark.slow
@@ -216,9 +220,7 @@ def test_code_of_users_finds_the_blas_of_scipy(tmp_path):
         "product = numba.njit(lambda a: np.dot(a, a))(2.0 * np.eye(2))",
         "print(product.tolist())",
     ]
-    command = [sys.executable, "-c", "\n".join(program)]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert result.stdout == "[[4.0, 0.0], [0.0, 4.0]]\n"
+    assert printed(program, tmp_path) == "[[4.0, 0.0], [0.0, 4.0]]\n"
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def njit(function: Any = None, *, nogil: bool = False, allocates: bool = True) -
 
 @cache
 def _load_array_functions() -> None:
-    """Load those of numba without the BLAS of SciPy, which takes 0.3 s and 30 MB.
+    """Load those of numba without the BLAS of SciPy, which takes 0.3 s and 16 MB.
 
     numba loads it to learn whether it is there, and looks again before it compiles a product of matrices.
     """

@@ -75,7 +75,9 @@ class FactorCache:
 
     def _rows(self, solved: NDArray[np.bool_] | None) -> NDArray[np.int64] | None:
         """Variables that the factors measure; None: all."""
-        return np.flatnonzero(solved) if solved is not None else None if self.chains is None else self.chains.kept
+        if solved is not None:
+            return np.flatnonzero(solved)
+        return None if self.chains is None else self.chains.kept
 
     def complete(self, poses: FloatArray) -> None:
         """Set the poses inside of chains, in ``poses`` (N, 3), by those at their ends."""
