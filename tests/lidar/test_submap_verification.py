@@ -11,9 +11,11 @@ from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.lidar.verification import (
     CLOSURE_SIGMA_M,
     CLOSURE_SIGMA_RAD,
+    Aligned,
     VerificationConfig,
     _information_of_inverse,
     _shortfall,
+    judge,
     verify,
 )
 from fcslam.records import Reason, ReasonCode
@@ -171,6 +173,19 @@ def test_a_noisy_scanner_is_allowed_more_violation_and_no_scanner_much():
     assert limits[0.09] is None
     much = replace(free, violation=0.11)
     assert _shortfall(much, CONFIG.strict, "strict", lambda: 1.0) is not None
+
+
+@pytest.mark.parametrize(("violation", "predicted"), [(0.08, False), (0.15, True)])
+def test_noise_is_measured_for_the_gate_that_decides(violation, predicted):
+    """0.08 is too much for the strict gate without noise, 0.15 for the loose one."""
+    free = Agreement(0.9, violation, 600, 0.9, 100.0 * np.eye(3))
+    aligned = Aligned(np.zeros(3), np.eye(3), free, 100.0, np.zeros(3))
+    asked = []
+    noise = lambda: asked.append(1) or 0.2  # noqa: E731
+    decided, other = (judge(aligned, CONFIG, noise, each) for each in (predicted, not predicted))
+    assert len(asked) == 1
+    assert (decided.strict, decided.loose) == (not predicted, True)
+    assert (other.strict, other.loose) == (False, not predicted)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3])

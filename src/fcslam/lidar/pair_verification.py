@@ -24,7 +24,6 @@ from fcslam.lidar.verification import (
     align,
     judge,
     no_noise,
-    verify,
 )
 from fcslam.records import FloatArray
 
@@ -55,14 +54,16 @@ _log = logging.getLogger(__name__)
 
 
 class Pair(NamedTuple):
-    """Two submaps that may show the same place; the fields are those of ``verify``."""
+    """Two submaps that may show the same place, as ``verify`` takes them."""
 
     a: Submap
     b: Submap
     T_a_b_guess: FloatArray
     prior: FloatArray = NO_PRIOR
     noise: Callable[[], float] = no_noise
-    """Stays in this process: it needs the scans."""
+    """As in ``judge``. Stays in this process: it needs the scans."""
+    predicted: bool = False
+    """As in ``judge``."""
 
 
 VerifyPairs = Callable[[Sequence[Pair], VerificationConfig], list[Verification]]
@@ -74,7 +75,11 @@ Processes = Callable[[], Sequence[Executor]]
 
 def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
     """Verify the pairs one after another in this process."""
-    return [verify(a, b, guess, config, prior, noise) for a, b, guess, prior, noise in pairs]
+    return [_judge(align(pair.a, pair.b, pair.T_a_b_guess, pair.prior), pair, config) for pair in pairs]
+
+
+def _judge(aligned: Aligned, pair: Pair, config: VerificationConfig) -> Verification:
+    return judge(aligned, config, pair.noise, pair.predicted)
 
 
 class VerificationPool:
@@ -102,7 +107,7 @@ class VerificationPool:
         peers = self._present()
         batches = _split(len(pairs), 1 + len(peers), math.ceil(BATCH_S / self._pair_s))
         aligned = self._align(pairs, batches, peers)
-        return [judge(found, config, pair.noise) for found, pair in zip(aligned, pairs, strict=True)]
+        return [_judge(found, pair, config) for found, pair in zip(aligned, pairs, strict=True)]
 
     def _present(self) -> "list[_Peer]":
         executors, now = self._processes(), time.perf_counter()

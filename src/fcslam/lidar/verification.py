@@ -135,7 +135,6 @@ def verify(
     T_a_b_guess: FloatArray,
     config: VerificationConfig,
     prior: FloatArray = NO_PRIOR,
-    noise: Callable[[], float] = no_noise,
 ) -> Verification:
     """Check whether two submaps show the same place: align them in both directions and rate the worse one.
 
@@ -147,13 +146,11 @@ def verify(
         prior: information of the guess from matched keypoints, over (x, y, theta) in the coordinates of a, shape
             (3, 3). It fixes the alignment where no wall does, as along a corridor. It does not make a closure
             informative: structure that repeats along a corridor repeats in images, too.
-        noise: sum of both submaps' violation of themselves (``self_violation``), called only where it decides. Two
-            submaps cannot agree better than each agrees with itself, so a noisy scanner is allowed as much violation.
 
     Returns:
         The alignment halfway between both directions, and the gates that it passes.
     """
-    return judge(align(a, b, T_a_b_guess, prior), config, noise)
+    return judge(align(a, b, T_a_b_guess, prior), config)
 
 
 def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_PRIOR) -> Aligned:
@@ -183,8 +180,19 @@ def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_
     return Aligned(T_a_b, _information(forward.information + prior, T_a_b), worse, worse.weakest, gap)
 
 
-def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], float] = no_noise) -> Verification:
-    """Which gates an alignment passes; arguments as for ``verify``."""
+def judge(
+    aligned: Aligned, config: VerificationConfig, noise: Callable[[], float] = no_noise, predicted: bool = False
+) -> Verification:
+    """Which gates an alignment passes.
+
+    Args:
+        aligned: the alignment.
+        config: thresholds.
+        noise: sum of both submaps' violation of themselves (``self_violation``), called only where it decides. Two
+            submaps cannot agree better than each agrees with itself, so a noisy scanner is allowed as much violation.
+        predicted: whether an estimate predicts the closure. The loose gate decides then, otherwise the strict one. The
+            noise counts for the gate that decides: to measure it takes as long as to build two submaps.
+    """
     worse, weakest = aligned.worse, aligned.weakest
     asymmetric = _asymmetry(aligned.gap)
     symmetric = asymmetric is None
@@ -192,7 +200,8 @@ def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], floa
         noise = no_noise  # it takes two submaps, and decides nothing
     informative = weakest >= INFORMATIVE
     one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, INFORMATIVE)
-    strict, loose = _shortfall(worse, config.strict, "strict", noise), _shortfall(worse, config.loose, "loose", noise)
+    strict = _shortfall(worse, config.strict, "strict", no_noise if predicted else noise)
+    loose = _shortfall(worse, config.loose, "loose", noise if predicted else no_noise)
     return Verification(
         T_a_b=aligned.T_a_b,
         information=aligned.information,

@@ -157,10 +157,8 @@ class _Comparison(NamedTuple):
     """Pairs of one stored place that are to be verified."""
 
     i: KeyscanId
-    guesses: Sequence[tuple[FloatArray, FloatArray]]
-    """T_i_j (3,) and its prior information (3, 3); none: there is no match."""
-    share: float
-    """Of matching descriptors, if it is known."""
+    guesses: Sequence[Motion]
+    """Possible T_i_j; none: there is no match."""
     predicted: bool
 
 
@@ -238,7 +236,7 @@ class PlaceMatcher:
         are ignored.
         """
         kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
-        pairs = [self._pair(self._places[i], place, T_i_j, NO_PRIOR) for i, T_i_j in kept]
+        pairs = [self._pair(i, place, Motion(T_i_j, NO_PRIOR, 0.0), predicted=True) for i, T_i_j in kept]
         loose = self._config.verification.loose
         fewer = loose.model_copy(update={"count": round(START_SHARE * loose.count)})
         checks = self._verify_pairs(pairs, self._config.verification.model_copy(update={"loose": fewer}))
@@ -268,8 +266,7 @@ class PlaceMatcher:
         near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
         others = (*self._candidates(result, is_unaligned), *lookalikes)
-        far = [_far(i, propose_motions(self._stored(i), place)) for i in others]
-        return [*near, *far]
+        return [*near, *(self._far(i, place) for i in others)]
 
     def state(self) -> State:
         """The state that ``restore`` needs."""
@@ -368,12 +365,14 @@ class PlaceMatcher:
         without the prediction, because the map may be wrong.
         """
         if place.channel is Channel.LIDAR:
-            return _Comparison(i, [(T_i_j, NO_PRIOR)], 0.0, predicted=True)
-        proposed = propose_motions(self._stored(i), place)
-        motion = next((motion for motion in proposed if self._confirms(motion, T_i_j)), None)
-        if motion is None:
-            return _far(i, proposed)
-        return _Comparison(i, [(motion.T_a_b, motion.information)], motion.share, predicted=True)
+            return _Comparison(i, [Motion(T_i_j, NO_PRIOR, 0.0)], predicted=True)
+        far = self._far(i, place)
+        confirmed = [motion for motion in far.guesses if self._confirms(motion, T_i_j)]
+        return _Comparison(i, confirmed[:1], predicted=True) if confirmed else far
+
+    def _far(self, i: KeyscanId, place: Place) -> _Comparison:
+        """The comparison of a pair that is not predicted, by its motions from keypoints."""
+        return _Comparison(i, propose_motions(self._stored(i), place), predicted=False)
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
@@ -384,7 +383,7 @@ class PlaceMatcher:
     ) -> list[PlaceMatch]:
         """Verify every guess of the comparisons; the best one of each counts."""
         pairs = [
-            self._pair(self._places[comparison.i], place, *guess)
+            self._pair(comparison.i, place, guess, comparison.predicted)
             for comparison in comparisons
             for guess in comparison.guesses
         ]
@@ -394,18 +393,17 @@ class PlaceMatcher:
             found = [next(checks) for _ in comparison.guesses]
             if found:
                 best = max(found, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
-                similarity = result.similarity_of(comparison.i, comparison.share)
+                similarity = result.similarity_of(comparison.i, comparison.guesses[0].share)
                 matches.append(
                     PlaceMatch.verified(comparison.i, place.id, place.channel, similarity, best, comparison.predicted)
                 )
         return matches
 
-    def _pair(self, stored: Place, place: Place, guess: FloatArray, prior: FloatArray) -> Pair:
+    def _pair(self, i: KeyscanId, place: Place, guess: Motion, predicted: bool) -> Pair:
+        stored = self._places[i]
         a, b = self._submap_of(stored), self._submap_of(place)
-        return Pair(a, b, guess, prior, lambda: self._noise_of(stored) + self._noise_of(place))
 
+        def noise() -> float:
+            return self._noise_of(stored) + self._noise_of(place)
 
-def _far(i: KeyscanId, proposed: Sequence[Motion]) -> _Comparison:
-    """The comparison of a pair that is not predicted, by its motions from keypoints."""
-    share = proposed[0].share if proposed else 0.0
-    return _Comparison(i, [(motion.T_a_b, motion.information) for motion in proposed], share, predicted=False)
+        return Pair(a, b, guess.T_a_b, guess.information, noise, predicted)
