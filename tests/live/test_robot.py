@@ -39,6 +39,14 @@ def drive(robot, scans):
     return [robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base) for scan in scans]
 
 
+def test_a_scan_that_a_driver_repeats_moves_the_robot_by_its_odometry_alone(robot, scans):
+    """The transform from ``map`` to ``odom`` stays, so odometry carries the robot on."""
+    *_, last = drive(robot, scans[:20])
+    T_odom_base = np.add(scans[19].T_odom_base, (0.3, 0.0, 0.0))
+    moved = replace(scans[19], stamp=scans[20].stamp, T_odom_base=T_odom_base)
+    assert robot.add(moved) is last
+
+
 def test_each_pose_is_that_of_the_tracker(robot, scans):
     poses = drive(robot, scans)
     frontend = RobotFrontend("anna", fcslam.MissionConfig().robot)

@@ -524,3 +524,24 @@ def test_chunks_without_an_index_of_their_messages_are_read(tmp_path, with_count
     summary = [record for record in records if record[0] in kept] + [(0x08, index)]
     path = mcap_file(tmp_path / "run.mcap", [*data, *summary, (0x02, struct.pack("<QQI", at, 0, 0))])
     assert len(scans_of(open_source(path))) == 40
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("away", [12.0, 120.0])
+def test_a_laser_mounted_in_centimetres_or_millimetres(tmp_path, name, away):
+    pose = tf(100.0, "base_link", "laser", (away, 0.0, 0.3), quaternion(0.0), topic="/tf_static")
+    said = [pose, *without(drive(), "/tf_static")]
+    assert f"puts the laser of /scan {away:.0f} m from 'base_link'" in refusal(save(tmp_path / name, said))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_odometry_of_two_nodes_that_differ_a_little_is_noticed(tmp_path, name):
+    said = drive()
+    times = [0.1 * k + 0.03 for k in range(80)]
+    other = [odom(100.0 + at, (pose_at(at)[0] + 0.2, *pose_at(at)[1:])) for at in times]
+    healthy = open_source(save(tmp_path / f"one-{name}", said))
+    twice = open_source(save(tmp_path / f"two-{name}", [*said, *other]))
+    assert not any("back and forth" in note for note in healthy.survey().notes)
+    (note,) = (note for note in twice.survey().notes if "back and forth" in note)
+    assert "/odom goes back and forth at 1" in note
+    assert "as if two nodes published it; stop one of them" in note

@@ -39,6 +39,26 @@ def assert_on_the_line(pose, stamp):
     assert math.remainder(pose[2] - 0.05 * stamp, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("late_by", [1, 2, 3])
+def test_a_reading_that_is_recorded_after_later_ones_changes_nothing(late_by):
+    """As over a network that changes their order: the scans lie on the line, and none is beyond the odometry."""
+    stamps = [0.05 * k for k in range(200)]
+    order = sorted(range(200), key=lambda k: k + (late_by + 0.5) * (k % 10 == 5))
+    said = [(stamps[place], 0, reading(stamps[k])) for place, k in enumerate(order)]
+    said += [(0.2 * k + 0.33, 1, scan(0.2 * k + 0.33)) for k in range(40)]
+    said.sort(key=lambda entry: entry[:2])
+    for entry in run([item for *_, item in said]):
+        assert entry.fault is None
+        assert_on_the_line(entry.T_odom_base, entry.scan.stamp)
+
+
+def test_a_clock_of_the_odometry_that_steps_back_for_good_is_followed():
+    stamps = [0.05 * k for k in range(100)] + [4.5 + 0.05 * k for k in range(40)]
+    said = [reading(stamp, (0.01 * k, 0.0, 0.0)) for k, stamp in enumerate(stamps)]
+    (pose,) = poses([*said, scan(stamps[-1])])
+    assert pose[0] == pytest.approx(0.01 * (len(stamps) - 1))
+
+
 times = st.integers(0, 40_000).map(lambda ms: ms / 1000)
 
 

@@ -203,7 +203,7 @@ def test_each_scan_of_a_laser_whose_beams_vary_has_its_own(tmp_path):
     for read in scans:
         np.testing.assert_allclose(read.ranges_m - 5.0, read.laser.angles_rad(), atol=1e-4)
     assert source.survey().lasers[0].beam_count == 360
-    assert source.faults.counts.keys() <= {Fault.FROZEN_SCAN}, "the ranges are all alike"
+    assert source.faults.counts.keys() <= {Fault.REPEATED_SCAN}, "the ranges are all alike"
 
 
 def test_a_laser_that_turns_to_the_right_is_turned_round(tmp_path):

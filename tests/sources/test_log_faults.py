@@ -113,6 +113,17 @@ def test_odometry_of_a_straight_drive_a_turn_or_a_few_scans_is_used(tmp_path, po
     assert all(np.isfinite(record.T_odom_base).all() for record in source.records())
 
 
+@pytest.mark.parametrize("scale", [100.0, 1000.0])
+def test_odometry_in_centimetres_or_millimetres_is_refused(tmp_path, scale):
+    lines = [flaser(k, (scale * 0.5 * k, 0.1 * scale * k, 0.01 * k)) for k in range(30)]
+    assert "as if in millimetres or centimetres" in refusal(save(tmp_path / "run.log", lines))
+
+
+def test_one_long_jump_of_the_odometry_is_not_another_unit(tmp_path):
+    lines = [flaser(k, (0.5 * k + 1e6 * (k > 15), 0.1 * k, 0.01 * k)) for k in range(30)]
+    assert open_source(save(tmp_path / "run.log", lines)).survey().scan_count == 30
+
+
 def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):
     message = refusal(save(tmp_path / "run.log", drive(30) + drive(31, start_stamp=200, beams=9)))
     assert "line 62: 31 scans are not of the laser of the first ones" in message

@@ -170,8 +170,11 @@ class LiveTracker(ABC):
         return frozen(np.full(3, np.nan)) if given is None else checked_pose("odometry", given)
 
     def _process(self, scan: LaserScan) -> RobotPose:
-        """Localize a scan, and tell what happened."""
+        """Localize a scan, and tell what happened. One that repeats the scan before has the pose of that one."""
+        before = self._frontend.newest
         self._take(self._processed(scan))
+        if self._pose is not None and self._frontend.newest is before:
+            return self._pose
         self._newest_s = max(self._newest_s, scan.stamp)
         self._scans += 1
         newest = self._newest()

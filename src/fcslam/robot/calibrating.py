@@ -28,6 +28,7 @@ from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
+from fcslam.sources.contradictions import RepeatedScans
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.source import Noted, Source
@@ -246,7 +247,7 @@ def _tracked(
 ) -> tuple[ScanMotions, OdometryTrack | None]:
     """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
     frontend = LidarFrontend("calibration", config, PREDICTED)
-    prediction, mapped = MotionPrediction(), MappedScans(config.ignore, config.footprint)
+    prediction, mapped, repeated = MotionPrediction(), MappedScans(config.ignore, config.footprint), RepeatedScans()
     unknown = np.full(3, np.nan)
     stamps: list[float] = []
     poses: list[FloatArray] = []
@@ -257,7 +258,7 @@ def _tracked(
     for record in records:
         if isinstance(record, Odometry):
             odometry.append(record)
-        if not isinstance(record, LaserScan):
+        if not isinstance(record, LaserScan) or not repeated.admits(record):
             continue
         if len(stamps) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break

@@ -49,16 +49,12 @@ from fcslam.robot.backend import (
 from fcslam.robot.backend_runner import BackendRunner, InlineBackend
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import LONGEST_S, PREDICTED, MotionPrediction
-from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
+from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits, WheelCheck
 from fcslam.robot.track import ScanTrack
-from fcslam.sources.contradictions import CHANGED, changed_share
+from fcslam.sources.contradictions import RepeatedScans
 from fcslam.sources.gate import is_clock_step
-from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.pose import pose_of
 from fcslam.wire.messages import Body, Hello, Packet
 
-SCANS_THAT_CHANGED = 10
-"""So many scans in a row that changed while the odometry said nothing show that it measures nothing."""
 LATE_S = 0.5
 """Largest time between a fix and the scan whose pose it measures."""
 MOST_FIXES = 100
@@ -130,10 +126,8 @@ class RobotFrontend:
         """Jumps of the odometry so far."""
         self.prediction: MotionPrediction | None = None
         """Stands in for the odometry; None if there is odometry."""
-        self.odometry_fault: str | None = None
-        """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
         self._config, self._mark = config, mark
-        self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
+        self._repeated, self._mapped = RepeatedScans(), MappedScans(config.lidar.ignore, config.lidar.footprint)
         self._backend = InlineBackend(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
@@ -162,12 +156,7 @@ class RobotFrontend:
         """Fixes of satellite navigation that wait for the next scan."""
         self._fixed = -1
         """The newest keyscan of the present session with a fix."""
-        self._at_rest: LaserScan | None = None
-        """The first scan."""
-        self._odometry = PathSummary()
-        """Odometry until it says something."""
-        self._changed = 0
-        """Newest scans in a row that measure something else than the first."""
+        self._wheels = WheelCheck()
         self._begin()
 
     @property
@@ -179,6 +168,11 @@ class RobotFrontend:
     def travel_m(self) -> float:
         """Path length of the present session up to its newest keyscan, metres; turns count a little."""
         return self._lidar.travel_m
+
+    @property
+    def odometry_fault(self) -> str | None:
+        """Why the odometry that there is is not used, as the end of a sentence; None if it is used."""
+        return self._wheels.fault
 
     @property
     def backlog(self) -> int:
@@ -198,7 +192,8 @@ class RobotFrontend:
                     self.begin_session()
                     self.prediction = MotionPrediction() if self.prediction else None
                 self._before_s = self._before_s[1], record.stamp
-                self._process_scan(self._mark(self._mapped.of(self._with_motion(record))))
+                if self._repeated.admits(record):
+                    self._process_scan(self._mark(self._mapped.of(self._with_motion(record))))
             case CameraImage() if self._config.uses_images:
                 image = self.odometry.image(record) if self.prediction is None else replace(record, T_odom_base=None)
                 if self._deferred:
@@ -261,30 +256,20 @@ class RobotFrontend:
 
     def _with_motion(self, scan: LaserScan) -> LaserScan:
         """The scan with its odometry free of jumps, or with a prediction if the scan has no odometry."""
-        if self.prediction is None and self._is_without_odometry(scan):
+        if self.prediction is None and self._wheels.say_nothing(scan):
             self.prediction = MotionPrediction()
-            self.begin_session()
+            if self._wheels.may_be_frozen:
+                self.scan_poses.cut(self._wheels.certain_s)
+                self._end_session()
+                self._process_deferred()  # in the new session
+            else:
+                self.begin_session()
         duration_s = self._config.lidar.scan_duration_s
         if scan.sweep is None and duration_s > 0.0:
             scan = replace(scan, sweep=Sweep(0.0, duration_s))
             if self.prediction is None and self._previous is not None:
                 scan = _moving_on(scan, self._previous)
         return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
-
-    def _is_without_odometry(self, scan: LaserScan) -> bool:
-        """Whether the first scan has no odometry, or the odometry says nothing while the scans change."""
-        if self._at_rest is None:
-            self._at_rest = scan
-            return bool(np.isnan(scan.T_odom_base).any())
-        if self._odometry.says_something:
-            return False
-        self._odometry.add(scan.stamp, pose_of(scan.T_odom_base))
-        if scan.laser == self._at_rest.laser:
-            changed = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m) > CHANGED
-            self._changed = self._changed + 1 if changed else 0
-        if self._changed >= SCANS_THAT_CHANGED:
-            self.odometry_fault = self._odometry.fault
-        return self.odometry_fault is not None
 
     def _observe(self, scan: LaserScan) -> None:
         """Predict the next scan from where this one was found."""
@@ -307,7 +292,8 @@ class RobotFrontend:
             self._end_session()
         # 1. Localize the scan; unless it is doubtful, process it.
         tracking = self._lidar.localize(scan)
-        if not is_doubtful(tracking, self._lidar, self._config.lost):
+        may_be_frozen = self.prediction is None and self._wheels.may_be_frozen
+        if not (may_be_frozen or is_doubtful(tracking, self._lidar, self._config.lost)):
             if self._deferred:
                 self._process_deferred()
                 tracking = self._lidar.localize(scan)
@@ -319,7 +305,7 @@ class RobotFrontend:
         self._deferred.append(scan)
         self.newest = _newest(self._lidar.scan_pose(scan.stamp, tracking.tracked), tracking, is_deferred=True)
         scans = [record for record in self._deferred if isinstance(record, LaserScan)]
-        if not can_decide(scans):
+        if may_be_frozen or not can_decide(scans):
             return
         # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them. If the
         # robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.

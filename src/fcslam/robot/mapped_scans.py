@@ -9,7 +9,8 @@ from fcslam.geometry.beams import beam_step
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors
 from fcslam.lidar.scan import rays_of
-from fcslam.records import Beams, LaserModel, LaserScan, Sweep
+from fcslam.records import Beams, LaserModel, LaserScan, Sweep, frozen
+from fcslam.sources.contradictions import has_return
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
 from fcslam.wire.quantisation import rounded
 
@@ -30,7 +31,8 @@ class MappedScans:
         """The scan as it is mapped.
 
         Its ranges, shape (mapped beams,), metres, are those of the wire, so that robot and cloud see the same numbers.
-        No return is inf; an invalid range, or one at the maximum, is 0.
+        No return is inf; an invalid range, or one at the maximum, is 0. All are 0 in a scan without any return, as of
+        a covered laser: it does not show that the floor is free.
         """
         index = self._lasers.index(scan.laser)
         step = beam_step(self._lasers.known[index].beams)
@@ -44,6 +46,8 @@ class MappedScans:
             ranges_m = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), ranges_m)
         sweep = _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
         ranges_m = rounded(ranges_m, laser.max_range_m)
+        if not has_return(ranges_m, laser.max_range_m):
+            ranges_m = frozen(np.zeros_like(ranges_m), np.float32)
         return LaserScan(scan.stamp, ranges_m, laser, scan.T_odom_base, sweep, scan.on_teammates)
 
 

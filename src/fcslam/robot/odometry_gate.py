@@ -1,13 +1,19 @@
-"""Odometry that no robot can have: a reading that jumps is bridged, so that scan matching goes on from where it was."""
+"""Odometry that no robot can have: a reading that jumps is bridged, so that scan matching goes on from where it was;
+wheels that say nothing while the scans change are not used.
+"""
 
 import math
 from dataclasses import replace
 
+import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
+from fcslam.sources.contradictions import CHANGED, changed_share, stands_still
+from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.pose import pose_of
 
 LEAST_BRIDGE_M, LEAST_BRIDGE_RAD = 0.02, 0.02
 """A bridge is at least such a motion: the tracker does not match the scans of a robot that stands still."""
@@ -18,6 +24,14 @@ SLACK_M = 1.0
 """Length allowed to any step, metres, as stamps may be wrong."""
 SLACK_RAD = 1.5
 """Turn allowed to any step, radians."""
+
+
+SCANS_THAT_CHANGED = 10
+"""So many scans in a row that changed while the odometry said nothing show that it measures nothing."""
+SLIGHTLY_CHANGED = 0.1
+"""Share of the beams that measure something else, of a robot that moved on a little."""
+FROZEN = "stands still while the scans change"
+"""Fault of odometry that measured the motion before."""
 
 
 class OdometryLimits(Settings):
@@ -93,3 +107,43 @@ class OdometryGate:
         limits = self._limits
         within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
         return moved_m > SLACK_M + limits.speed_m_s * within_s or turned_rad > SLACK_RAD + limits.turn_rad_s * within_s
+
+
+class WheelCheck:
+    """Finds odometry that says nothing, from the beginning on or any more, while the scans change."""
+
+    def __init__(self) -> None:
+        self.fault: str | None = None
+        """Why it is not odometry, as the end of a sentence; None if it can be."""
+        self.certain_s = -math.inf
+        """Stamp of the newest scan at which the odometry moved, or which measures what the scan at rest does."""
+        self._at_rest: LaserScan | None = None
+        """The first scan; once the odometry has said something, the first one where it now stands."""
+        self._path = PathSummary()
+        """Odometry until it says something."""
+        self._changed = 0
+        """Newest scans in a row that measure something else than the one at rest."""
+
+    @property
+    def may_be_frozen(self) -> bool:
+        """Whether odometry that measured the motion before stands still, and the newest scan has changed."""
+        return self._changed > 0 and self._path.says_something
+
+    def say_nothing(self, scan: LaserScan) -> bool:
+        """Whether the odometry up to the next scan says nothing while the scans change, or the first one has none."""
+        if self._at_rest is None:
+            self._at_rest = scan
+            return bool(np.isnan(scan.T_odom_base).any())
+        if not self._path.says_something:
+            self._path.add(scan.stamp, pose_of(scan.T_odom_base))
+        if self._path.says_something and not stands_still(self._at_rest, scan):
+            self._at_rest, self._changed, self.certain_s = scan, 0, scan.stamp
+            return False
+        if scan.laser == self._at_rest.laser:
+            share = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m)
+            self._changed = self._changed + 1 if share > CHANGED else 0
+            if not share > SLIGHTLY_CHANGED:  # true for NaN
+                self.certain_s = scan.stamp
+        if self._changed >= SCANS_THAT_CHANGED:
+            self.fault = FROZEN if self._path.says_something else self._path.fault
+        return self.fault is not None

@@ -36,6 +36,13 @@ class ScanTrack:
         self._keyscans.append(pose.keyscan)
         self._T_keyscan_base.extend(pose.T_keyscan_base.tolist())
 
+    def cut(self, last_s: float) -> None:
+        """Drop the newest scans, those after ``last_s``, seconds."""
+        while self._stamps and self._stamps[-1] > last_s:
+            self._stamps.pop()
+            self._keyscans.pop()
+            del self._T_keyscan_base[-3:]
+
     def extend(self, motion: FloatArray) -> None:
         """Append the next keyscan by the motion to it from the one before, shape (3,), as it is sent to the cloud."""
         self._T_odom_keyscan.extend(se2.compose(np.array(self._T_odom_keyscan[-3:]), motion))

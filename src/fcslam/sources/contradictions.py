@@ -1,10 +1,13 @@
-"""Finds scans that contradict the odometry, so that a frozen encoder or scanner does not pass unnoticed.
+"""Finds scans that say nothing or contradict the odometry, so that a frozen encoder or scanner does not pass unnoticed.
 
+- A scan has the ranges of the scan before to the last bit, and the odometry moved, or the stamp is the same: a driver
+  repeats it, or it was recorded twice. A robot skips it.
+- A scan has no return, as of a covered laser. It clears nothing (``fcslam.robot.mapped_scans``).
 - The odometry stands still and the scan changes: most beams measure another range than when it began to stand.
-- The odometry moves and the scan stays: its ranges are those of the scan before to the last bit, or the odometry turned
-  and still all beams measure what they did. Travel alone proves nothing: along a corridor, scans stay the same.
+- The odometry turned and still all beams measure what they did. Travel alone proves nothing: along a corridor, scans
+  stay the same.
 
-The scans are kept, as one sensor alone does not say which of both is wrong.
+The last two are kept, as one sensor alone does not say which of both is wrong.
 """
 
 from dataclasses import dataclass
@@ -15,7 +18,7 @@ import numpy as np
 
 from fcslam.records import LaserScan, Ranges
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.pose import Pose
+from fcslam.sources.pose import Pose, pose_of
 
 STILL_M, STILL_RAD = 0.005, 0.003
 """Odometry that moved less stands still."""
@@ -40,59 +43,90 @@ class _Seen(NamedTuple):
 class _Laser:
     """The state of the check for one laser."""
 
-    last: _Seen
     rest: _Seen
     """The first scan where the odometry now stands."""
     turn: _Seen
     """The scan from which the turn is counted."""
 
 
-class OdometryWatch:
-    """Compares the scans of one pass with their odometry."""
+class RepeatedScans:
+    """Finds scans that say nothing new: of a driver that repeats its last scan, or recorded twice."""
+
+    def __init__(self) -> None:
+        self._newest: dict[Pose, LaserScan] = {}
+        """The newest scan of each laser, by its mounting."""
+
+    def admits(self, scan: LaserScan) -> bool:
+        """Whether the next scan does not repeat the one before of its laser."""
+        before = self._newest.get(scan.laser.T_base_laser)
+        if before is not None and _repeats(before, scan):
+            return False
+        self._newest[scan.laser.T_base_laser] = scan
+        return True
+
+
+class ScanWatch:
+    """Compares the scans of one pass with each other and with their odometry."""
 
     def __init__(self, audit: Audit) -> None:
         self._audit = audit
+        self._repeated = RepeatedScans()
         self._lasers: dict[Pose, _Laser] = {}
 
     def add(self, number: int, scan: LaserScan) -> None:
         """Count what is wrong with the next scan, which is on line (or in message) ``number``."""
+        if not self._repeated.admits(scan):
+            self._audit.add(Fault.REPEATED_SCAN, number)
+            return
+        if not has_return(scan.ranges_m, scan.laser.max_range_m):
+            self._audit.add(Fault.NO_RETURN, number)
         x, y, theta = scan.T_odom_base.tolist()
         if isnan(theta):
             return
         seen = _Seen(scan, (x, y, theta))
         known = self._lasers.get(scan.laser.T_base_laser)
         if known is None:
-            self._lasers[scan.laser.T_base_laser] = _Laser(seen, seen, seen)
+            self._lasers[scan.laser.T_base_laser] = _Laser(seen, seen)
             return
-        if _is_still(known.rest, seen):
+        if _is_still(known.rest.T_odom_base, seen.T_odom_base):
             if _changed_share(known.rest.scan, scan) > CHANGED:
                 self._audit.add(Fault.FROZEN_ODOMETRY, number)
         else:
             known.rest = seen
-        moved_m, turned_rad = _motion(known.turn, seen)
-        turned_without_change = turned_rad > TURN_RAD and _changed_share(known.turn.scan, scan) < UNCHANGED
-        if turned_without_change or (not _is_still(known.last, seen) and _is_repeated(known.last.scan, scan)):
+        moved_m, turned_rad = _motion(known.turn.T_odom_base, seen.T_odom_base)
+        if turned_rad > TURN_RAD and _changed_share(known.turn.scan, scan) < UNCHANGED:
             self._audit.add(Fault.FROZEN_SCAN, number)
         if turned_rad > TURN_RAD or moved_m > CHANGE_M:
             known.turn = seen
-        known.last = seen
 
 
-def _is_still(before: _Seen, after: _Seen) -> bool:
-    moved_m, turned_rad = _motion(before, after)
-    return moved_m < STILL_M and turned_rad < STILL_RAD
+def has_return(ranges_m: Ranges, max_range_m: float) -> bool:
+    """Whether a beam of a scan has a return below the maximum range."""
+    return bool(np.count_nonzero((ranges_m > 0.0) & (ranges_m < max_range_m)))
 
 
-def _is_repeated(before: LaserScan, after: LaserScan) -> bool:
-    """Whether both scans have the same ranges to the last bit, with enough returns."""
+def _repeats(before: LaserScan, after: LaserScan) -> bool:
+    """Whether both have the same ranges to the last bit, with enough returns, and the odometry moved or one stamp."""
+    if before.stamp != after.stamp and (stands_still(before, after) or np.isnan(after.T_odom_base).any()):
+        return False
     if before.ranges_m.tobytes() != after.ranges_m.tobytes():
         return False
     return bool(np.count_nonzero(np.isfinite(after.ranges_m) & (after.ranges_m > 0.0)) >= FEWEST_RETURNS)
 
 
-def _motion(before: _Seen, after: _Seen) -> tuple[float, float]:
+def stands_still(before: LaserScan, after: LaserScan) -> bool:
+    """Whether the odometry stood still between two scans; false without odometry."""
+    return _is_still(pose_of(before.T_odom_base), pose_of(after.T_odom_base))
+
+
+def _is_still(before: Pose, after: Pose) -> bool:
+    moved_m, turned_rad = _motion(before, after)
+    return moved_m < STILL_M and turned_rad < STILL_RAD
+
+
+def _motion(before: Pose, after: Pose) -> tuple[float, float]:
     """Distance and turn by odometry."""
-    (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base, after.T_odom_base
+    (x0, y0, theta0), (x1, y1, theta1) = before, after
     return hypot(x1 - x0, y1 - y0), abs(remainder(theta1 - theta0, tau))
 
 

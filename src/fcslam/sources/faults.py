@@ -18,17 +18,29 @@ class Fault(StrEnum):
     NO_ODOMETRY = "scans without odometry within 1 s skipped"
     HELD_ODOMETRY = "scans beyond the odometry's ends given its nearest pose"
     FROZEN_ODOMETRY = "scans that change while the odometry stands still kept"
-    FROZEN_SCAN = "scans that stay the same while the odometry moves kept"
+    FROZEN_SCAN = "scans that stay the same while the odometry turns kept"
+    REPEATED_SCAN = "scans that repeat the scan before skipped"
     ODOMETRY_JUMP = "jumps of the odometry bridged by scan matching"
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
     MISPLACED_SCAN = "scans recorded far back in time skipped"
     CLOCK_STEP = "steps back of the clock, where a new session begins"
     TIME_REVERSAL = "steps back in time kept"
     NO_STAMP = "scans without a stamp taken as 1 s apart"
-    REPEATED_STAMP = "scans with the stamp of the scan before kept"
+    REPEATED_STAMP = "scans with the stamp of the scan before"
     NON_FINITE_RANGE = "ranges that are not finite made invalid"
     FIX_AT_ZERO = "GNSS fixes at latitude 0, longitude 0 skipped"
     NEGATIVE_RANGE = "negative ranges made invalid"
+    NO_RETURN = "scans without a return, which clear nothing"
+
+
+WARNED_FROM = 10
+"""Fewer faults of one kind give no warning."""
+_CONSEQUENCES = {
+    Fault.FROZEN_ODOMETRY: "the odometry stood still while the scans changed; from ten in a row on, scan matching alone "
+    "gives the motion",
+    Fault.NO_RETURN: "a laser saw nothing; odometry alone gives the motion there",
+}
+"""What many faults of a kind mean for the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +71,11 @@ class Faults:
     def plus(self, kind: Fault, count: int) -> "Faults":
         """These faults and ``count`` more, found by the robot and not by the reader."""
         return Faults({**self.counts, kind: FaultCount(self[kind].count + count)}, self.unit) if count else self
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences about faults that may make the map worse."""
+        return tuple(text for kind, text in _CONSEQUENCES.items() if self[kind].count >= WARNED_FROM)
 
     def __str__(self) -> str:
         return ", ".join(self._describe(kind) for kind in Fault if kind in self.counts) or "no faults"

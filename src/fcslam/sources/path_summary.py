@@ -3,8 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import hypot, inf, remainder, tau
+from pathlib import Path
 from typing import Final
 
+from fcslam.errors import SourceError
 from fcslam.sources.pose import Pose, relative_pose
 
 RESOLUTION_M: Final = 1e-3
@@ -16,6 +18,14 @@ LEAST_TRAVEL_M: Final = 1.0
 """A robot that drove less far may not have turned at all."""
 SIDEWAYS: Final = 0.1
 """Odometry without turns that moves sideways by a larger share of its travel has no heading."""
+FASTEST_M_S: Final = 10.0
+"""Larger speeds are those of no robot that maps a building."""
+LONG_STEP_M: Final = 0.02
+"""Shorter steps may be noise of a robot at rest."""
+ZIGZAG: Final = 0.2
+"""Share of the long steps that go back, of poses of two nodes; a robot rarely turns back."""
+LEAST_DURATION_S: Final = 10.0
+"""The stamps of a shorter drive may all be wrong."""
 
 
 @dataclass(slots=True)
@@ -29,6 +39,16 @@ class PathSummary:
     """Whether any two successive poses differ."""
     earliest: float = inf
     latest: float = -inf
+    _steps: int = 0
+    """Steps of known duration to another position."""
+    _fast: int = 0
+    """Those faster than any robot."""
+    _long: int = 0
+    """Those longer than noise."""
+    _back: int = 0
+    """Long ones against the direction of the one before."""
+    _direction: tuple[float, float] = (0.0, 0.0)
+    _stamp: float = 0.0
     _first: Pose | None = None
     _pose: Pose | None = None
     _sideways_m: float = 0.0
@@ -41,12 +61,21 @@ class PathSummary:
             self._first = pose
         elif pose != self._pose:
             self.moves = True
-            self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
+            x, y = pose[0] - self._pose[0], pose[1] - self._pose[1]
+            step_m = hypot(x, y)
+            self.length_m += step_m
+            if stamp > self._stamp:
+                self._steps += 1
+                self._fast += step_m > FASTEST_M_S * (stamp - self._stamp)
+                if step_m > LONG_STEP_M:
+                    self._long += 1
+                    self._back += x * self._direction[0] + y * self._direction[1] < 0.0
+                    self._direction = x, y
             if not self.says_something:
                 self._sideways_m += abs(relative_pose(self._pose, pose)[1])
                 self._leaves |= hypot(pose[0] - self._first[0], pose[1] - self._first[1]) > RESOLUTION_M
                 self._turns |= abs(remainder(pose[2] - self._first[2], tau)) > RESOLUTION_RAD
-        self._pose = pose
+        self._pose, self._stamp = pose, stamp
         self.count += 1
         self.earliest = min(self.earliest, stamp)
         self.latest = max(self.latest, stamp)
@@ -62,6 +91,19 @@ class PathSummary:
         return self._leaves and self._turns
 
     @property
+    def is_too_fast(self) -> bool:
+        """Whether the whole drive and most of its steps are faster than any robot; a jump alone does not count."""
+        is_fast = self.duration_s >= LEAST_DURATION_S and self.length_m > FASTEST_M_S * self.duration_s
+        return is_fast and 2 * self._fast > self._steps
+
+    @property
+    def zigzag(self) -> str | None:
+        """What these poses do if two nodes publish them, as the end of a sentence; None if they are of one."""
+        if self._back < FEWEST_POSES or self._back < ZIGZAG * self._long:
+            return None
+        return f"goes back and forth at {self._back} of {self._long} steps, as if two nodes published it"
+
+    @property
     def fault(self) -> str | None:
         """Why these poses are not odometry, as the end of a sentence; None if they can be."""
         if self.count < FEWEST_POSES or self.says_something:
@@ -71,6 +113,20 @@ class PathSummary:
         if self._leaves and self.length_m > LEAST_TRAVEL_M and self._sideways_m > SIDEWAYS * self.length_m:
             return f"moves sideways for {self._sideways_m:.1f} of {self.length_m:.1f} m: its heading is never set"
         return None
+
+
+def check_speed(path: Path, driven: PathSummary) -> None:
+    """Reject odometry in millimetres or centimetres.
+
+    Raises:
+        SourceError: the robot drives faster than any.
+    """
+    if driven.is_too_fast:
+        raise SourceError(
+            f"{path}: the odometry drives {driven.length_m:.0f} m in {driven.duration_s:.0f} s, as if in millimetres "
+            "or centimetres, or of two robots; correct it to metres, or map a bag without it by --sensors "
+            "odom-topic=none"
+        )
 
 
 def fault_of_odometry(poses: Iterable[Pose]) -> str | None:

@@ -7,7 +7,8 @@ nearest in the recording, not in time, so that a step back of the clock does not
 An image whose clock is ahead would hold the scans behind it. So once such a scan has its pose, the image waits no
 longer and gets the nearest pose.
 
-Odometry that jumps goes on as before the jump.
+Odometry that jumps goes on as before the jump. A reading that was recorded a little late, after one with a later stamp,
+counts at its time.
 
 Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
 nearest reading within 1 s, or none.
@@ -34,6 +35,8 @@ _AHEAD_S = 0.2
 """An image that is farther ahead of the newest reading than this holds no scan; by one clock, odometry is not later."""
 _READINGS_KEPT = 1000
 """Number of past readings that are searched for a scan."""
+_LATE_S, _MOST_LATE = 0.15, 3
+"""A reading may be recorded so long after one with a later stamp, and so many in a row, as over a network."""
 _LONGEST_QUEUE = 1000
 """Most waiting scans and readings; beyond, the oldest scan does not wait for later odometry."""
 
@@ -79,6 +82,8 @@ class OdometryPairing:
         self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
         self._queue: deque[_QueuedItem] = deque()
         self._bridge, self._updates = OdometryBridge(), OdometryUpdates()
+        self._late = 0
+        """Newest readings in a row that are earlier than the newest one in time."""
         self.images_ahead_s = 0.0
         """By how much the newest image that held a scan was ahead of the odometry; 0 without one."""
 
@@ -93,7 +98,9 @@ class OdometryPairing:
         if isinstance(item, OdometryReading):
             T_odom_base, is_after_jump = self._bridge.bridged(item.stamp, item.T_odom_base)
             item = item._replace(T_odom_base=T_odom_base, is_after_jump=is_after_jump)
-            if self._updates.is_fresh(item.stamp, item.T_odom_base):
+            if self._is_late(item.stamp):
+                _insert(readings, item)
+            elif self._updates.is_fresh(item.stamp, item.T_odom_base):
                 _assign_poses(queue, readings[-1] if readings else None, item)
                 readings.append(item)
             queue.append(_QueuedItem(number, item, _PoseMatch(item.T_odom_base, None)))
@@ -101,6 +108,12 @@ class OdometryPairing:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
         while queue and (self._is_complete(queue[0]) or len(queue) > _LONGEST_QUEUE or self._is_held_by_image()):
             yield _with_pose(queue.popleft(), readings)
+
+    def _is_late(self, stamp: float) -> bool:
+        """Whether a reading was recorded after later ones; several in a row are of a clock that stepped back."""
+        is_back = bool(self._readings) and 0.0 < self._readings[-1].stamp - stamp <= _LATE_S
+        self._late = self._late + 1 if is_back else 0
+        return 0 < self._late <= _MOST_LATE
 
     def _is_complete(self, waiting: _QueuedItem) -> bool:
         """Whether the odometry at the stamp and, for a scan, during its sweep is known.
@@ -194,6 +207,14 @@ def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, n
             waiting.match = _nearest_pose([previous, newest], stamp)
         elif stamp <= newest.stamp:
             waiting.match = _nearest_pose([newest], stamp)
+
+
+def _insert(readings: deque[OdometryReading], late: OdometryReading) -> None:
+    """Insert a late reading by its stamp."""
+    after = [readings.pop()]
+    while readings and late.stamp < readings[-1].stamp <= after[-1].stamp:
+        after.append(readings.pop())
+    readings.extend((late, *reversed(after)))
 
 
 def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | None:

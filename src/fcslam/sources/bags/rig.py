@@ -1,7 +1,7 @@
 """The mounted sensors of a robot: they turn its messages into records."""
 
 from collections.abc import Iterable, Sequence
-from math import degrees, radians
+from math import degrees, hypot, radians
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,8 @@ from fcslam.sources.images import check_image
 
 _LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
+_FARTHEST_M = 10.0
+"""Largest distance of a sensor from the base of a robot; a pose in millimetres or centimetres says more."""
 
 
 class MountingError(FcslamError):
@@ -94,9 +96,15 @@ def sensor_mounting(tree: TransformTree, base_frame: str, frame: str, kind: str,
 
     Raises:
         NoTransformError: tf does not say it.
-        MountingError: the laser ``name`` does not look along the floor.
+        MountingError: the laser ``name`` does not look along the floor, or is not on the robot.
     """
     mounted = mounting(tree.fixed(base_frame, frame))
+    away_m = hypot(*mounted.T_base_laser[:2])
+    if away_m > _FARTHEST_M:
+        raise MountingError(
+            f"tf puts the laser of {name} {away_m:.0f} m from '{base_frame}', as if in millimetres or centimetres; "
+            "correct it in tf, or give its pose with --sensors laser-pose=X,Y,THETA (metres, radians)"
+        )
     if kind not in LASER_SCANS:  # their scans are level
         return Mounting(mounted.T_base_laser, upside_down=False, tilt_rad=0.0)
     if mounted.tilt_rad > _STEEPEST_RAD:

@@ -35,10 +35,10 @@ from fcslam.sources.bags.robots import BagRobot, robots_of, slashed
 from fcslam.sources.bags.stream import BagStream, RecordedLaser
 from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError, TransformTree
-from fcslam.sources.contradictions import OdometryWatch
+from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.path_summary import FEWEST_POSES, PathSummary
+from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_speed
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -103,7 +103,7 @@ class RosBag:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
-        watch = OdometryWatch(audit)
+        watch = ScanWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
         found, faults = self._fixes
         fixes = deque(found)
@@ -209,6 +209,7 @@ class RosBag:
             *self.stream.robot.notes,
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
+            *self._zigzag_notes(odometry),
             *tilts,
             *camera_notes,
         )
@@ -245,12 +246,22 @@ class RosBag:
                 f"the first scan has the stamp {laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from "
                 f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
             )
+        check_speed(path, scans)
         jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
         if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
             raise SourceError(
                 f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
                 "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
             )
+
+    def _zigzag_notes(self, odometry: PathSummary) -> list[str]:
+        source, zigzag = self.stream.odometry, odometry.zigzag
+        if source is None or zigzag is None:
+            return []
+        return [
+            f"{self.stream.path}: {source.name} {zigzag}; stop one of them, or choose another odometry by --sensors "
+            "odom-topic, or none to map without"
+        ]
 
     def _first_errors(self) -> str:
         """The faults of the first invalid message of each topic, in brackets."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, Ranges, SensorRecord, frozen
-from fcslam.sources.contradictions import OdometryWatch
+from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
 from fcslam.sources.logs.archive import numbered_lines
@@ -33,7 +33,7 @@ from fcslam.sources.logs.laser import (
     tells_more,
 )
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
-from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_speed
 from fcslam.sources.pose import UNKNOWN_POSE, Pose
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -102,7 +102,7 @@ class TextLog:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = Audit()
-        watch = OdometryWatch(audit)
+        watch = ScanWatch(audit)
         (laser,) = self._reading.survey.lasers
         unit = self._dialect.metres_per_range_unit
         for number, entry in self._entries(scans, parse_ahead(self._all_lines(), unit), audit):
@@ -151,6 +151,7 @@ class TextLog:
         sample.check(path, "", "the unit of the ranges")
         pose_from_odometry = not scans.moves and odometry.moves
         driven = odometry if pose_from_odometry else scans
+        check_speed(path, driven)
         laser = laser_model(telling, parameters, mounting)
         notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
         notes += _spinning(laser, scans)

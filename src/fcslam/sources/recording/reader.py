@@ -28,7 +28,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.runs import read_tum
-from fcslam.sources.contradictions import OdometryWatch
+from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
@@ -95,7 +95,7 @@ class Recording:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
-        watch = OdometryWatch(audit)
+        watch = ScanWatch(audit)
         lasers, camera = self._survey.lasers, self._survey.camera
         with opened(self._path / RANGES) as ranges:
             for number, frame in self._entries(scans, audit):
