@@ -36,8 +36,8 @@ class Fault(StrEnum):
 WARNED_FROM = 10
 """Fewer faults of one kind give no warning."""
 _CONSEQUENCES = {
-    Fault.FROZEN_ODOMETRY: "the odometry stood still while the scans changed; from ten in a row on, scan matching alone "
-    "gives the motion",
+    Fault.FROZEN_ODOMETRY: "the odometry stood still while the scans changed; from ten in a row on, scan matching "
+    "alone gives the motion",
     Fault.NO_RETURN: "a laser saw nothing; odometry alone gives the motion there",
 }
 """What many faults of a kind mean for the map."""
