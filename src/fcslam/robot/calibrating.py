@@ -100,7 +100,8 @@ def _calibrate_facing(
     if (distance, turn) != (1.0, 1.0) or found.facing == Facing():
         fine = _calibrate_finely(bag, config, is_bent)
         scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
-        lines_before = () if _is_wrong(scale) else (f"{found}; not corrected",)
+        is_explained = _is_wrong(scale) or fine.correction.odometry_delay_s != 0.0  # by its scale, or another clock
+        lines_before = () if is_explained else (f"{found}; not corrected",)
         return replace(fine, lines=(*lines_before, *fine.lines))
     T_base_laser = np.array(bag.survey().lasers[0].T_base_laser)
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))

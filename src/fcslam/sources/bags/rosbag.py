@@ -243,8 +243,10 @@ class RosBag:
         if alone > scans.count:
             raise SourceError(
                 f"{path}: {alone} of {alone + scans.count} scans in {laser.topic.name} have no odometry within 1 s: "
-                f"the first scan has the stamp {laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from "
-                f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
+                f"message {faults[Fault.NO_ODOMETRY].first_line} is the first. The first scan has the stamp "
+                f"{laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from {odometry.earliest:.3f} s to "
+                f"{odometry.latest:.3f} s; record both by one clock, all the way, or map without odometry by --sensors "
+                "odom-topic=none"
             )
         check_speed(path, scans)
         jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
