@@ -127,7 +127,8 @@ class RobotFrontend:
         self.prediction: MotionPrediction | None = None
         """Stands in for the odometry; None if there is odometry."""
         self._config, self._mark = config, mark
-        self._repeated, self._mapped = RepeatedScans(), MappedScans(config.lidar.ignore, config.lidar.footprint)
+        self._repeated = RepeatedScans()
+        self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self._backend = InlineBackend(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")

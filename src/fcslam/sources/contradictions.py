@@ -78,7 +78,7 @@ class ScanWatch:
         if not self._repeated.admits(scan):
             self._audit.add(Fault.REPEATED_SCAN, number)
             return
-        if not has_return(scan.ranges_m, scan.laser.max_range_m):
+        if not count_returns(scan.ranges_m, scan.laser.max_range_m):
             self._audit.add(Fault.NO_RETURN, number)
         x, y, theta = scan.T_odom_base.tolist()
         if isnan(theta):
@@ -100,9 +100,9 @@ class ScanWatch:
             known.turn = seen
 
 
-def has_return(ranges_m: Ranges, max_range_m: float) -> bool:
-    """Whether a beam of a scan has a return below the maximum range."""
-    return bool(np.count_nonzero((ranges_m > 0.0) & (ranges_m < max_range_m)))
+def count_returns(ranges_m: Ranges, max_range_m: float) -> int:
+    """Number of beams of a scan with a return below the maximum range."""
+    return int(np.count_nonzero((ranges_m > 0.0) & (ranges_m < max_range_m)))
 
 
 def _repeats(before: LaserScan, after: LaserScan) -> bool:
@@ -111,7 +111,7 @@ def _repeats(before: LaserScan, after: LaserScan) -> bool:
         return False
     if before.ranges_m.tobytes() != after.ranges_m.tobytes():
         return False
-    return bool(np.count_nonzero(np.isfinite(after.ranges_m) & (after.ranges_m > 0.0)) >= FEWEST_RETURNS)
+    return count_returns(after.ranges_m, after.laser.max_range_m) >= FEWEST_RETURNS
 
 
 def stands_still(before: LaserScan, after: LaserScan) -> bool:
