@@ -259,18 +259,26 @@ class RobotFrontend:
         """The scan with its odometry free of jumps, or with a prediction if the scan has no odometry."""
         if self.prediction is None and self._wheels.say_nothing(scan):
             self.prediction = MotionPrediction()
-            if self._wheels.may_be_frozen:
-                self.scan_poses.cut(self._wheels.certain_s)
-                self._end_session()
-                self._process_deferred()  # in the new session
-            else:
-                self.begin_session()
+            self._begin_without_odometry(self.prediction)
         duration_s = self._config.lidar.scan_duration_s
         if scan.sweep is None and duration_s > 0.0:
             scan = replace(scan, sweep=Sweep(0.0, duration_s))
             if self.prediction is None and self._previous is not None:
                 scan = _moving_on(scan, self._previous)
         return self.odometry.scan(scan) if self.prediction is None else self.prediction.predict(scan)
+
+    def _begin_without_odometry(self, prediction: MotionPrediction) -> None:
+        """Begin a session whose motion is predicted, with the scans at which the odometry was frozen."""
+        frozen: list[LaserScan | CameraImage] = []
+        if self._wheels.may_be_frozen:
+            self.scan_poses.cut(self._wheels.certain_s)
+            frozen, self._deferred, self._T_local_deferred = self._deferred, [], None
+        self.begin_session()
+        for record in frozen:
+            if isinstance(record, LaserScan):
+                self._process_scan(prediction.predict(record))
+            else:
+                self._describe(replace(record, T_odom_base=None))
 
     def _observe(self, scan: LaserScan) -> None:
         """Predict the next scan from where this one was found."""
