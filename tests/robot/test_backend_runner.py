@@ -7,7 +7,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 import pytest
 
 from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Place
-from fcslam.robot.backend_runner import WorkerBackend, backend_process
+from fcslam.robot.backend_runner import BlockExecutor, WorkerBackend, backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
@@ -133,9 +133,10 @@ def contents_of(bodies):
     return [(type(body), getattr(body, "id", None), getattr(body, "j", None)) for body in bodies]
 
 
-def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans):
+@pytest.mark.parametrize("block", [1, 8])
+def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans, block):
     expected = driven(scans)[1]
-    with backend_process("r", CONFIG) as backend:
+    with backend_process("r", CONFIG, block) as backend:
         assert contents(driven(scans, backend)[1]) == contents(expected)
         worker = backend._executor.submit(os.getpid).result()
         for stop in (signal.SIGINT, signal.SIGTERM):  # meant for the robot, which ends the worker itself
@@ -145,3 +146,47 @@ def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothi
         robot, packets = driven(scans, backend)
         assert "BrokenProcessPool" in robot.backend_failure
         assert keyscans(packets) == keyscans(expected)
+
+
+def test_tasks_start_together_when_their_block_is_full_or_a_result_is_asked_for():
+    inner = Held()
+    inner.holds = True
+    executor = BlockExecutor(inner, 3)
+    squares = [executor.submit(pow, number, 2) for number in range(4)]
+    assert len(inner._tasks) == 1
+    inner.work()
+    inner.holds = False
+    assert [square.done() for square in squares] == [True, True, True, False]
+    assert [square.result() for square in squares] == [0, 1, 4, 9]
+
+
+def test_an_error_of_a_task_is_one_of_its_block_alone():
+    class Failing(Held):
+        def submit(self, function, /, *arguments):
+            future = Future()
+            try:
+                future.set_result(function(*arguments))
+            except ValueError as error:
+                future.set_exception(error)
+            return future
+
+    executor = BlockExecutor(Failing(), 2)
+    words = [executor.submit(int, word) for word in ("1", "one", "2", "3")]
+    assert [task.exception() is not None for task in words] == [True, True, False, False]
+
+
+def test_a_block_that_a_breaking_executor_loses_is_not_waited_for():
+    class Losing(Executor):
+        tasks = 0
+
+        def submit(self, *_):
+            self.tasks += 1
+            if self.tasks == 1:
+                return Future()
+            raise BrokenExecutor("it was killed")
+
+    executor = BlockExecutor(Losing(), 2)
+    tasks = [executor.submit(os.getpid) for _ in range(3)]
+    for task in reversed(tasks):
+        with pytest.raises(BrokenExecutor, match="it was killed"):
+            task.result(timeout=1.0)

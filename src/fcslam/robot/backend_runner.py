@@ -7,11 +7,11 @@ order.
 
 import os
 import signal
-from collections.abc import Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError, ProcessPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from fcslam.errors import FeatureError
 from fcslam.processes import obey_parent, worker_pool
@@ -64,6 +64,70 @@ class WorkerBackend:
         return self._executor.submit(_process, self._robot, input)
 
 
+class BlockExecutor(Executor):
+    """Passes tasks to another executor in blocks, as each transfer to another process wakes three threads.
+
+    A task waits until its block is full or its result is asked for. An error is an error of all tasks of the block.
+    """
+
+    def __init__(self, executor: Executor, size: int) -> None:
+        self._executor, self._size = executor, size
+        self._block: list[tuple[_BlockTask, Callable[..., Any], tuple[Any, ...]]] = []
+        self._unfinished: list[_BlockTask] = []
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[Any]":  # type: ignore[override]
+        """Add a task to the block."""
+        task = _BlockTask(self._start)
+        self._block.append((task, function, arguments))
+        if len(self._block) >= self._size:
+            self._start()
+        return task
+
+    def _start(self) -> None:
+        """Pass the block on."""
+        block, self._block = self._block, []
+        if not block:
+            return
+        tasks = [task for task, _, _ in block]
+        self._unfinished = [task for task in self._unfinished if not task.done()] + tasks
+        try:
+            results = self._executor.submit(_run_all, [(function, arguments) for _, function, arguments in block])
+        except BrokenExecutor as error:
+            for task in self._unfinished:  # also of a block that came while the executor broke: it may be lost (3.11)
+                with suppress(InvalidStateError):
+                    task.set_exception(error)
+            return
+        results.add_done_callback(lambda results: _hand_out(results, tasks))
+
+
+class _BlockTask(Future[Any]):
+    """The future of one task of a block."""
+
+    def __init__(self, start: Callable[[], None]) -> None:
+        super().__init__()
+        self._start = start
+
+    def result(self, timeout: float | None = None) -> Any:
+        """The result; starts the block."""
+        self._start()
+        return super().result(timeout)
+
+
+def _run_all(tasks: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]]) -> list[Any]:
+    return [function(*arguments) for function, arguments in tasks]
+
+
+def _hand_out(results: "Future[list[Any]]", tasks: Sequence[_BlockTask]) -> None:
+    """Give the tasks of a block that has ended their results."""
+    error = results.exception()
+    for number, task in enumerate(tasks):
+        with suppress(InvalidStateError):
+            if error is None:
+                task.set_result(results.result()[number])
+            else:
+                task.set_exception(error)
+
+
 def worker_process() -> ProcessPoolExecutor:
     """An executor with one worker, another process with a lower priority than this one.
 
@@ -92,10 +156,16 @@ def copied_worker() -> Iterator[ProcessPoolExecutor]:
 
 
 @contextmanager
-def backend_process(robot: str, config: SessionConfig) -> Iterator[WorkerBackend]:
-    """A back end in a process of its own, which ends with this block."""
+def backend_process(robot: str, config: SessionConfig, block: int = 1) -> Iterator[WorkerBackend]:
+    """A back end in a process of its own, which ends with this block.
+
+    Args:
+        robot: its name.
+        config: its settings.
+        block: inputs that go there together; 1 for a live robot.
+    """
     with copied_worker() as executor:
-        yield WorkerBackend(robot, config, executor)
+        yield WorkerBackend(robot, config, executor if block == 1 else BlockExecutor(executor, block))
 
 
 _backends: dict[str, RobotBackend] = {}
