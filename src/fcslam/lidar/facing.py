@@ -14,9 +14,11 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.lidar.leaning import floor_line
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.straightness import Excess, excess_of
 from fcslam.records import Beams, FloatArray, LaserScan
+from fcslam.sources.returns import FloorLine
 
 LEAST_MOVE_M: Final = 0.3
 LEAST_TURN_RAD: Final = 0.3
@@ -227,9 +229,9 @@ def _best(trial: "_Trial") -> tuple[Facing, dict[Facing, FloatArray]]:
     return max(near, key=lambda facing: trial.mean(trial.agreements(facing))), scores
 
 
-def wrong_laser(scans: Sequence[LaserScan]) -> Contradiction | Excess | None:
-    """What is wrong with how a laser measures or faces, by the scans of a ``FacingWatch``."""
-    return excess_of(scans) or contradicted_facing(scans)
+def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Excess | Contradiction | None:
+    """What is wrong with how a laser is mounted or measures, by the scans of a ``FacingWatch``."""
+    return floor_line(scans) or excess_of(scans) or contradicted_facing(scans)
 
 
 class FacingWatch:

@@ -52,6 +52,8 @@ Polygon = Annotated[
 """Corners in the order of the outline; empty: none."""
 
 FEWEST_PLACES, MOST_PLACES = 20, 200
+NOTHING_M: Final = 1e3
+"""Range of a degree without a return."""
 LARGEST_BODY_M: Final = 1.5
 """Farther returns are not of the robot."""
 SAME_M, STEADY = 0.05, 0.95
@@ -89,7 +91,7 @@ def body_sectors(scans: Iterable[LaserScan]) -> Sectors:
     turns = np.array([scan.T_odom_base[2] for scan in places])
     if len(places) < FEWEST_PLACES or np.hypot(np.cos(turns).mean(), np.sin(turns).mean()) > SHARPEST:
         return ()
-    ranges_m = np.stack([_by_degree(scan) for scan in places])
+    ranges_m = np.stack([by_degree(scan) for scan in places])
     middle_m = np.median(ranges_m, axis=0)
     steady = np.mean(np.abs(ranges_m - middle_m) < SAME_M, axis=0) > STEADY
     own = np.flatnonzero(steady & (middle_m < LARGEST_BODY_M))
@@ -108,11 +110,11 @@ def _sector(first_deg: int, last_deg: int) -> tuple[float, float]:
     return float(first_deg - turn_deg), float(last_deg - turn_deg)
 
 
-def _by_degree(scan: LaserScan) -> FloatArray:
-    """The least range in each degree of the headings in ``base``, shape (360,); 1e3 without one."""
+def by_degree(scan: LaserScan) -> FloatArray:
+    """The least range in each degree of the headings in ``base``, shape (360,); ``NOTHING_M`` without one."""
     is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
     degree = np.floor(np.remainder(_headings_deg(scan.laser), 360.0)).astype(np.intp) % 360
-    found = np.full(360, 1e3)
+    found = np.full(360, NOTHING_M)
     np.minimum.at(found, degree[is_return], scan.ranges_m[is_return].astype(np.float64))
     return found
 

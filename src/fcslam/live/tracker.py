@@ -21,6 +21,7 @@ from fcslam.live.records import EventKind, RobotEvent, RobotPose
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, LaserScan, SensorRecord, checked_pose, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
+from fcslam.sources.returns import FloorLine
 from fcslam.wire.messages import Packet
 
 UNDETERMINED_S = 1.0
@@ -68,7 +69,7 @@ class LiveTracker(ABC):
         self._is_finished = False
         self._facing: defaultdict[tuple[float, float, float], FacingWatch] = defaultdict(FacingWatch)
         """By the mounting of a laser."""
-        self._examined: deque[Future[Contradiction | Excess | None]] = deque()
+        self._examined: deque[Future[FloorLine | Excess | Contradiction | None]] = deque()
         """What the worker finds wrong with each laser: it takes as long as hundreds of scans."""
         self._told: set[str] = set()
         """Failures that were reported."""

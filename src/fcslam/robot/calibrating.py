@@ -21,6 +21,7 @@ from fcslam.lidar.facing import (
     turn_remedy,
 )
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
+from fcslam.lidar.leaning import floor_line
 from fcslam.lidar.own_body import body_sectors
 from fcslam.lidar.straightness import Excess, excess_of
 from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
@@ -31,6 +32,7 @@ from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.contradictions import RepeatedScans
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
+from fcslam.sources.returns import FloorLine
 from fcslam.sources.source import Noted, Source
 
 MOST_SCANS: Final = 1200
@@ -58,6 +60,8 @@ AT_ONCE_SHARE: Final = 0.15
 """Beams that take a smaller share of the time between scans are measured at once."""
 WHOLE_SHARE: Final = 0.05
 """A scanner that spins without a pause measures all the time between scans."""
+FLOOR_HALF_DEG: Final = 75
+"""Half of the sector in which a leaning laser sees the floor at most."""
 STAMP_TOLERANCE_S: Final = 0.005
 """Tolerance by which a delay is that of a stamp in the middle or at the end of a scan, and not of another clock."""
 
@@ -79,11 +83,21 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
         SourceError: the bag cannot be mapped.
     """
     contradictions = _contradictions(bag)
+    floors = tuple(found.floor for found in contradictions)
+    if not any(floors):
+        return _calibrate_level(bag, config, contradictions)
+    level = bag.corrected(BagCorrection(floors=floors), ())
+    calibrated = _calibrate_level(level, config, _contradictions(level))
+    lines = (*(f"{floor}; its returns are left out" for floor in filter(None, floors)), *calibrated.lines)
+    return replace(calibrated, correction=replace(calibrated.correction, floors=floors), lines=lines)
+
+
+def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Found]") -> Calibrated:
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
-        lines = (f"{laser.name}: {line}; not corrected" for laser, found in named for line in filter(None, found))
+        lines = (f"{laser.name}: {line}; not corrected" for laser, found in named for line in found.lines)
         return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
-    facing, excess = contradictions[0]
+    facing, excess, _ = contradictions[0]
     if excess is None:
         return _calibrate_facing(bag, config, facing)
     calibrated = _calibrate_facing(bag, config, facing, is_bent=True)
@@ -120,7 +134,16 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     Raises:
         SourceError: the recording cannot be mapped.
     """
-    return tuple(f"{source.name}: {line}" for found in _contradictions(source) for line in filter(None, found))
+    lines = []
+    for laser, found in zip(source.survey().lasers, _contradictions(source), strict=True):
+        lines += found.lines
+        if found.floor is not None:
+            middle_deg = round(math.degrees(se2.wrap_angle(found.floor.heading_rad + laser.T_base_laser[2])))
+            ignored = [middle_deg - FLOOR_HALF_DEG, middle_deg + FLOOR_HALF_DEG]
+            lines.append(
+                f"{found.floor}, or leave its beams out by the configuration: robot: {{lidar: {{ignore: [{ignored}]}}}}"
+            )
+    return tuple(f"{source.name}: {line}" for line in lines)
 
 
 def bodies_of(source: Source) -> tuple[str, ...]:
@@ -151,6 +174,12 @@ class _Found(NamedTuple):
 
     facing: Contradiction | None
     excess: Excess | None
+    floor: FloorLine | None
+
+    @property
+    def lines(self) -> list[str]:
+        """What cannot be corrected, but for the facing."""
+        return [str(found) for found in (self.facing, self.excess) if found is not None]
 
 
 def _contradictions(source: Source) -> list[_Found]:
@@ -158,7 +187,7 @@ def _contradictions(source: Source) -> list[_Found]:
     found = []
     for laser in source.survey().lasers:
         first = list(islice(_scans_of(laser, source), MOST_COMPARED))
-        found.append(_Found(contradicted_facing(first), excess_of(first)))
+        found.append(_Found(contradicted_facing(first), excess_of(first), floor_line(first)))
     return found
 
 

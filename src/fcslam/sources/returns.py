@@ -10,14 +10,15 @@
 """
 
 from collections.abc import Sequence
-from math import hypot, inf, remainder, tau
+from dataclasses import replace
+from math import degrees, hypot, inf, remainder, tau
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import FloatArray, Ranges, frozen
+from fcslam.records import FloatArray, LaserScan, Ranges, frozen
 from fcslam.sources.pose import Pose
 
 FEWEST_RETURNS = 0.02
@@ -48,6 +49,36 @@ _NEAR, _ABOVE_NEAR = 2, 5
 _FIRST, _KEPT = 20, 256
 """Scans that are kept wherever they are from, and most that are kept."""
 _APART_M, _APART_RAD = 0.3, 0.3
+
+
+_AT_FLOOR, _ASIDE = 0.88, 0.17
+"""Share of the distance of the floor from which on ranges are of it, as robots nod; and least cosine of the angle to
+its nearest point where it is seen."""
+
+
+class FloorLine(NamedTuple):
+    """The line in which a leaning laser sees the floor; it moves with the robot."""
+
+    distance_m: float
+    heading_rad: float
+    """Of its nearest point, among the angles of the beams."""
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        return (
+            f"the laser leans and sees the floor: a line {self.distance_m:.1f} m away, at "
+            f"{degrees(self.heading_rad):.0f} deg among its beams, moves with the robot; mount it level"
+        )
+
+    def mirrored(self) -> "FloorLine":
+        """As the laser sees it upside down."""
+        return self._replace(heading_rad=-self.heading_rad)
+
+    def left_out(self, scan: LaserScan) -> LaserScan:
+        """The scan with NaN, an invalid range, for what would be at the floor or beyond it."""
+        ahead = np.cos(scan.laser.angles_rad() - self.heading_rad)
+        is_floor = (ahead > _ASIDE) & (scan.ranges_m * ahead > _AT_FLOOR * self.distance_m)
+        return replace(scan, ranges_m=frozen(np.where(is_floor, np.float32(np.nan), scan.ranges_m), np.float32))
 
 
 class _Sample(NamedTuple):

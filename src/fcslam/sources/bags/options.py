@@ -5,6 +5,7 @@ from typing import Final
 
 from fcslam.sources.point_clouds import CloudBand
 from fcslam.sources.pose import Pose
+from fcslam.sources.returns import FloorLine
 
 NO_ODOMETRY: Final = "none"
 """In place of a topic of odometry: none is read."""
@@ -27,6 +28,8 @@ class BagCorrection:
     """``C`` of the true ``T_base_laser = C T_base_laser``."""
     upside_down: bool = False
     """Whether the laser is upside down where the bag says that it is upright, or the other way round."""
+    floors: tuple[FloorLine | None, ...] = ()
+    """Of each laser, mounted as the bag says: where it sees the floor, which is left out. Empty: none does."""
 
 
 @dataclass(frozen=True, slots=True)

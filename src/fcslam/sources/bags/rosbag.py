@@ -105,6 +105,8 @@ class RosBag:
         audit = self._audit = _audit()
         watch = ScanWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
+        correction = self._options.correction
+        floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
         found, faults = self._fixes
         fixes = deque(found)
         for kind, fault in faults.counts.items():
@@ -116,6 +118,8 @@ class RosBag:
                     yield fixes.popleft()
                 if values := placeholders[entry.scan.laser]:
                     record = replace(record, ranges_m=without(record.ranges_m, values))
+                if floors and (floor := floors[entry.scan.laser]) is not None:
+                    record = floor.left_out(record)
                 watch.add(number, record)
                 yield record
             elif isinstance(entry, OdometryReading):
@@ -294,9 +298,10 @@ class RosBag:
         return bool(self._options.laser_poses)
 
     def corrected(self, correction: BagCorrection, notes: tuple[str, ...]) -> "RosBag":
-        """The same bag, read with a correction that ``notes`` explain."""
+        """The same bag, read with a correction that ``notes`` explain; the floors of an earlier one stay left out."""
         if self.has_given_pose:
             correction = replace(correction, mounting=(0.0, 0.0, 0.0), upside_down=False)
+        correction = replace(correction, floors=correction.floors or self._options.correction.floors)
         options = replace(self._options, correction=correction)
         return RosBag(self.stream.path, self.name, options, (*self._notes, *notes), self.stream.robot)
 

@@ -1,0 +1,125 @@
+"""A laser that leans sees the floor in a line that moves with the robot: it is found, told and left out of the map."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.lidar.facing import FacingWatch, wrong_laser
+from fcslam.lidar.frontend import LidarConfig
+from fcslam.lidar.leaning import floor_line
+from fcslam.records import LaserModel, frozen
+from fcslam.robot.calibrating import calibrated
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.sources import open_source, write_bag
+from fcslam.sources.logs.carmen_writer import write_carmen
+from fcslam.sources.returns import FloorLine
+from tests.lidar import worlds
+
+pytestmark = pytest.mark.slow
+
+LASER = LaserModel(360, -math.pi, math.radians(1.0), 20.0, (0.2, 0.0, 0.5))
+POSES = worlds.ring_drive(rounds=1.5)
+SCANS = worlds.recording(POSES, POSES, worlds.ring(), LASER)
+
+
+def with_floor(floor, scans=SCANS, nod=0.02):
+    """Scans of a robot that nods, and whose laser sees the floor."""
+    rng = np.random.default_rng(2)
+
+    def ranges(scan):
+        ahead = np.cos(scan.laser.angles_rad() - floor.heading_rad)
+        distance_m = floor.distance_m * (1.0 + nod * rng.normal())
+        at_m = distance_m / np.maximum(ahead, 1e-3) + rng.normal(0.0, 0.02, len(ahead))
+        return frozen(np.minimum(scan.ranges_m, np.where(ahead > 0.1, at_m, np.inf)), np.float32)
+
+    return [replace(scan, ranges_m=ranges(scan)) for scan in scans]
+
+
+@pytest.mark.parametrize("floor", [FloorLine(2.0, 0.0), FloorLine(2.5, 1.0), FloorLine(1.5, -3.1)])
+def test_the_line_is_found(floor):
+    found = floor_line(with_floor(floor))
+    assert found.distance_m == pytest.approx(floor.distance_m, rel=0.06)
+    assert abs(se2.wrap_angle(found.heading_rad - floor.heading_rad)) < 0.05
+    scans = [scan for scan in with_floor(floor) for scan in (scan, scan)]
+    assert floor_line(scans) == found, "scans at one place count once"
+
+
+def test_level_lasers_and_short_or_straight_drives_tell_nothing():
+    leaning = with_floor(FloorLine(2.0, 0.0))
+    assert floor_line(SCANS) is None
+    assert floor_line(leaning[:100]) is None
+    straight = [replace(scan, T_odom_base=frozen((0.4 * k, 0.0, 0.0))) for k, scan in enumerate(leaning)]
+    assert floor_line(straight) is None
+    assert floor_line(replace(scan, T_odom_base=frozen((math.nan,) * 3)) for scan in leaning) is None
+
+
+def test_walls_at_one_distance_along_a_corridor_are_no_floor():
+    ahead = [(x, 0.0, 0.0) for x in np.arange(0.0, 20.0, 0.3)]
+    turning = [(20.0, 0.0, angle) for angle in np.arange(0.0, math.pi, 0.35)]
+    back = [(x, 0.0, math.pi) for x in np.arange(20.0, 0.0, -0.3)]
+    poses = np.array([*ahead, *turning, *back, *((0.0, 0.0, math.pi + angle) for _, _, angle in turning)])
+    assert floor_line(worlds.recording(poses, poses, worlds.corridor(), LASER)) is None
+
+
+def test_a_round_room_is_no_floor():
+    angles = np.linspace(0.0, 2.0 * math.pi, 73)
+    round_room = worlds.path(*np.stack((2.5 * np.cos(angles), 2.5 * np.sin(angles)), axis=1))
+    poses = np.array([(0.0, 0.0, 0.35 * k) for k in range(120)])
+    assert floor_line(worlds.recording(poses, poses, round_room, replace(LASER, T_base_laser=(0.0, 0.0, 0.0)))) is None
+
+
+def test_what_is_at_the_line_or_beyond_is_left_out_and_nothing_else():
+    floor = FloorLine(2.0, 0.7)
+    angles = LASER.angles_rad()
+    scan = replace(SCANS[0], ranges_m=frozen(np.full(360, 1.5), np.float32))
+    assert np.array_equal(floor.left_out(scan).ranges_m, scan.ranges_m)
+    for far in (3.0, np.inf):
+        kept = np.isfinite(floor.left_out(replace(scan, ranges_m=frozen(np.full(360, 3.0), np.float32))).ranges_m)
+        assert np.array_equal(kept, 3.0 * np.cos(angles - 0.7) <= 0.88 * 2.0)
+        nothing = floor.left_out(replace(scan, ranges_m=frozen(np.full(360, far), np.float32))).ranges_m
+        assert np.isnan(nothing[np.cos(angles - 0.7) > 0.6]).all()
+
+
+def largest_error_m(source):
+    """Of the positions of all scans in the local map of a robot."""
+    robot = RobotFrontend("r", RobotConfig())
+    for record in source.records():
+        robot.process(record)
+    robot.finish()
+    (track,) = robot.tracks
+    return worlds.pose_errors(track.T_odom_base(), POSES)[0].max()
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_a_bag_is_mapped_without_the_floor(tmp_path, upside_down):
+    path = tmp_path / "leaning.bag"
+    write_bag(path, with_floor(FloorLine(2.0, 0.4)))
+    bag = open_source(path)
+    if upside_down:  # as tf says; the scans tell that it is not
+        bag = bag.corrected(replace(bag._options.correction, upside_down=True), ())
+    source = calibrated(bag, LidarConfig())
+    said = [note for note in source.survey().notes if "sees the floor" in note]
+    assert len(said) == 1
+    assert "a line 2." in said[0]
+    assert said[0].endswith("mount it level; its returns are left out")
+    assert largest_error_m(source) < 0.1
+    assert upside_down or largest_error_m(bag) > 0.3
+
+
+def test_a_log_names_the_beams_to_leave_out(tmp_path):
+    path = tmp_path / "leaning.log"
+    write_carmen(path, with_floor(FloorLine(2.0, 0.0), scans=SCANS))
+    notes = calibrated(open_source(path), LidarConfig()).survey().notes
+    (said,) = (note for note in notes if "sees the floor" in note)
+    assert "robot: {lidar: {ignore: [[" in said
+
+
+def test_a_live_robot_is_told():
+    poses = worlds.drive(3 * [(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.15)
+    scans = worlds.recording(poses, poses, worlds.room(), LASER)
+    watch = FacingWatch()
+    (watched,) = (found for scan in with_floor(FloorLine(2.0, 0.0), scans) if (found := list(watch.add(scan))))
+    assert "the laser leans and sees the floor: a line 2." in str(wrong_laser(watched))
