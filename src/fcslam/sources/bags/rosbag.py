@@ -209,6 +209,7 @@ class RosBag:
             *self.stream.robot.notes,
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
+            *self._clock_notes(),
             *self._zigzag_notes(odometry),
             *tilts,
             *camera_notes,
@@ -238,6 +239,15 @@ class RosBag:
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
+        clocks = self.stream.clocks
+        lost = [(name, clock) for name, clock in clocks.items() if clock.is_unset and not clock.is_recorded]
+        if 0 < len(lost) < len(clocks):  # all with the same stamps keep their order
+            name, clock = lost[0]
+            raise SourceError(
+                f"{path}: {clock.repeats} messages of {name} repeat the stamp of the one before, and "
+                "its time of recording, so nothing says when they were made; let the driver set the stamps, with their "
+                "nanoseconds, and record again"
+            )
         check_consistency(path, faults, scans.count, odometry.count, self._first_errors())
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
@@ -255,6 +265,14 @@ class RosBag:
                 f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
                 "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
             )
+
+    def _clock_notes(self) -> list[str]:
+        return [
+            f"{self.stream.path}: {clock.repeats} messages of {name} repeat the stamp of the one "
+            "before, so their times of recording are used; let the driver set the stamps, with their nanoseconds"
+            for name, clock in self.stream.clocks.items()
+            if clock.is_unset and clock.is_recorded
+        ]
 
     def _zigzag_notes(self, odometry: PathSummary) -> list[str]:
         source, zigzag = self.stream.odometry, odometry.zigzag

@@ -12,7 +12,7 @@ from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Sweep
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
-from fcslam.sources.bags.census import CountedBag
+from fcslam.sources.bags.census import Clock, CountedBag
 from fcslam.sources.bags.clouds import CloudMessage, cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, ODOMETRY, SCANS
 from fcslam.sources.bags.container import RawMessage, Topic
@@ -333,6 +333,15 @@ class BagStream:
             self.odometry_notes.append(f"{self.path}: {candidate.name} {fault}, so it is not used")
         self.odometry_notes.append(f"{self.path}: {WITHOUT_ODOMETRY}")
         return None
+
+    @cached_property
+    def clocks(self) -> dict[str, Clock]:
+        """The stamps of the lasers and of the odometry that are read, by the names of these."""
+        read = {(topic, "", ""): topic.name for topic in self.topics.scans}
+        if self.odometry is not None:
+            read |= {(topic, *(self.odometry.edge or ("", ""))): self.odometry.name for topic in self.odometry.topics}
+        clocks = self.bag.census.clocks
+        return {name: clocks[stamped] for stamped, name in read.items() if stamped in clocks}
 
     @cached_property
     def _scans_change(self) -> bool:
