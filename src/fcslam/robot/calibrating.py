@@ -15,7 +15,6 @@ from fcslam.lidar.facing import (
     MOST_COMPARED,
     WHEELS,
     Contradiction,
-    Facing,
     contradicted_facing,
     distance_remedy,
     turn_remedy,
@@ -96,8 +95,8 @@ def _calibrate_facing(
     """Calibrate a bag with one laser; ``is_bent``: its ranges are no distances, so they do not tell where it sits."""
     if found is None:
         return _calibrate_finely(bag, config, is_bent)
-    turned_deg, upside_down, distance, turn = found.facing
-    if (distance, turn) != (1.0, 1.0) or found.facing == Facing():
+    turned_deg, upside_down, distance, _ = found.facing
+    if not found.is_correctable:
         fine = _calibrate_finely(bag, config, is_bent)
         scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
         is_explained = _is_wrong(scale) or fine.correction.odometry_delay_s != 0.0  # by its scale, or another clock
@@ -120,7 +119,19 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     Raises:
         SourceError: the recording cannot be mapped.
     """
-    return tuple(f"{source.name}: {line}" for found in _contradictions(source) for line in filter(None, found))
+    lines = (
+        [found.facing and (str if isinstance(source, RosBag) else _without_tf)(found.facing), found.excess]
+        for found in _contradictions(source)
+    )
+    return tuple(f"{source.name}: {line}" for each in lines for line in filter(None, each))
+
+
+def _without_tf(found: Contradiction) -> str:
+    """What speaks against a laser whose mounting no option gives."""
+    return found.line(
+        "write the recording as a bag by `fcslam record` and map that, which corrects the mounting of one laser; or "
+        "correct the signs of the odometry"
+    )
 
 
 def bodies_of(source: Source) -> tuple[str, ...]:
