@@ -17,6 +17,7 @@ from fcslam.records import LaserModel, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source, write_bag
 from tests.sources.bag_messages import (
+    LASER_POSE,
     Said,
     drive,
     mounted,
@@ -135,6 +136,23 @@ def test_a_missing_transform_is_named_with_the_way_out(tmp_path):
     message = refusal(save(tmp_path / "run.bag", drive(20)[1:]))
     assert "no transform from 'base_link' to 'laser'" in message
     assert "--sensors laser-pose" in message
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_laser_with_a_second_parent_is_where_the_base_says(tmp_path, is_first):
+    stray = tf(99.0 if is_first else 101.0, "camera", "laser", (9.0, 0.0, 0.0), topic="/tf_static")
+    source = open_source(save(tmp_path / "run.bag", [stray, *drive(20)]))
+    assert source.survey().scan_count == 20
+    assert source.survey().lasers[0].T_base_laser == pytest.approx(LASER_POSE)
+    (note,) = source.survey().notes
+    first, second = ("camera", "base_link") if is_first else ("base_link", "camera")
+    assert f"'laser' is in '{first}' and in '{second}'; the pose below 'base_link' is used" in note
+
+
+def test_a_laser_with_two_poses_names_both_parents(tmp_path):
+    stray = [tf(101.0, "chassis", "laser"), tf(101.0, "base_link", "chassis")]
+    message = refusal(save(tmp_path / "run.bag", [*stray, *drive(20)]))
+    assert "tf has two transforms from 'base_link' to 'laser' ('laser' is in 'base_link' and in 'chassis'" in message
 
 
 def test_a_laser_that_moves_on_the_robot(tmp_path):

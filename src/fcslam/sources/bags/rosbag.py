@@ -189,6 +189,12 @@ class RosBag:
             for its, mounted in zip(of_several, mountings, strict=True)
             if (tilt := tilt_note(mounted))
         )
+        placed = dict.fromkeys(
+            () if self.has_given_pose else (tree.placed(each.first.frame) for each in self.stream.lasers)
+        )
+        several_parents = (
+            f"{self.stream.path}: {frames}; the pose below '{base_frame}' is used" for frames in placed if frames
+        )
         unlimited = (
             f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
             for laser, its_m in zip(self.stream.lasers, farthest_m, strict=True)
@@ -212,6 +218,7 @@ class RosBag:
             *self._clock_notes(),
             *self._zigzag_notes(odometry),
             *tilts,
+            *several_parents,
             *camera_notes,
         )
         rig = rig_of([laser.first for laser in self.stream.lasers], farthest_m, mountings, camera)
