@@ -626,6 +626,23 @@ def test_a_laser_mounted_in_centimetres_or_millimetres(tmp_path, name, away):
 
 
 @pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("period_s", [0.02, 0.1])
+def test_headings_in_degrees(tmp_path, name, period_s):
+    """The robot turns by 0.4 rad/s on average."""
+    times = np.arange(0.0, 20.0, period_s)
+    headings = 0.4 * times + 0.5 * np.sin(0.7 * times)
+    for unit in (1.0, 180.0 / math.pi):
+        poses = np.column_stack((np.cumsum(np.cos(headings)), np.cumsum(np.sin(headings)), unit * headings))
+        poses *= 0.5 * period_s, 0.5 * period_s, 1.0
+        readings = [odom(100.0 + at, pose) for at, pose in zip(times.tolist(), poses.tolist(), strict=True)]
+        bag = save(tmp_path / f"{unit:.0f}-{name}", [*readings, *without(drive(90), "/odom")])
+        if unit == 1.0:
+            assert not open_source(bag).survey().notes
+        else:
+            assert "rad in 20 s, as if in degrees" in refusal(bag)
+
+
+@pytest.mark.parametrize("name", FILES)
 def test_odometry_of_two_nodes_that_differ_a_little_is_noticed(tmp_path, name):
     said = drive()
     times = [0.1 * k + 0.03 for k in range(80)]

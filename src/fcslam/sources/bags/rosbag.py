@@ -38,7 +38,7 @@ from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformErr
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_speed
+from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_units
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -265,12 +265,18 @@ class RosBag:
                 f"{odometry.latest:.3f} s; record both by one clock, all the way, or map without odometry by --sensors "
                 "odom-topic=none"
             )
-        check_speed(path, scans)
+        check_units(path, scans)
         jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
         if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
             raise SourceError(
                 f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
                 "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
+            )
+
+        if source is not None and (spins := odometry.spins) is not None:
+            raise SourceError(
+                f"{path}: {source.name} {spins}, as if in degrees, or of two robots; publish a quaternion made from "
+                "radians, or map without it by --sensors odom-topic=none"
             )
 
     def _clock_notes(self) -> list[str]:
