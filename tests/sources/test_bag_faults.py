@@ -486,6 +486,12 @@ def test_a_bag_that_is_compressed_as_a_whole_by_zstd(tmp_path):
     assert len(scans_of(open_source(folder))) == 20
 
 
+def test_a_folder_whose_file_was_not_fetched(tmp_path):
+    folder = save(tmp_path / "run", drive(20))
+    (folder / "run.mcap").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    assert "run.mcap: is a pointer of Git LFS and not the recording; fetch that by `git lfs pull`" in refusal(folder)
+
+
 def test_messages_that_are_compressed_one_by_one_are_read_without_their_metadata(tmp_path):
     folder = save(tmp_path / "run", drive(20), "message")
     (file,) = folder.glob("run.*")

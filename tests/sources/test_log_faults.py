@@ -15,6 +15,8 @@ from fcslam.errors import SourceError
 from fcslam.sources import Fault, FaultCount, open_source
 from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
 
+LOG = "\n".join(drive(3)) + "\n"
+
 
 def refusal(path):
     """The message that refuses ``path`` before any record is read."""
@@ -44,6 +46,13 @@ def written(path: Path, content: bytes) -> Path:
         (b"\x1f\x8b\x08\x00garbage", "truncated or damaged"),
         (b"\xfd7zXZ\x00garbage", "truncated or damaged"),
         (b"BZh9garbage", "cannot be read"),
+        (LOG.encode("utf-16"), "is text in UTF-16; convert it by `iconv"),
+        (LOG.replace("\n", "\r").encode(), "has lines that end with CR alone; convert them by `tr"),
+        (gzip.compress(LOG.replace("\n", "\r").encode(), mtime=0), "has lines that end with CR alone"),
+        (b"PK\x03\x04" + bytes(60), "is a zip archive; unpack it"),
+        (b"run/".ljust(257, b"\0") + b"ustar" + bytes(250), "is a tar archive; unpack it"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "is a pointer of Git LFS"),
+        (b"<!DOCTYPE html><html><body>Sign in</body></html>\n", "is a web page"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, content, reason):
