@@ -32,7 +32,7 @@ from fcslam.sources.bags.rig import usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
 from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad, joined_turns
 from fcslam.sources.bags.topics import Candidates, Topics, calibration_beside, choose_topics, find_candidates
-from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree, is_fixed
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE
@@ -439,6 +439,12 @@ class BagStream:
         try:
             return cloud_mounting(self.tree.fixed(self._base_frame_of(frame), frame))
         except NoTransformError as error:
+            if is_fixed(frame):
+                raise SourceError(
+                    f"{self.path}: the points of {topic.name} are in '{frame}', in which the robot drives, so another "
+                    "node has moved them; record the clouds of the sensor's driver, or choose them by --sensors "
+                    "scan-topic"
+                ) from error
             raise SourceError(
                 f"{self.path}: tf has {error}, so the pose of the sensor of {topic.name} is unknown; give it "
                 "with --sensors laser-pose=X,Y,THETA (metres, radians)"

@@ -39,6 +39,8 @@ USUAL_BASES = ("base_footprint", "base_link")
 """Frames of the robot's body, where no message names it."""
 _NO_ODOMETRY = ("map", *USUAL_BASES)
 """Frames in which a robot jumps, or in which its joints move."""
+_FIXED = ("map", "world", "camera_init")
+"""Frames in which a robot drives, besides that of its odometry; the last is of LOAM and its successors."""
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -198,6 +200,11 @@ def last_part(name: str) -> str:
 def is_odom(frame: str) -> bool:
     """Whether odometry is usually in a frame of this name."""
     return "odom" in last_part(frame)
+
+
+def is_fixed(frame: str) -> bool:
+    """Whether a frame of this name usually stands on the floor."""
+    return is_odom(frame) or last_part(frame) in _FIXED
 
 
 def _matches(link: Link, parent: str | None, child: str | None) -> bool:
