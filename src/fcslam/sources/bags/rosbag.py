@@ -35,7 +35,7 @@ from fcslam.sources.bags.robots import BagRobot, robots_of, slashed
 from fcslam.sources.bags.stream import BagStream, RecordedLaser
 from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError, TransformTree
-from fcslam.sources.contradictions import ScanWatch
+from fcslam.sources.contradictions import Alternation, ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_units
@@ -157,6 +157,7 @@ class RosBag:
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in self.stream.lasers]
         bodies = [BodySample() for _ in self.stream.lasers]
+        alternations = [Alternation() for _ in self.stream.lasers]
         farthest_m = [laser.first.range_max_m for laser in self.stream.lasers]
         base_frame = self._options.base_frame or ""
         self.stream.count_broken_transforms(audit)
@@ -164,6 +165,7 @@ class RosBag:
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
                 farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
+                alternations[laser].add(entry.scan.raw_ranges_m)
                 if self.stream.lasers[laser].topic.type not in LASER_SCANS:
                     bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
                 if (sample := samples[laser]).wants(entry.T_odom_base):
@@ -173,6 +175,13 @@ class RosBag:
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
+        for recorded, found in zip(self.stream.lasers, alternations, strict=True):
+            if found.is_certain:
+                raise SourceError(
+                    f"{self.stream.path}: the scans of {recorded.name} alternate between two views at "
+                    f"{found.alternating} of {found.count} scans, as of two lasers or robots publishing on one topic; "
+                    "give each robot its own namespace, and each laser its own topic or frame, and record again"
+                )
         self._refuse(audit.faults(), scans, odometry)
         which = [f" of {laser.name}" for laser in self.stream.lasers]
         for sample, its, recorded in zip(samples, which, self.stream.lasers, strict=True):
