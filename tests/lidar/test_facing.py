@@ -149,6 +149,19 @@ def test_a_log_says_that_its_laser_faces_another_way(tmp_path):
     assert len(list(source.records())) == source.survey().scan_count
 
 
+@pytest.mark.parametrize(("turned_deg", "upside_down"), [(180, False), (0, True)])
+def test_what_a_log_says_to_do_about_its_laser_is_true(tmp_path, turned_deg, upside_down):
+    write_carmen(tmp_path / "wrong.clf", stated(drive(NARROW), turned_deg, upside_down))
+    log = open_source(tmp_path / "wrong.clf")
+    note = calibrated(log, LidarConfig()).survey().notes[-1]
+    assert "write the recording as a bag by `fcslam record` and map that" in note
+    assert "--sensors" not in note, "an option of bags"
+    write_bag(tmp_path / "wrong.mcap", log.records())
+    corrected = calibrate_bag(open_source(tmp_path / "wrong.mcap"), LidarConfig()).correction
+    assert corrected.upside_down == upside_down
+    assert math.remainder(math.degrees(corrected.mounting[2]) - turned_deg, 360.0) == pytest.approx(0.0, abs=3.0)
+
+
 def test_a_laser_may_be_given_upside_down(tmp_path):
     scans = drive(NARROW)[:20]
     path = tmp_path / "wrong.mcap"

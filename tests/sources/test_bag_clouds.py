@@ -139,6 +139,19 @@ def test_a_cloud_without_a_mounting_is_refused_in_one_line(tmp_path):
     assert misfit_m(by_hand.records()) < 0.01
 
 
+@pytest.mark.parametrize(("frame", "has_tf"), [("odom", True), ("odom", False), ("camera_init", False)])
+def test_clouds_that_another_node_moved_are_refused_with_what_to_record(tmp_path, frame, has_tf):
+    messages = [each for each in drive() if each.topic != "/points"]
+    for t in np.arange(0.1, 2.0, 0.1).round(3).tolist():
+        messages.append(said("/points", START + t, cloud(START + t, seen(t), VELODYNE, frame)))
+        x, y, theta = pose_at([t])[0].tolist()
+        messages += [tf(START + t, "odom", "base_link", (x, y, 0.0), quaternion(theta))] * has_tf
+    with pytest.raises(
+        SourceError, match=f"in '{frame}', in which the robot drives, so another node has moved them; record"
+    ):
+        open_source(save(tmp_path / "moved.mcap", messages)).survey()
+
+
 def test_invalid_clouds_are_refused_by_their_field(tmp_path):
     messages = [each for each in drive() if each.topic != "/points"]
     measured = spinning(pose_at, rings=2, columns=90)

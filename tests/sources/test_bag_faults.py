@@ -13,9 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
+from fcslam.records import LaserModel, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source
+from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source, write_bag
 from tests.sources.bag_messages import (
+    LASER_POSE,
     Said,
     drive,
     mounted,
@@ -136,6 +138,23 @@ def test_a_missing_transform_is_named_with_the_way_out(tmp_path):
     assert "--sensors laser-pose" in message
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_laser_with_a_second_parent_is_where_the_base_says(tmp_path, is_first):
+    stray = tf(99.0 if is_first else 101.0, "camera", "laser", (9.0, 0.0, 0.0), topic="/tf_static")
+    source = open_source(save(tmp_path / "run.bag", [stray, *drive(20)]))
+    assert source.survey().scan_count == 20
+    assert source.survey().lasers[0].T_base_laser == pytest.approx(LASER_POSE)
+    (note,) = source.survey().notes
+    first, second = ("camera", "base_link") if is_first else ("base_link", "camera")
+    assert f"'laser' is in '{first}' and in '{second}'; the pose below 'base_link' is used" in note
+
+
+def test_a_laser_with_two_poses_names_both_parents(tmp_path):
+    stray = [tf(101.0, "chassis", "laser"), tf(101.0, "base_link", "chassis")]
+    message = refusal(save(tmp_path / "run.bag", [*stray, *drive(20)]))
+    assert "tf has two transforms from 'base_link' to 'laser' ('laser' is in 'base_link' and in 'chassis'" in message
+
+
 def test_a_laser_that_moves_on_the_robot(tmp_path):
     said = [tf(100 + k, "base_link", "laser", (0.1 * k, 0.0, 0.0)) for k in range(4)]
     assert "'laser' moves in 'base_link'" in refusal(save(tmp_path / "run.bag", drive(20)[1:] + said))
@@ -173,6 +192,78 @@ def test_clocks_that_differ_also_in_the_times_of_recording(tmp_path):
 
 
 # Time
+
+
+def whole_seconds(said, topics, recorded=False):
+    """The messages of some topics without nanoseconds; ``recorded``: also in the times of recording."""
+    for each in said:
+        stamp = math.floor(each.fields["stamp"]) if each.topic in topics else each.fields["stamp"]
+        bag_time = stamp if recorded and each.topic in topics else each.bag_time
+        yield each._replace(fields={**each.fields, "stamp": stamp}, bag_time=bag_time)
+
+
+@pytest.mark.parametrize("topics", [("/scan",), ("/odom",), ("/scan", "/odom")])
+@pytest.mark.parametrize("name", FILES)
+def test_stamps_without_nanoseconds_give_way_to_the_times_of_recording(tmp_path, name, topics):
+    usual = scans_of(open_source(save(tmp_path / f"usual-{name}", drive())))
+    source = open_source(save(tmp_path / name, whole_seconds(drive(), topics)))
+    for expected, found in zip(usual, scans_of(source), strict=True):
+        assert found.stamp == pytest.approx(expected.stamp, abs=0.03)
+        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=0.03)
+    (*_, note) = source.survey().notes
+    assert f"messages of {topics[-1]} repeat the stamp of the one before, so their times of recording are used" in note
+
+
+def test_odometry_without_nanoseconds_of_a_robot_that_mostly_stands(tmp_path):
+    still = [odom(60.0 + 0.1 * k, pose_at(-0.1)) for k in range(390)]
+    source = open_source(save(tmp_path / "run.bag", whole_seconds([*still, *drive()], ("/odom",))))
+    assert any("messages of /odom repeat the stamp of the one before" in note for note in source.survey().notes)
+
+
+def test_odometry_in_tf_without_nanoseconds(tmp_path):
+    said = [
+        tf(each.bag_time, "odom", "base_link", each.fields["at"], each.fields["rotation"], bag_time=each.bag_time)
+        if each.topic == "/odom"
+        else each
+        for each in drive()
+    ]
+    usual = scans_of(open_source(save(tmp_path / "usual.bag", said)))
+    source = open_source(save(tmp_path / "run.bag", whole_seconds(said, ("/tf",))))
+    for expected, found in zip(usual, scans_of(source), strict=True):
+        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=0.03)
+    assert any("messages of tf from odom to base_link repeat the stamp" in note for note in source.survey().notes)
+
+
+def test_stamps_without_nanoseconds_that_were_recorded_with_them(tmp_path):
+    message = refusal(save(tmp_path / "run.bag", whole_seconds(drive(), ("/scan",), recorded=True)))
+    assert "32 messages of /scan repeat the stamp of the one before, and its time of recording" in message
+
+
+def test_a_bag_from_a_log_with_whole_seconds_keeps_its_order(tmp_path):
+    poses = [(100 + k // 5, pose_at(0.2 * k)) for k in range(40)]
+    scans = [
+        LaserScan(stamp, np.full(8, 1.0 + 0.01 * k, np.float32), LaserModel(8, -1.0, 0.25, 20.0), np.array(pose))
+        for k, (stamp, pose) in enumerate(poses)
+    ]
+    write_bag(tmp_path / "run.bag", scans)
+    source = open_source(tmp_path / "run.bag")
+    for k, found in enumerate(scans_of(source)):
+        np.testing.assert_allclose(found.T_odom_base, poses[k][1], atol=1e-6)
+    assert not source.survey().notes
+
+
+def test_odometry_that_is_published_again_keeps_its_stamps(tmp_path):
+    said = [
+        each._replace(bag_time=each.bag_time + 0.01 * k)
+        for each in drive()
+        for k in range(3 if each.topic == "/odom" else 1)
+    ]
+    source = open_source(save(tmp_path / "run.bag", said))
+    for expected, found in zip(
+        scans_of(open_source(save(tmp_path / "usual.bag", drive()))), scans_of(source), strict=True
+    ):
+        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=1e-6)
+    assert not source.survey().notes
 
 
 def test_three_recordings_put_together(tmp_path):
@@ -395,6 +486,12 @@ def test_a_bag_that_is_compressed_as_a_whole_by_zstd(tmp_path):
     assert len(scans_of(open_source(folder))) == 20
 
 
+def test_a_folder_whose_file_was_not_fetched(tmp_path):
+    folder = save(tmp_path / "run", drive(20))
+    (folder / "run.mcap").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    assert "run.mcap: is a pointer of Git LFS and not the recording; fetch that by `git lfs pull`" in refusal(folder)
+
+
 def test_messages_that_are_compressed_one_by_one_are_read_without_their_metadata(tmp_path):
     folder = save(tmp_path / "run", drive(20), "message")
     (file,) = folder.glob("run.*")
@@ -532,6 +629,23 @@ def test_a_laser_mounted_in_centimetres_or_millimetres(tmp_path, name, away):
     pose = tf(100.0, "base_link", "laser", (away, 0.0, 0.3), quaternion(0.0), topic="/tf_static")
     said = [pose, *without(drive(), "/tf_static")]
     assert f"puts the laser of /scan {away:.0f} m from 'base_link'" in refusal(save(tmp_path / name, said))
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("period_s", [0.02, 0.1])
+def test_headings_in_degrees(tmp_path, name, period_s):
+    """The robot turns by 0.4 rad/s on average."""
+    times = np.arange(0.0, 20.0, period_s)
+    headings = 0.4 * times + 0.5 * np.sin(0.7 * times)
+    for unit in (1.0, 180.0 / math.pi):
+        poses = np.column_stack((np.cumsum(np.cos(headings)), np.cumsum(np.sin(headings)), unit * headings))
+        poses *= 0.5 * period_s, 0.5 * period_s, 1.0
+        readings = [odom(100.0 + at, pose) for at, pose in zip(times.tolist(), poses.tolist(), strict=True)]
+        bag = save(tmp_path / f"{unit:.0f}-{name}", [*readings, *without(drive(90), "/odom")])
+        if unit == 1.0:
+            assert not open_source(bag).survey().notes
+        else:
+            assert "rad in 20 s, as if in degrees" in refusal(bag)
 
 
 @pytest.mark.parametrize("name", FILES)

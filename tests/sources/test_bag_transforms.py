@@ -120,6 +120,35 @@ def test_a_frame_that_two_robots_have_is_that_of_the_own_base():
             tree.fixed(base, "laser")
 
 
+@pytest.mark.parametrize("parents", [("base", "camera"), ("camera", "base"), ("base", "odom"), ("odom", "base")])
+def test_a_second_parent_that_leads_elsewhere_changes_nothing(parents):
+    tree = TransformTree()
+    for k in range(3):
+        for parent in parents:
+            tree.add(parent, "laser", placed(0.1 if parent == "base" else 7.0))
+        tree.add("odom", "base", placed(0.1 * k))
+    assert tree.fixed("base", "laser").translation_m[0] == 0.1
+    assert tree.odometry_link("laser") == ("odom", "base")
+
+
+def test_two_parents_that_disagree_are_named():
+    tree = TransformTree()
+    tree.add("base", "laser", placed(0.1))
+    tree.add("chassis", "laser", placed(0.1))
+    tree.add("base", "chassis", placed(0.0))
+    assert tree.fixed("base", "laser").translation_m[0] == 0.1
+    tree.add("mast", "laser", placed(0.1))
+    tree.add("base", "mast", placed(0.4))
+    with pytest.raises(
+        NoTransformError, match=r"two transforms from 'base' to 'laser' .'laser' is in 'base' and in 'mast'"
+    ):
+        tree.fixed("base", "laser")
+    tree.add("chassis", "mast", placed(0.4))
+    tree.add("mast", "lidar", placed(0.4))
+    with pytest.raises(NoTransformError, match="'mast' is in 'base' and in 'chassis'"):
+        tree.fixed("base", "lidar")
+
+
 def test_a_ring_of_frames_ends():
     tree = TransformTree()
     tree.add("a", "b", placed(1.0))

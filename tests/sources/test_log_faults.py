@@ -15,6 +15,8 @@ from fcslam.errors import SourceError
 from fcslam.sources import Fault, FaultCount, open_source
 from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
 
+LOG = "\n".join(drive(3)) + "\n"
+
 
 def refusal(path):
     """The message that refuses ``path`` before any record is read."""
@@ -44,6 +46,13 @@ def written(path: Path, content: bytes) -> Path:
         (b"\x1f\x8b\x08\x00garbage", "truncated or damaged"),
         (b"\xfd7zXZ\x00garbage", "truncated or damaged"),
         (b"BZh9garbage", "cannot be read"),
+        (LOG.encode("utf-16"), "is text in UTF-16; convert it by `iconv"),
+        (LOG.replace("\n", "\r").encode(), "has lines that end with CR alone; convert them by `tr"),
+        (gzip.compress(LOG.replace("\n", "\r").encode(), mtime=0), "has lines that end with CR alone"),
+        (b"PK\x03\x04" + bytes(60), "is a zip archive; unpack it"),
+        (b"run/".ljust(257, b"\0") + b"ustar" + bytes(250), "is a tar archive; unpack it"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "is a pointer of Git LFS"),
+        (b"<!DOCTYPE html><html><body>Sign in</body></html>\n", "is a web page"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, content, reason):
@@ -122,6 +131,31 @@ def test_odometry_in_centimetres_or_millimetres_is_refused(tmp_path, scale):
 def test_one_long_jump_of_the_odometry_is_not_another_unit(tmp_path):
     lines = [flaser(k, (0.5 * k + 1e6 * (k > 15), 0.1 * k, 0.01 * k)) for k in range(30)]
     assert open_source(save(tmp_path / "run.log", lines)).survey().scan_count == 30
+
+
+def round_trip(laps=3.0, ahead=0.0):
+    """Poses of a robot on a circle of 2 m, 0.15 m apart; it looks ``ahead`` of where it drives."""
+    turns = np.arange(0.0, laps * 2.0 * np.pi, 0.075)
+    return np.column_stack((2.0 * np.sin(turns), 2.0 - 2.0 * np.cos(turns), turns + ahead))
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+def test_headings_in_degrees_are_refused(tmp_path, wrap):
+    poses = round_trip() * (1.0, 1.0, 180.0 / np.pi)
+    if wrap:
+        poses[:, 2] = (poses[:, 2] + 180.0) % 360.0 - 180.0
+    log = save(tmp_path / "run.log", [flaser(0.2 * k, pose) for k, pose in enumerate(poses.round(4).tolist())])
+    assert "the headings of the odometry are in degrees" in refusal(log)
+
+
+@pytest.mark.parametrize("kind", ["forward", "backward", "sideways", "in all directions"])
+def test_headings_in_radians_may_go_beyond_a_turn(tmp_path, kind):
+    """Also those of a robot that drives in other directions than ahead."""
+    poses = round_trip(laps=5.0, ahead={"backward": np.pi, "sideways": 1.5}.get(kind, 0.0))
+    if kind == "in all directions":
+        poses[:, 2] = np.linspace(0.0, 40.0, len(poses)) * np.sin(np.arange(len(poses)))
+    lines = [flaser(0.2 * k, pose) for k, pose in enumerate(poses.round(4).tolist())]
+    assert open_source(save(tmp_path / "run.log", lines)).survey().scan_count == len(poses)
 
 
 def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):

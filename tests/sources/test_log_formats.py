@@ -241,5 +241,5 @@ def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
         tracemalloc.stop()
         return peak
 
-    peak_bytes(10)
+    peak_bytes(600)
     assert peak_bytes(3000) < 1.2 * peak_bytes(300) + 20_000

@@ -103,8 +103,20 @@ class Contradiction(NamedTuple):
     beams: Beams
     """Of the laser, as stated."""
 
+    @property
+    def is_correctable(self) -> bool:
+        """Whether another mounting, and nothing else, makes the scans fit the odometry."""
+        return self.facing != Facing() and (self.facing.distance, self.facing.turn) == (1.0, 1.0)
+
     def __str__(self) -> str:
         """Why the mounting or the odometry cannot be right, and what to do."""
+        return self.line(
+            "correct the mounting in tf, or give --sensors laser-pose=X,Y,THETA[,upside-down], or correct the signs of "
+            "the odometry"
+        )
+
+    def line(self, remedy: str) -> str:
+        """The same with the remedy of a wrong mounting."""
         (turned_deg, upside_down, distance, turn), claims = self.facing, []
         if self.facing == Facing():
             return (
@@ -112,12 +124,11 @@ class Contradiction(NamedTuple):
                 "no other mounting is certain; check the mounting, that the ranges are distances in the order of their "
                 "beams, and that both are of one robot"
             )
-        remedy = (
-            "correct the mounting in tf, or give --sensors laser-pose=X,Y,THETA[,upside-down], or correct the signs of "
-            "the odometry"
-        )
         if upside_down:
-            claims.append("turns go the other way: the laser is upside down, or is upright and stated upside down")
+            claims.append(
+                "turns go the other way: the laser is upside down, or is upright and stated upside down, or its beams "
+                "go clockwise"
+            )
         if turned_deg:
             side = "left" if turned_deg > 0.0 else "right"
             claims.append(f"the laser is turned by about {abs(turned_deg):.0f} deg to the {side} of what is stated")

@@ -1,7 +1,7 @@
 """Calibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with it."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Final, NamedTuple, TypeGuard
@@ -15,7 +15,6 @@ from fcslam.lidar.facing import (
     MOST_COMPARED,
     WHEELS,
     Contradiction,
-    Facing,
     contradicted_facing,
     distance_remedy,
     turn_remedy,
@@ -95,7 +94,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
 def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Found]") -> Calibrated:
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
-        lines = (f"{laser.name}: {line}; not corrected" for laser, found in named for line in found.lines)
+        lines = (f"{laser.name}: {line}; not corrected" for laser, found in named for line in found.lines(str))
         return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
     facing, excess, _ = contradictions[0]
     if excess is None:
@@ -110,8 +109,8 @@ def _calibrate_facing(
     """Calibrate a bag with one laser; ``is_bent``: its ranges are no distances, so they do not tell where it sits."""
     if found is None:
         return _calibrate_finely(bag, config, is_bent)
-    turned_deg, upside_down, distance, turn = found.facing
-    if (distance, turn) != (1.0, 1.0) or found.facing == Facing():
+    turned_deg, upside_down, distance, _ = found.facing
+    if not found.is_correctable:
         fine = _calibrate_finely(bag, config, is_bent)
         scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
         is_explained = _is_wrong(scale) or fine.correction.odometry_delay_s != 0.0  # by its scale, or another clock
@@ -134,9 +133,10 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     Raises:
         SourceError: the recording cannot be mapped.
     """
+    say = str if isinstance(source, RosBag) else _without_tf
     lines = []
     for laser, found in zip(source.survey().lasers, _contradictions(source), strict=True):
-        lines += found.lines
+        lines += found.lines(say)
         if found.floor is not None:
             middle_deg = round(math.degrees(se2.wrap_angle(found.floor.heading_rad + laser.T_base_laser[2])))
             ignored = [middle_deg - FLOOR_HALF_DEG, middle_deg + FLOOR_HALF_DEG]
@@ -144,6 +144,14 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
                 f"{found.floor}, or leave its beams out by the configuration: robot: {{lidar: {{ignore: [{ignored}]}}}}"
             )
     return tuple(f"{source.name}: {line}" for line in lines)
+
+
+def _without_tf(found: Contradiction) -> str:
+    """What speaks against a laser whose mounting no option gives."""
+    return found.line(
+        "write the recording as a bag by `fcslam record` and map that, which corrects the mounting of one laser; or "
+        "correct the signs of the odometry"
+    )
 
 
 def bodies_of(source: Source) -> tuple[str, ...]:
@@ -176,10 +184,10 @@ class _Found(NamedTuple):
     excess: Excess | None
     floor: FloorLine | None
 
-    @property
-    def lines(self) -> list[str]:
-        """What cannot be corrected, but for the facing."""
-        return [str(found) for found in (self.facing, self.excess) if found is not None]
+    def lines(self, say: Callable[[Contradiction], str]) -> list[str]:
+        """What speaks against the mounting, as ``say`` says it, and against the ranges."""
+        facing = () if self.facing is None else (say(self.facing),)
+        return [*facing, *(() if self.excess is None else (str(self.excess),))]
 
 
 def _contradictions(source: Source) -> list[_Found]:

@@ -30,6 +30,10 @@ CHANGED, UNCHANGED = 0.6, 0.02
 """Share of the beams that measure something else, if the scan changed and if it did not."""
 FEWEST_RETURNS = 20
 """Scans with fewer common returns are not compared."""
+ALIKE = 0.3
+"""Largest share of the beams that measure something else in two scans of one place."""
+FEWEST_ALTERNATING, ALTERNATING = 10, 0.1
+"""Scans, and their share, between two that are alike and differ from it, of two lasers that publish on one topic."""
 
 
 class _Seen(NamedTuple):
@@ -63,6 +67,28 @@ class RepeatedScans:
             return False
         self._newest[scan.laser.T_base_laser] = scan
         return True
+
+
+class Alternation:
+    """Finds scans of two lasers that come as those of one: each is like the one before the last, unlike the last."""
+
+    def __init__(self) -> None:
+        self.count = self.alternating = 0
+        self._before: list[Ranges] = []
+
+    def add(self, ranges_m: Ranges) -> None:
+        """Add the next scan."""
+        self.count += 1
+        self._before = [*self._before[-2:], ranges_m]
+        if len(self._before) == 3:
+            oldest_m, last_m, _ = self._before
+            is_other = changed_share(last_m, ranges_m) > CHANGED and changed_share(oldest_m, last_m) > CHANGED
+            self.alternating += is_other and changed_share(oldest_m, ranges_m) < ALIKE
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether one laser cannot have measured all scans."""
+        return self.alternating > max(FEWEST_ALTERNATING, ALTERNATING * self.count)
 
 
 class ScanWatch:

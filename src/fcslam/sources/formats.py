@@ -23,8 +23,22 @@ from fcslam.sources.logs.mines import MINES
 from fcslam.sources.logs.textlog import TextLog
 from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
+from fcslam.untrusted import open_file
 
 _BAG = "ROS bag"
+_OTHERS: tuple[tuple[int, bytes, str], ...] = (
+    (0, b"PK\x03\x04", "is a zip archive; unpack it and give the recording in it"),
+    (0, b"7z\xbc\xaf\x27\x1c", "is a 7z archive; unpack it and give the recording in it"),
+    (257, b"ustar", "is a tar archive; unpack it by `tar -xf` and give the recording in it"),
+    (0, b"version https://git-lfs", "is a pointer of Git LFS and not the recording; fetch that by `git lfs pull`"),
+    (0, b"/annex/objects/", "is a pointer of git-annex and not the recording; fetch that by `git annex get`"),
+    (0, b"<!DOCTYPE", "is a web page and not the recording; download that again"),
+    (0, b"<html", "is a web page and not the recording; download that again"),
+    (0, b"\xff\xfe", "is text in UTF-16; convert it by `iconv -f UTF-16 -t UTF-8`"),
+    (0, b"\xfe\xff", "is text in UTF-16; convert it by `iconv -f UTF-16 -t UTF-8`"),
+)
+"""Where other files have which bytes, and what they are and what to do."""
+_FEW_BYTES = 512
 _SCANS_SHARED = 20
 """Scans that two recordings share at least if they overlap."""
 
@@ -175,6 +189,7 @@ def format_of(path: Path) -> Format:
                 )
         return kind
     content = b"" if is_folder(path) else head(path)
+    _refuse_others(path, content)
     with translate_errors(path):
         for kind in FORMATS:
             if kind.recognises(path, content):
@@ -188,3 +203,16 @@ def format_of(path: Path) -> Format:
     if content.startswith(ZSTD):
         raise SourceError(f"{path}: is compressed by zstd; give its folder, or unpack it by `zstd -d {path.name}`")
     raise SourceError(f"{path}: not a recording of a known format (it starts with {content[:16]!r}); give a {known}")
+
+
+def _refuse_others(path: Path, content: bytes) -> None:
+    """Raise SourceError for what is known not to be a recording, or for such a file in the folder of a bag."""
+    for at, magic, what in _OTHERS:
+        if content.startswith(magic, at):
+            raise SourceError(f"{path}: {what}")
+    if b"\r" in content and not (b"\n" in content or b"\0" in content):
+        raise SourceError(f"{path}: has lines that end with CR alone; convert them by `tr '\\r' '\\n'`")
+    if not content:
+        for file in filter(Path.is_file, (*path.glob("*.mcap"), *path.glob("*.db3"))):
+            with translate_errors(file), open_file(file) as stream:
+                _refuse_others(file, stream.read(_FEW_BYTES))

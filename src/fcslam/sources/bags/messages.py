@@ -155,7 +155,7 @@ def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:
     stamp, odom_frame = header_of(content.header, bag_time_ns)
     pose = content.pose.pose
     transform = _transform(pose.position, pose.orientation)
-    return OdometryReading(stamp, planar(transform), _frame(content.child_frame_id), odom_frame)
+    return OdometryReading(stamp, planar(transform), frame_of(content.child_frame_id), odom_frame)
 
 
 def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
@@ -163,7 +163,7 @@ def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
     for entry in content.transforms:
         stamp, parent = header_of(entry.header, bag_time_ns)
         transform = _transform(entry.transform.translation, entry.transform.rotation)
-        yield StampedTransform(stamp, parent, _frame(entry.child_frame_id), transform)
+        yield StampedTransform(stamp, parent, frame_of(entry.child_frame_id), transform)
 
 
 def odometry_in(transform: StampedTransform) -> OdometryReading:
@@ -180,10 +180,10 @@ def _angle_rad(single: float) -> float:
 def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
     """Stamp and frame of a header; a zero stamp is replaced by the time of recording."""
     stamp_ns = header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
-    return (stamp_ns or bag_time_ns) / _NANOSECONDS, _frame(header.frame_id)
+    return (stamp_ns or bag_time_ns) / _NANOSECONDS, frame_of(header.frame_id)
 
 
-def _frame(name: str) -> str:
+def frame_of(name: str) -> str:
     """Frame name without the leading slash of ROS 1."""
     if len(name) > _LONGEST_FRAME:
         raise ValueError("the name of a frame is too long")

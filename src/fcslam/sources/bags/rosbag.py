@@ -35,10 +35,10 @@ from fcslam.sources.bags.robots import BagRobot, robots_of, slashed
 from fcslam.sources.bags.stream import BagStream, RecordedLaser
 from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError, TransformTree
-from fcslam.sources.contradictions import ScanWatch
+from fcslam.sources.contradictions import Alternation, ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_speed
+from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_units
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -161,6 +161,7 @@ class RosBag:
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in self.stream.lasers]
         bodies = [BodySample() for _ in self.stream.lasers]
+        alternations = [Alternation() for _ in self.stream.lasers]
         farthest_m = [laser.first.range_max_m for laser in self.stream.lasers]
         base_frame = self._options.base_frame or ""
         self.stream.count_broken_transforms(audit)
@@ -168,6 +169,7 @@ class RosBag:
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
                 farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
+                alternations[laser].add(entry.scan.raw_ranges_m)
                 if self.stream.lasers[laser].topic.type not in LASER_SCANS:
                     bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
                 if (sample := samples[laser]).wants(entry.T_odom_base):
@@ -177,6 +179,13 @@ class RosBag:
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
+        for recorded, found in zip(self.stream.lasers, alternations, strict=True):
+            if found.is_certain:
+                raise SourceError(
+                    f"{self.stream.path}: the scans of {recorded.name} alternate between two views at "
+                    f"{found.alternating} of {found.count} scans, as of two lasers or robots publishing on one topic; "
+                    "give each robot its own namespace, and each laser its own topic or frame, and record again"
+                )
         self._refuse(audit.faults(), scans, odometry)
         which = [f" of {laser.name}" for laser in self.stream.lasers]
         for sample, its, recorded in zip(samples, which, self.stream.lasers, strict=True):
@@ -192,6 +201,12 @@ class RosBag:
             f"{self.stream.path}: the laser{its} is {tilt}"
             for its, mounted in zip(of_several, mountings, strict=True)
             if (tilt := tilt_note(mounted))
+        )
+        placed = dict.fromkeys(
+            () if self.has_given_pose else (tree.placed(each.first.frame) for each in self.stream.lasers)
+        )
+        several_parents = (
+            f"{self.stream.path}: {frames}; the pose below '{base_frame}' is used" for frames in placed if frames
         )
         unlimited = (
             f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
@@ -213,8 +228,10 @@ class RosBag:
             *self.stream.robot.notes,
             *self.stream.topics.notes,
             *self.stream.odometry_notes,
+            *self._clock_notes(),
             *self._zigzag_notes(odometry),
             *tilts,
+            *several_parents,
             *camera_notes,
         )
         rig = rig_of([laser.first for laser in self.stream.lasers], farthest_m, mountings, camera)
@@ -242,6 +259,15 @@ class RosBag:
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
+        clocks = self.stream.clocks
+        lost = [(name, clock) for name, clock in clocks.items() if clock.is_unset and not clock.is_recorded]
+        if 0 < len(lost) < len(clocks):  # all with the same stamps keep their order
+            name, clock = lost[0]
+            raise SourceError(
+                f"{path}: {clock.repeats} messages of {name} repeat the stamp of the one before, and "
+                "its time of recording, so nothing says when they were made; let the driver set the stamps, with their "
+                "nanoseconds, and record again"
+            )
         check_consistency(path, faults, scans.count, odometry.count, self._first_errors())
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
@@ -252,13 +278,27 @@ class RosBag:
                 f"{odometry.latest:.3f} s; record both by one clock, all the way, or map without odometry by --sensors "
                 "odom-topic=none"
             )
-        check_speed(path, scans)
+        check_units(path, scans)
         jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
         if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
             raise SourceError(
                 f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
                 "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
             )
+
+        if source is not None and (spins := odometry.spins) is not None:
+            raise SourceError(
+                f"{path}: {source.name} {spins}, as if in degrees, or of two robots; publish a quaternion made from "
+                "radians, or map without it by --sensors odom-topic=none"
+            )
+
+    def _clock_notes(self) -> list[str]:
+        return [
+            f"{self.stream.path}: {clock.repeats} messages of {name} repeat the stamp of the one "
+            "before, so their times of recording are used; let the driver set the stamps, with their nanoseconds"
+            for name, clock in self.stream.clocks.items()
+            if clock.is_unset and clock.is_recorded
+        ]
 
     def _zigzag_notes(self, odometry: PathSummary) -> list[str]:
         source, zigzag = self.stream.odometry, odometry.zigzag

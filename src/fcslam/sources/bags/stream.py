@@ -12,7 +12,7 @@ from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Sweep
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
-from fcslam.sources.bags.census import CountedBag
+from fcslam.sources.bags.census import Clock, CountedBag
 from fcslam.sources.bags.clouds import CloudMessage, cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, ODOMETRY, SCANS
 from fcslam.sources.bags.container import RawMessage, Topic
@@ -32,7 +32,7 @@ from fcslam.sources.bags.rig import usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, robot_of, usual
 from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, cloud_sector_rad, joined_turns
 from fcslam.sources.bags.topics import Candidates, Topics, calibration_beside, choose_topics, find_candidates
-from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, NoTransformError, TransformTree, is_fixed
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE
@@ -335,6 +335,15 @@ class BagStream:
         return None
 
     @cached_property
+    def clocks(self) -> dict[str, Clock]:
+        """The stamps of the lasers and of the odometry that are read, by the names of these."""
+        read = {(topic, "", ""): topic.name for topic in self.topics.scans}
+        if self.odometry is not None:
+            read |= {(topic, *(self.odometry.edge or ("", ""))): self.odometry.name for topic in self.odometry.topics}
+        clocks = self.bag.census.clocks
+        return {name: clocks[stamped] for stamped, name in read.items() if stamped in clocks}
+
+    @cached_property
     def _scans_change(self) -> bool:
         """Whether the scans show that the robot moves: some scan measures something else than the first."""
         scans = self._scans_of(self.topics.scans[0])
@@ -430,6 +439,12 @@ class BagStream:
         try:
             return cloud_mounting(self.tree.fixed(self._base_frame_of(frame), frame))
         except NoTransformError as error:
+            if is_fixed(frame):
+                raise SourceError(
+                    f"{self.path}: the points of {topic.name} are in '{frame}', in which the robot drives, so another "
+                    "node has moved them; record the clouds of the sensor's driver, or choose them by --sensors "
+                    "scan-topic"
+                ) from error
             raise SourceError(
                 f"{self.path}: tf has {error}, so the pose of the sensor of {topic.name} is unknown; give it "
                 "with --sensors laser-pose=X,Y,THETA (metres, radians)"

@@ -1,6 +1,8 @@
 """The tree of transforms (tf) of a bag, and the mounting of the laser in it."""
 
 from collections.abc import Iterator
+from contextlib import suppress
+from itertools import pairwise
 from math import acos, atan2, cos, isfinite, pi, sin, sqrt
 from typing import NamedTuple
 
@@ -37,6 +39,8 @@ USUAL_BASES = ("base_footprint", "base_link")
 """Frames of the robot's body, where no message names it."""
 _NO_ODOMETRY = ("map", *USUAL_BASES)
 """Frames in which a robot jumps, or in which its joints move."""
+_FIXED = ("map", "world", "camera_init")
+"""Frames in which a robot drives, besides that of its odometry; the last is of LOAM and its successors."""
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -77,51 +81,65 @@ class TransformTree:
     """The frames and transforms seen so far."""
 
     def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Transform]] = {}
-        self._moving: set[str] = set()
+        self._parents: dict[str, list[str]] = {}
+        """Of each frame, in the order in which they appeared; usually one."""
         self.links: dict[Link, Transform | None] = {}
         """The first transform of each link, in the order in which they appeared; None if it moves."""
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Add a transform. The first one counts; a frame whose transform changes later is moving."""
+        """Add a transform. The first one counts; a link whose transform changes later is moving."""
+        if (parent, child) not in self.links:
+            self._parents.setdefault(child, []).append(parent)
         of_link = self.links.setdefault((parent, child), T_parent_child)
         if of_link is not None and differ(of_link, T_parent_child):
             self.links[parent, child] = None
-        first_parent, first = self._parents.setdefault(child, (parent, T_parent_child))
-        if first is not T_parent_child and (parent != first_parent or differ(first, T_parent_child)):
-            self._moving.add(child)
 
     def __contains__(self, frame: str) -> bool:
-        return frame in self._parents or any(parent == frame for parent, _ in self._parents.values())
+        return frame in self._parents or any(parent == frame for parent, _ in self.links)
 
     def fixed(self, base: str, frame: str) -> Transform:
-        """``T_base_frame``; of a frame that two robots have, that of the robot with ``base``.
+        """``T_base_frame``; of a frame with several parents, that through those below ``base``.
 
         Raises:
-            NoTransformError: the frames are not connected, or one moves against the other.
+            NoTransformError: the frames are not connected, one moves against the other, or two parents disagree.
         """
-        parents = [parent for parent, child in self.links if child == frame]
-        if frame != base and len(parents) > 1:
-            own = [parent for parent in parents if base in self._above(parent)]
-            T_parent_frame = self.links[own[0], frame] if len(own) == 1 else None
-            if T_parent_frame is None:
-                raise NoTransformError(
-                    f"no fixed transform from '{base}' to '{frame}' ('{frame}' is in '{parents[0]}' and in "
-                    f"'{parents[1]}', as if two robots had it)"
-                )
-            return _compose(self.fixed(base, own[0]), T_parent_frame)
+        parents = self._parents.get(frame, [])
+        if frame == base or len(parents) < 2:
+            return self._along(base, frame)
+        found: dict[str, Transform] = {}
+        for parent in [each for each in parents if base in self._above(each)] or parents:
+            T_parent_frame = self.links[parent, frame]
+            with suppress(NoTransformError):
+                if T_parent_frame is not None:
+                    found[parent] = _compose(self._along(base, parent), T_parent_frame)
+        if not found:
+            raise NoTransformError(f"no fixed transform from '{base}' to '{frame}' ({self.placed(frame)})")
+        (one, first), *others = found.items()
+        if other := next((parent for parent, T_base_frame in others if differ(first, T_base_frame)), None):
+            raise NoTransformError(
+                f"two transforms from '{base}' to '{frame}' ('{frame}' is in '{one}' and in '{other}'; stop one)"
+            )
+        return first
+
+    def _along(self, base: str, frame: str) -> Transform:
+        """``T_base_frame`` of frames with one parent."""
         above_base, above_frame = list(self._above(base)), list(self._above(frame))
         meeting = next((ancestor for ancestor in above_frame if ancestor in above_base), None)
         if meeting is None:
             raise NoTransformError(f"no transform from '{base}' to '{frame}'")
-        down = above_frame[: above_frame.index(meeting)]
-        up = above_base[: above_base.index(meeting)]
-        for child in (*up, *down):
-            if child in self._moving:
-                raise NoTransformError(
-                    f"no fixed transform from '{base}' to '{frame}' ('{child}' moves in '{self._parents[child][0]}')"
-                )
+        down = above_frame[: above_frame.index(meeting) + 1]
+        up = above_base[: above_base.index(meeting) + 1]
+        for child, parent in (*pairwise(up), *pairwise(down)):
+            if self.links[parent, child] is None or len(self._parents[child]) > 1:
+                why = f"'{child}' moves in '{parent}'" if self.links[parent, child] is None else self.placed(child)
+                raise NoTransformError(f"no fixed transform from '{base}' to '{frame}' ({why})")
         return _compose(_inverse(self._chain(up)), self._chain(down))
+
+    def placed(self, frame: str) -> str:
+        """In which frames a frame is, as a sentence, if these are several; else empty."""
+        if len(self._parents.get(frame, ())) < 2:
+            return ""
+        return f"'{frame}' is in " + " and in ".join(f"'{parent}'" for parent in self._parents[frame][:2])
 
     def robot(self, frame: str, odom_frame: str | None = None, base_frame: str | None = None) -> Link:
         """The transform in which the robot with ``frame`` moves: its parent and child.
@@ -133,9 +151,12 @@ class TransformTree:
         """
         above = [link for child in self._above(frame) for link in self.links if link[1] == child]
         above = [link for link in above if _matches(link, odom_frame, base_frame)]
-        named = [link for link in above if is_odom(link[0])]
-        moving = [link for link in above if link[1] in self._moving and last_part(link[0]) not in _NO_ODOMETRY]
-        fixed = (each for each in self._above(frame) if each in self._moving or each not in self._parents)
+        moves = [link for link in above if self.links[link] is None]
+        sure = [*moves, *(link for link in above if len(self._parents[link[1]]) == 1)]
+        named = [link for link in sure if is_odom(link[0])]
+        moving = [link for link in moves if last_part(link[0]) not in _NO_ODOMETRY]
+        ends = {child for _, child in moves}
+        fixed = (each for each in self._above(frame) if each in ends or each not in self._parents)
         return next(iter((*named, *moving, *(above if odom_frame else ()))), ("", next(fixed, frame)))
 
     def odometry_link(self, frame: str, odom_frame: str | None = None, base_frame: str | None = None) -> Link | None:
@@ -153,18 +174,21 @@ class TransformTree:
         return next(bases, next((each for each in unconnected if is_odom(each[0])), None))
 
     def _above(self, frame: str) -> Iterator[str]:
-        """The frame and its ancestors; a cycle ends where it closes."""
+        """The frame and its ancestors, of several parents by one that has parents; a cycle ends where it closes."""
         seen: set[str] = set()
         while frame not in seen:
             seen.add(frame)
             yield frame
-            frame = self._parents[frame][0] if frame in self._parents else frame
+            parents = self._parents.get(frame, [frame])
+            frame = next((parent for parent in parents if parent in self._parents), parents[0])
 
     def _chain(self, frames: list[str]) -> Transform:
-        """The transform from the parent of the last frame to the first."""
+        """The transform from the last frame, through parents, to the first."""
         result = IDENTITY
-        for frame in frames:
-            result = _compose(self._parents[frame][1], result)
+        for child, parent in pairwise(frames):
+            T_parent_child = self.links[parent, child]
+            assert T_parent_child is not None
+            result = _compose(T_parent_child, result)
         return result
 
 
@@ -176,6 +200,11 @@ def last_part(name: str) -> str:
 def is_odom(frame: str) -> bool:
     """Whether odometry is usually in a frame of this name."""
     return "odom" in last_part(frame)
+
+
+def is_fixed(frame: str) -> bool:
+    """Whether a frame of this name usually stands on the floor."""
+    return is_odom(frame) or last_part(frame) in _FIXED
 
 
 def _matches(link: Link, parent: str | None, child: str | None) -> bool:

@@ -33,7 +33,7 @@ from fcslam.sources.logs.laser import (
     tells_more,
 )
 from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
-from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_speed
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_units
 from fcslam.sources.pose import UNKNOWN_POSE, Pose
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -151,7 +151,7 @@ class TextLog:
         sample.check(path, "", "the unit of the ranges")
         pose_from_odometry = not scans.moves and odometry.moves
         driven = odometry if pose_from_odometry else scans
-        check_speed(path, driven)
+        check_units(path, driven)
         laser = laser_model(telling, parameters, mounting)
         notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
         notes += _spinning(laser, scans)
