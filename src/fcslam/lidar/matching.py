@@ -38,8 +38,8 @@ INLIER_RATIO: Final = 20.0
 """Density of points on their surface relative to that of outliers."""
 INDEPENDENT: Final = 0.2
 """Share of the points' log-likelihood that counts: errors of neighbouring points are correlated, five count as one."""
-FIXED: Final = np.full(3, 1e12)
-"""Information of a velocity that is known."""
+FIXED: Final = np.full(3, 1e18)
+"""Information of a velocity that is known, far beyond the square of what the points say against it."""
 SHRINK: Final = 0.6
 FAST_SHRINK: Final = 0.35
 """Factor of the loss scale after each step; the fast one after a small step."""
@@ -144,9 +144,11 @@ class _Loss(NamedTuple):
 def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: ignore[no-untyped-def]
     """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``NARROW_SCALE_M``, in clutter to ``clutter``.
 
-    It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + v^T diag(velocity_prior) v. The
-    Jacobian of e_i over pose and velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J,
-    t J^T J and t^2 J^T J. The Schur complement eliminates v.
+    It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + p_x v_x^2 + p_y v_y^2
+    + log(1 + p_theta v_theta^2), with p the ``velocity_prior``: a robot that drives straight may begin to turn within a
+    scan, so the prior of the turn rate has the tails of Cauchy's distribution. The Jacobian of e_i over pose and
+    velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J, t J^T J and t^2 J^T J. The Schur
+    complement eliminates v.
     """
     pose, velocity = guess.copy(), np.zeros(3)
     equations = _Equations(np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((4, 3)))
@@ -228,8 +230,11 @@ def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_pri
     _scale_symmetric(mixed, s2, mixed_sums)
     _scale_symmetric(own, s2, own_velocity)
     for r in range(3):
-        own[r, r] += velocity_prior[r] + DAMPING
-        reduced[3, r] = s2 * velocity_moment[r] + velocity_prior[r] * velocity[r]
+        weight = velocity_prior[r]
+        if r == 2:
+            weight /= 1.0 + velocity_prior[r] * velocity[r] * velocity[r]
+        own[r, r] += weight + DAMPING
+        reduced[3, r] = s2 * velocity_moment[r] + weight * velocity[r]
     reduced[3, 0], reduced[3, 1], reduced[3, 2] = _solve(own, reduced[3])
     for r in range(3):
         reduced[r, 0], reduced[r, 1], reduced[r, 2] = _solve(own, mixed[r])
