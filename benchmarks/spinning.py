@@ -59,11 +59,14 @@ def simulate(seeds: Sequence[int], path_m: float) -> Iterator[tuple[object, ...]
     scanners = [Scanner.INSTANT, *(scanner for scanner, lidar in SCANNERS.items() if lidar.spin)]
     cases = list(product(scanners, (SLOW_RAD_S, FAST_RAD_S), (OdometryKind.GOOD,)))
     cases += [(Scanner.LD19, FAST_RAD_S, kind) for kind in OdometryKind if kind is not OdometryKind.GOOD]
+    cases += [(Scanner.RPLIDAR_A1, turn_rate, OdometryKind.NONE) for turn_rate in (SLOW_RAD_S, FAST_RAD_S)]
     for (scanner, turn_rate, kind), seed in product(cases, seeds):
         robot = drive(SCANNERS[scanner], turn_rate, kind, seed, path_m)
         with recorded(robot) as source:
             run = run_mission([source], MissionConfig())
         found, truth = run.trajectories[robot.name], robot.T_building_base
+        if len(found.T_map_base) < len(truth):
+            raise SystemExit(f"{scanner}, {turn_rate} rad/s, {kind}, seed {seed}: the map came apart")
         errors = PositionErrors.of(position_errors(align(truth, found.T_map_base), truth, found.T_map_base))
         yield scanner, turn_rate, kind, seed, len(truth), errors.rmse_m, errors.max_m
 
