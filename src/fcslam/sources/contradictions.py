@@ -74,16 +74,17 @@ class Alternation:
 
     def __init__(self) -> None:
         self.count = self.alternating = 0
-        self._before: list[Ranges] = []
+        self._last_m: Ranges | None = None
+        self._before_other_m: Ranges | None = None
+        """The scan before the last, if the last one is unlike it."""
 
     def add(self, ranges_m: Ranges) -> None:
         """Add the next scan."""
         self.count += 1
-        self._before = [*self._before[-2:], ranges_m]
-        if len(self._before) == 3:
-            oldest_m, last_m, _ = self._before
-            is_other = changed_share(last_m, ranges_m) > CHANGED and changed_share(oldest_m, last_m) > CHANGED
-            self.alternating += is_other and changed_share(oldest_m, ranges_m) < ALIKE
+        is_other = self._last_m is not None and changed_share(self._last_m, ranges_m) > CHANGED
+        if is_other and self._before_other_m is not None:
+            self.alternating += changed_share(self._before_other_m, ranges_m) < ALIKE
+        self._before_other_m, self._last_m = self._last_m if is_other else None, ranges_m
 
     @property
     def is_certain(self) -> bool:

@@ -149,13 +149,10 @@ class PathSummary:
     @property
     def spins(self) -> str | None:
         """How the robot turns if that is faster than any, as the end of a sentence."""
-        if self.duration_s < LEAST_DURATION_S or self._turned_rad < LARGEST_MEAN_RAD_S * self.duration_s:
+        is_fast = self.duration_s >= LEAST_DURATION_S and self._turned_rad >= LARGEST_MEAN_RAD_S * self.duration_s
+        if not is_fast or 3 * self._spun <= 2 * self._turned:
             return None
-        return (
-            f"turns {self._turned_rad:.0f} rad in {self.duration_s:.0f} s"
-            if 3 * self._spun > 2 * self._turned
-            else None
-        )
+        return f"turns {self._turned_rad:.0f} rad in {self.duration_s:.0f} s"
 
     @property
     def zigzag(self) -> str | None:

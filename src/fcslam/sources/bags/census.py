@@ -14,7 +14,7 @@ from fcslam.sources.bags.transforms import TransformTree, differ
 
 UNSET_SHARE: Final = 0.5
 """Share of the messages that repeat the stamp of the one before if nobody sets it, or not its nanoseconds."""
-_MEASURED: Final = 12
+_STAMP_END: Final = 12
 """Bytes of a message up to the end of its stamp, in ROS 1 and in ROS 2."""
 FEWEST_REPEATS: Final = 20
 """Fewer repeated stamps say nothing."""
@@ -126,7 +126,7 @@ class CountedBag(BagFile):
         if topic.type in SCANS:
             stamp, frame = header_of(content.header, now_ns)
             census.scan_frames.setdefault(topic, Counter())[frame] += 1
-            clock.add(stamp, now_ns, (frame, getattr(content, "angle_min", 0.0)), message.payload[_MEASURED:])
+            clock.add(stamp, now_ns, (frame, getattr(content, "angle_min", 0.0)), message.payload[_STAMP_END:])
         elif topic.type == ODOMETRY:
             reading = odometry_of(content, now_ns)
             census.base_frames.setdefault(topic, Counter())[reading.base_frame] += 1
