@@ -416,9 +416,10 @@ def test_sectors_of_a_turn_are_joined(robot):
         assert record.sweep.duration_s == pytest.approx(0.2 * 359 / 360)
 
 
-def test_point_clouds_wait_for_tf_and_then_are_scans():
+@pytest.mark.parametrize(("columns", "directions"), [(480, 720), (180, 180)])
+def test_point_clouds_wait_for_tf_and_then_are_scans(columns, directions):
     robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",))
-    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8, columns=480)
+    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8, columns=columns)
 
     def drives(stamps):
         for stamp in stamps:
@@ -432,10 +433,11 @@ def test_point_clouds_wait_for_tf_and_then_are_scans():
     drives(1.2 + 0.1 * np.arange(2 * SCANS_FOR_RIG))
     record = robot.records[0]
     assert record.laser.T_base_laser == pytest.approx(LASER_POSE)
+    assert record.laser.beam_count == directions
     assert record.sweep.duration_s == pytest.approx(PERIOD_S, rel=0.01)
     angles = record.laser.angles_rad() + LASER_POSE[2]
     errors = np.abs(record.ranges_m - plan_ranges(*LASER_POSE[:2], angles))
-    assert np.nanmedian(errors) < 0.005
+    assert np.nanmedian(errors) < 0.01
     assert np.isfinite(errors).mean() > 0.9
 
 

@@ -44,19 +44,19 @@ def pose_at(times):
 
 
 @cache
-def seen(stamp):
+def seen(stamp, columns=480):
     """The cloud of the turn that begins ``stamp`` seconds after the start."""
     R = rotation(yaw=YAW)
-    return spinning(lambda times: pose_at(stamp + times), LIDAR, R, rings=6, columns=480)
+    return spinning(lambda times: pose_at(stamp + times), LIDAR, R, rings=6, columns=columns)
 
 
-def drive(seconds=2.0, every_s=0.1, layout=VELODYNE, body=None, ros1=False):
+def drive(seconds=2.0, every_s=0.1, layout=VELODYNE, body=None, ros1=False, columns=480):
     """Odometry at 50 Hz and clouds of a turning scanner at 10 Hz; ``body``: points that it always sees, too."""
     messages = [tf(START, "base_link", "lidar", LIDAR, quaternion(YAW), topic="/tf_static")]
     for t in np.arange(0.0, seconds + 0.5, 0.02):
         messages.append(odom(START + t, pose_at([t])[0], bag_time=START + t))
     for t in np.arange(0.1, seconds, every_s).round(3).tolist():
-        measured = seen(t)
+        measured = seen(t, columns)
         if body is not None:
             points, times = np.vstack((measured.points, body)), np.append(measured.times, np.zeros(len(body)))
             measured = Measured(points, times)
@@ -87,6 +87,14 @@ def test_a_cloud_is_the_scan_of_a_laser_in_its_place(tmp_path, suffix, layout):
     assert source.survey().lasers[0].T_base_laser == pytest.approx((0.1, 0.05, 0.3))
     assert all(record.sweep.velocity[2] == pytest.approx(0.8, abs=0.01) for record in records)
     assert misfit_m(records) < 0.01
+
+
+def test_the_scans_of_a_sparse_scanner_have_its_directions(tmp_path):
+    source = open_source(save(tmp_path / "sparse.mcap", drive(columns=180)))
+    assert source.survey().lasers[0].beam_count == 180
+    records = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert {record.laser.beam_count for record in records} == {180}
+    assert misfit_m(records) < 0.02
 
 
 def test_points_in_no_order_are_moved_to_where_they_are_seen_at_one_time(tmp_path):

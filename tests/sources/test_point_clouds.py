@@ -10,7 +10,7 @@ from fcslam.records import LaserModel
 from fcslam.sources.bags.camera import calibration_of
 from fcslam.sources.bags.clouds import cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LIVOX_CLOUDS, POINT_CLOUD, MessageCodec
-from fcslam.sources.point_clouds import DIRECTIONS, CloudBand, CloudMounting, floor_in
+from fcslam.sources.point_clouds import DIRECTIONS, CloudBand, CloudMounting, directions_in, floor_in
 from tests.sources.clouds import (
     DOUBLES,
     HESAI,
@@ -78,6 +78,28 @@ def test_the_layout_of_a_spinning_scanner(layout, begin_s, height, clockwise):
     assert scan.stamp == pytest.approx(STAMP)
     assert_room(scan)
     assert_turn(scan, begin_s, clockwise)
+
+
+@pytest.mark.parametrize(("columns", "directions"), [(120, 120), (180, 180), (240, 240), (360, 360), (1800, 720)])
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_a_sparse_scanner_has_the_directions_that_it_measures(columns, directions, clockwise):
+    message = cloud(STAMP, spinning(at_rest, columns=columns, clockwise=clockwise, first_rad=0.7), VELODYNE)
+    found = cloud_of(message, POINT_CLOUD, 0)
+    assert directions_in([found.cloud], mounting()) == directions
+    scan = found.scan(mounting()._replace(directions=directions), BAND)
+    assert scan.beams.beam_count == directions
+    errors, seen = errors_m(scan)
+    assert seen > 0.95
+    assert np.median(errors) < 0.02
+    laser = LaserModel(*scan.beams, 100.0, (0.0, 0.0, 0.0))
+    assert point_scan(scan.raw_ranges_m, laser).normals.any(axis=1).mean() > 0.8
+
+
+def test_few_returns_do_not_tell_the_directions_of_a_scanner():
+    few = cloud_of(cloud(STAMP, spinning(at_rest, columns=40), VELODYNE), POINT_CLOUD, 0).cloud
+    dense = cloud_of(cloud(STAMP, spinning(at_rest), VELODYNE), POINT_CLOUD, 0).cloud
+    assert directions_in([few], mounting()) == directions_in([], mounting()) == DIRECTIONS
+    assert directions_in([few, dense, dense], mounting()) == DIRECTIONS
 
 
 def test_points_in_no_order_are_seen_at_their_mean_time():

@@ -66,6 +66,7 @@ from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransf
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY
+from fcslam.sources.point_clouds import directions_in
 
 USUAL_ODOM = "odom"
 """Frame of an odometry that names none."""
@@ -117,6 +118,8 @@ class LiveSensors:
         """Frames of the odometry in tf, once the laser's are known."""
         self._calibrations: dict[str, Calibration] = {}
         """By the topic of camera_info."""
+        self._directions: dict[str, int] = {}
+        """Directions of the scans of clouds in a full turn, by topic; the first cloud decides."""
         self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]
         self._frames: dict[str, str] = {}
         """Coordinate frame of the scans on each topic."""
@@ -285,14 +288,16 @@ class LiveSensors:
             return None
         cloud = cloud_of(content, kind, received_ns, self._calibrations.get(info))
         if self._options.laser_poses:
-            pose = self._options.laser_poses[self._topics.scans.index(topic)]
-            return cloud.scan(given_cloud_mounting(pose, cloud.frame), self._options.cloud_band)
-        try:
-            mounting = cloud_mounting(self._tree.fixed(self._known_base_frame(), cloud.frame))
-        except NoTransformError as error:
-            self._awaited[topic] = _missing_mounting(error)
-            return None
-        return cloud.scan(mounting, self._options.cloud_band)
+            mounting = given_cloud_mounting(self._options.laser_poses[self._topics.scans.index(topic)], cloud.frame)
+        else:
+            try:
+                mounting = cloud_mounting(self._tree.fixed(self._known_base_frame(), cloud.frame))
+            except NoTransformError as error:
+                self._awaited[topic] = _missing_mounting(error)
+                return None
+        if topic not in self._directions:
+            self._directions[topic] = directions_in([cloud.cloud], mounting)
+        return cloud.scan(mounting._replace(directions=self._directions[topic]), self._options.cloud_band)
 
     def _known_base_frame(self) -> str:
         """The frame of the odometry, or else a usual one that tf has."""

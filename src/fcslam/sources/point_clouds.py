@@ -22,8 +22,12 @@ from fcslam.sources.pose import Pose
 from fcslam.sources.returns import is_apart
 
 DIRECTIONS: Final = 720
-"""In a full turn."""
+"""In a full turn, at most."""
 _SPACING_RAD: Final = tau / DIRECTIONS
+_COARSEST: Final = 8
+"""Largest spacing of the directions that a sensor measures, in ``_SPACING_RAD``."""
+_FEWEST_DIRECTIONS: Final = 50
+"""A cloud with returns in fewer does not tell how far apart they are."""
 FARTHEST_M: Final = 100.0
 """Farther returns are left out."""
 SAME_SURFACE_M: Final = 0.05
@@ -100,6 +104,8 @@ class CloudMounting(NamedTuple):
     heading_rad: float
     """Heading of the level frame in which the scan is."""
     is_height_known: bool = True
+    directions: int = DIRECTIONS
+    """Directions of a scan in a full turn."""
 
 
 class CloudScan(NamedTuple):
@@ -107,7 +113,7 @@ class CloudScan(NamedTuple):
 
     beams: Beams
     ranges_m: Ranges
-    """Shape (DIRECTIONS,); NaN: nothing measured in the band."""
+    """Shape (beams.beam_count,); NaN: nothing measured in the band."""
     offset_s: float
     """Stamp of the scan after that of the message."""
     sweep: Sweep | None
@@ -147,26 +153,41 @@ def scan_of_cloud(
     xy = ((in_base - mounting.position_m) @ _levelling(floor.normal, mounting.heading_rad).T)[:, :2]
     is_timed = len(cloud.times_s) > 0
     turn = _turn(xy, cloud.times_s if is_timed else np.linspace(0.0, 1.0, len(xy))) if motion is None else None
+    count, spacing_rad = mounting.directions, tau / mounting.directions
     kept = (heights_m > band.low_m) & (heights_m < band.high_m) & outside
     kept &= np.hypot(xy[:, 0], xy[:, 1]) < FARTHEST_M
-    first, sweep = -DIRECTIONS // 2, None
+    first, sweep = -count // 2, None
     angles = np.arctan2(xy[kept, 1], xy[kept, 0])
     if turn is None or not is_timed:
         if turn is not None:  # the drive may show how long it takes, if the directions are in the order of time
-            first = turn.directions()[0]
-        index = np.remainder(np.rint(angles / _SPACING_RAD).astype(np.int64) - first, DIRECTIONS)
+            first = turn.directions(count)[0]
+        index = np.remainder(np.rint(angles / spacing_rad).astype(np.int64) - first, count)
         if is_timed:
             sweep = Sweep(float(cloud.times_s.min()) - offset_s, float(cloud.times_s.max()) - offset_s)
     else:
-        offset_s, (first, sweep) = 0.0, turn.directions()
+        offset_s, (first, sweep) = 0.0, turn.directions(count)
         expected = turn.angle_rad + turn.rate_rad_s * cloud.times_s[kept]
         stray = np.remainder(angles - expected + pi, tau) - pi
-        index = np.rint((expected + stray) / _SPACING_RAD).astype(np.int64) - first
+        index = np.rint((expected + stray) / spacing_rad).astype(np.int64) - first
         index[np.abs(stray) > _STRAY_RAD] = -1
-    ranges_m = _ranges(xy[kept], index, first)
-    first = (first + DIRECTIONS // 2) % DIRECTIONS - DIRECTIONS // 2
-    beams = Beams(DIRECTIONS, first * _SPACING_RAD, _SPACING_RAD)
+    ranges_m = _ranges(xy[kept], index, first, count)
+    first = (first + count // 2) % count - count // 2
+    beams = Beams(count, first * spacing_rad, spacing_rad)
     return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None and is_timed)
+
+
+def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
+    """Directions in a full turn that a scan of these clouds has: as far apart as those that the sensor measures.
+
+    Directions between them would be empty, or repeat their neighbours, and the normals of surfaces would be lost.
+    """
+    gaps = []
+    for cloud in clouds:
+        x, y = (cloud.points @ mounting.rotation.T)[:, :2].T
+        seen = np.unique(np.rint(np.arctan2(y, x) / _SPACING_RAD))
+        if len(seen) >= _FEWEST_DIRECTIONS:
+            gaps.append(int(np.quantile(np.diff(seen), 0.25)))  # larger gaps are also where nothing is seen
+    return DIRECTIONS // min(int(np.median(gaps or [1])), _COARSEST)
 
 
 def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
@@ -266,7 +287,7 @@ class BodySample:
     def add(self, T_odom_base: Pose, beams: Beams, ranges_m: Ranges) -> None:
         """Add a scan; only those at different places are kept."""
         if len(self._places) < _MOST_PLACES and (not self._places or is_apart(self._places[-1][0], T_odom_base)):
-            first = round(beams.angle_min_rad / _SPACING_RAD)
+            first = round(beams.angle_min_rad / beams.angle_increment_rad)
             self._places.append((T_odom_base, np.roll(ranges_m, first)))
 
     def radius_m(self, T_base_laser: Pose) -> float:
@@ -281,7 +302,7 @@ class BodySample:
         steady = np.mean(np.abs(ranges_m - middle_m) < SAME_SURFACE_M, axis=0) > _STEADY
         body = np.flatnonzero(steady & (middle_m < LARGEST_BODY_M))
         x, y, heading_rad = T_base_laser
-        angles = heading_rad + body * _SPACING_RAD
+        angles = heading_rad + body * (tau / len(middle_m))
         distances_m = np.hypot(x + middle_m[body] * np.cos(angles), y + middle_m[body] * np.sin(angles))
         return float(distances_m.max(initial=0.0))
 
@@ -316,11 +337,12 @@ class _Turn(NamedTuple):
     begin_s: float
     """When the turn begins."""
 
-    def directions(self) -> tuple[int, Sweep]:
-        """The first direction of the scan in spacings, and the times of the directions."""
-        begin = round((self.angle_rad + self.rate_rad_s * self.begin_s) / _SPACING_RAD)
-        first = begin if self.rate_rad_s > 0.0 else begin - DIRECTIONS + 1
-        ends = np.array([first, first + DIRECTIONS - 1]) * _SPACING_RAD
+    def directions(self, count: int) -> tuple[int, Sweep]:
+        """The first of ``count`` directions in spacings, and the times of the directions."""
+        spacing_rad = tau / count
+        begin = round((self.angle_rad + self.rate_rad_s * self.begin_s) / spacing_rad)
+        first = begin if self.rate_rad_s > 0.0 else begin - count + 1
+        ends = np.array([first, first + count - 1]) * spacing_rad
         first_s, last_s = ((ends - self.angle_rad) / self.rate_rad_s).tolist()
         return first, Sweep(first_s, last_s)
 
@@ -346,32 +368,33 @@ def _turn(xy: FloatArray, times_s: FloatArray) -> _Turn | None:
     return _Turn(float(angle), float(rate), begin_s)
 
 
-def _ranges(xy: FloatArray, index: NDArray[np.int64], first: int) -> Ranges:
-    """Range of the nearest surface along each direction, shape (DIRECTIONS,)."""
-    used = (index >= 0) & (index < DIRECTIONS)
+def _ranges(xy: FloatArray, index: NDArray[np.int64], first: int, count: int) -> Ranges:
+    """Range of the nearest surface along each direction, shape (count,)."""
+    spacing_rad = tau / count
+    used = (index >= 0) & (index < count)
     xy, index = xy[used], index[used]
     distances_m = np.hypot(xy[:, 0], xy[:, 1])
-    nearest_m = np.full(DIRECTIONS, np.inf)
+    nearest_m = np.full(count, np.inf)
     np.minimum.at(nearest_m, index, distances_m)
     same = distances_m < nearest_m[index] + SAME_SURFACE_M
-    counts = np.bincount(index[same], minlength=DIRECTIONS)
+    counts = np.bincount(index[same], minlength=count)
     seen = np.flatnonzero(counts)
-    points = np.stack([np.bincount(index[same], axis, DIRECTIONS)[seen] / counts[seen] for axis in xy[same].T], axis=1)
-    ranges_m = np.full(DIRECTIONS, np.nan, np.float32)
+    points = np.stack([np.bincount(index[same], axis, count)[seen] / counts[seen] for axis in xy[same].T], axis=1)
+    ranges_m = np.full(count, np.nan, np.float32)
     ranges_m[seen] = np.hypot(points[:, 0], points[:, 1])
-    directions = (np.arange(DIRECTIONS) + first) * _SPACING_RAD
+    directions = (np.arange(count) + first) * spacing_rad
     rays = np.stack((np.cos(directions), np.sin(directions)), axis=1)
     if len(seen) < 2:
         return ranges_m
     # The returns on both sides of each direction: the range is where its ray meets the surface between them.
     right_of = _cross(rays[seen], points) < 0.0  # a return clockwise of its direction
-    left = np.searchsorted(seen, np.arange(DIRECTIONS), side="left")
+    left = np.searchsorted(seen, np.arange(count), side="left")
     is_seen = counts > 0
     left[is_seen] += right_of
     inside = (left > 0) & (left < len(seen))
     a, b = points[left[inside] - 1], points[left[inside]]
     gap = seen[left[inside]] - seen[left[inside] - 1]
-    spacing_m = gap * _SPACING_RAD * np.minimum(np.hypot(a[:, 0], a[:, 1]), np.hypot(b[:, 0], b[:, 1]))
+    spacing_m = gap * spacing_rad * np.minimum(np.hypot(a[:, 0], a[:, 1]), np.hypot(b[:, 0], b[:, 1]))
     apart_m = np.hypot(*(b - a).T)
     joined = (gap <= LARGEST_GAP) & (apart_m < np.maximum(GAP_M, GAP_PER_SPACING * spacing_m))
     across = _cross(rays[inside], b - a)

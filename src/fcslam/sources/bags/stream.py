@@ -37,7 +37,7 @@ from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
-from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, leaning
+from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, directions_in, leaning
 from fcslam.sources.pose import Pose
 
 Found = TypeVar("Found")
@@ -47,7 +47,7 @@ _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
 _READINGS_TRIED = 20
 _CLOUDS_FOR_FLOOR, _CLOUDS_TRIED = 20, 200
-"""Clouds in which the floor is sought, spread over the first ones."""
+"""Clouds that show the floor and the directions of the sensor, spread over the first ones."""
 _FEWEST_LAGS = 4
 _LARGEST_DELAY_S = 2.0
 """Messages of one clock are recorded within this time of each other's delay."""
@@ -425,7 +425,9 @@ class BagStream:
         cloud = cloud_of(content, topic.type, message.bag_time_ns, self._depth_calibrations[topic])
         if (topic, cloud.frame) not in self._cloud_mountings:
             mounting = self._cloud_mounting(topic, cloud.frame)
-            self._cloud_mountings[topic, cloud.frame] = self._levelled(topic, cloud.frame, mounting)
+            mounting = self._levelled(topic, cloud.frame, mounting)
+            directions = directions_in(self._some_clouds(topic, cloud.frame), mounting)
+            self._cloud_mountings[topic, cloud.frame] = mounting._replace(directions=directions)
         return cloud.scan(self._cloud_mountings[topic, cloud.frame], self.cloud_band)
 
     def _cloud_mounting(self, topic: Topic, frame: str) -> CloudMounting:
