@@ -5,10 +5,13 @@ import pytest
 
 from fcslam.features.birdseye import describe
 from fcslam.geometry import se2
+from fcslam.lidar.pair_verification import verify_here
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.verification import Gate, LooseGate, VerificationConfig
+from fcslam.lidar.verification import NO_PRIOR, Gate, LooseGate, VerificationConfig
+from fcslam.places import matcher as matcher_module
 from fcslam.places import motions
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.places.motions import Motion
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
 from tests.lidar.worlds import corridor, other_room, room, scan_at
@@ -70,6 +73,28 @@ def test_another_room_is_another_place(visits, monkeypatch):
     matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
     matches = matcher.match(visits.visit("b", 0, other_room(), (0.5, 0.5, 1.0)), {}, STRANGERS)
     assert not any(match.M for match in matches)
+
+
+def test_of_many_doubtful_motions_only_the_best_are_verified(visits, monkeypatch):
+    """A true motion is verified however many false ones there are; of the false ones, a few are."""
+    truth, stored = se2.between(POSE_A, POSE_B), [visits.visit("a", number, room(), POSE_A) for number in range(3)]
+    wrong = [se2.compose(truth, (0.0, 0.0, angle)) for angle in np.linspace(0.5, 5.5, 10)]
+    verified = []
+
+    def verify(pairs, config):
+        verified.append([np.asarray(pair.T_a_b_guess) for pair in pairs])
+        return verify_here(pairs, config)
+
+    matcher = PlaceMatcher(MatcherConfig(), visits.submap_of, np.random.default_rng(0), verify_pairs=verify)
+    for place in stored:
+        matcher.match(place, {}, FRIENDS)
+    proposed = [Motion(T, NO_PRIOR, 0.1) for T in (*wrong, truth)]
+    monkeypatch.setattr(matcher_module, "propose_motions", lambda *_: proposed)
+    matches = matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS)
+    assert [match.M for match in matches] == [True] * 3
+    right = [T for T in verified[-1] if np.allclose(T, truth)]
+    assert len(right) == 3
+    assert len(verified[-1]) == 3 + matcher_module.MOST_DOUBTFUL
 
 
 def test_a_bare_corridor_may_be_the_same_place_but_fixes_no_pose(visits):

@@ -14,7 +14,7 @@ from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 from fcslam.storage.state_file import State
 
-UNPACKED: Final = 100
+UNPACKED: Final = 250
 """Submaps that are kept ready to compare, 0.2 MB each. To unpack one takes a tenth of the time to build it."""
 
 

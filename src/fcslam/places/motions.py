@@ -73,7 +73,7 @@ def rigid_hypotheses(
     a = keypoints_a[matches.pairs[:, 0]].astype(np.float64)
     b = keypoints_b[matches.pairs[:, 1]].astype(np.float64)
     seeds = np.argsort(matches.distances, kind="stable")[:SEEDS]
-    poses, agreeing = _best(a, b, _trials(a, b, seeds))
+    poses, agreeing = _best(a, b, seeds)
     return [
         Hypothesis(frozen(pose), frozen(np.flatnonzero(agrees), np.int64))
         for pose, agrees in zip(poses, agreeing, strict=True)
@@ -82,48 +82,53 @@ def rigid_hypotheses(
 
 @njit
 def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64]) -> FloatArray:
-    """Motions of every two seeds whose keypoints are equally far apart in both places: rows x, y, theta, score.
+    """Motions of every two seeds whose keypoints are equally far apart in both places: columns of x, y, cos, sin.
 
     Pairs of keypoints closer than twice ``INLIER_M`` are skipped, because they do not determine the angle.
     """
-    trials = np.empty((seeds.shape[0] * (seeds.shape[0] - 1) // 2, 4))
+    trials = np.empty((4, seeds.shape[0] * (seeds.shape[0] - 1) // 2))
     count = 0
     for p in range(1, seeds.shape[0]):
         for q in range(p):
             i, j = seeds[p], seeds[q]
             ax, ay = a[j, 0] - a[i, 0], a[j, 1] - a[i, 1]
             bx, by = b[j, 0] - b[i, 0], b[j, 1] - b[i, 1]
-            length_a, length_b = np.hypot(ax, ay), np.hypot(bx, by)
+            length_a, length_b = np.sqrt(ax * ax + ay * ay), np.sqrt(bx * bx + by * by)
             if min(length_a, length_b) < 2.0 * INLIER_M or abs(length_a - length_b) > INLIER_M:
                 continue
             cos = (bx * ax + by * ay) / (length_a * length_b)
             sin = (bx * ay - by * ax) / (length_a * length_b)
             middle_x, middle_y = 0.5 * (b[i, 0] + b[j, 0]), 0.5 * (b[i, 1] + b[j, 1])
-            x = 0.5 * (a[i, 0] + a[j, 0]) - (cos * middle_x - sin * middle_y)
-            y = 0.5 * (a[i, 1] + a[j, 1]) - (sin * middle_x + cos * middle_y)
-            trials[count, 0], trials[count, 1], trials[count, 2] = x, y, np.arctan2(sin, cos)
-            trials[count, 3] = _score(a, b, (x, y, cos, sin))
+            trials[0, count] = 0.5 * (a[i, 0] + a[j, 0]) - (cos * middle_x - sin * middle_y)
+            trials[1, count] = 0.5 * (a[i, 1] + a[j, 1]) - (sin * middle_x + cos * middle_y)
+            trials[2, count], trials[3, count] = cos, sin
             count += 1
-    return trials[:count]
+    return trials[:, :count].copy()
 
 
 @njit
-def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, float]) -> float:
-    """Sum over the inliers of 1 - (distance / ``INLIER_M``)^2 (MSAC): smaller residuals break ties of their count."""
-    x, y, cos, sin = motion
-    score = 0.0
+def _scores(a: FloatArray, b: FloatArray, trials: FloatArray) -> FloatArray:
+    """Sum over the inliers of 1 - (distance / ``INLIER_M``)^2 (MSAC): smaller residuals break ties of their count.
+
+    The inner loop is over the trials, so that the compiler vectorises it.
+    """
+    x, y, cos, sin = trials[0], trials[1], trials[2], trials[3]
+    scores = np.zeros(trials.shape[1])
     scale = 1.0 / INLIER_M**2
     for k in range(a.shape[0]):
-        dx = x + cos * b[k, 0] - sin * b[k, 1] - a[k, 0]
-        dy = y + sin * b[k, 0] + cos * b[k, 1] - a[k, 1]
-        score += max(0.0, 1.0 - scale * (dx * dx + dy * dy))
-    return score
+        ax, ay, bx, by = a[k, 0], a[k, 1], b[k, 0], b[k, 1]
+        for t in range(scores.shape[0]):
+            dx = x[t] + cos[t] * bx - sin[t] * by - ax
+            dy = y[t] + sin[t] * bx + cos[t] * by - ay
+            scores[t] += max(0.0, 1.0 - scale * (dx * dx + dy * dy))
+    return scores
 
 
 @njit
-def _best(a: FloatArray, b: FloatArray, trials: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _best(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64]) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Refine the best trials one after another and suppress trials near a hypothesis that was found before."""
-    scores = trials[:, 3].copy()
+    trials = _trials(a, b, seeds)
+    scores = _scores(a, b, trials)
     poses = np.empty((MOST_HYPOTHESES, 3))
     agreeing = np.empty((MOST_HYPOTHESES, a.shape[0]), np.bool_)
     found = 0
@@ -131,66 +136,83 @@ def _best(a: FloatArray, b: FloatArray, trials: FloatArray) -> tuple[FloatArray,
         best = np.argmax(scores)
         if scores[best] <= 0.0:
             break
-        pose, agrees = _refine(a, b, trials[best, :3])
         scores[best] = 0.0
-        if agrees.sum() < MINIMUM_INLIERS or _near(pose, poses[:found]):
+        pose, agrees, count = _refine(a, b, _pose(trials, best))
+        if count < MINIMUM_INLIERS or _near(pose, poses[:found]):
             continue
-        poses[found], agreeing[found] = pose, agrees
+        poses[found, 0], poses[found, 1], poses[found, 2] = pose
+        agreeing[found] = agrees
         found += 1
         for index in range(scores.shape[0]):
-            if _near(trials[index], pose.reshape(1, 3)):
+            if scores[index] > 0.0 and _near(_pose(trials, index), poses[found - 1 : found]):
                 scores[index] = 0.0
     return poses[:found], agreeing[:found]
 
 
-@njit
-def _near(pose: FloatArray, others: FloatArray) -> bool:
+@njit(allocates=False)
+def _pose(trials: FloatArray, index: int) -> se2.Pose:
+    return trials[0, index], trials[1, index], np.arctan2(trials[3, index], trials[2, index])
+
+
+@njit(allocates=False)
+def _near(pose: se2.Pose, others: FloatArray) -> bool:
+    """Whether a motion is not distinct from one of the ``others`` (N, 3)."""
     for index in range(others.shape[0]):
-        turn = abs(pose[2] - others[index, 2])
+        dx, dy, turn = pose[0] - others[index, 0], pose[1] - others[index, 1], abs(pose[2] - others[index, 2])
         turn = min(turn, 2.0 * np.pi - turn)
-        if np.hypot(pose[0] - others[index, 0], pose[1] - others[index, 1]) <= DISTINCT_M and turn <= DISTINCT_RAD:
+        if dx * dx + dy * dy <= DISTINCT_M * DISTINCT_M and turn <= DISTINCT_RAD:
             return True
     return False
 
 
 @njit
-def _refine(a: FloatArray, b: FloatArray, pose: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    agrees = _agreeing(a, b, pose)
+def _refine(a: FloatArray, b: FloatArray, pose: se2.Pose) -> tuple[se2.Pose, NDArray[np.bool_], int]:
+    """Least squares over the inliers until these no longer change; returns the pose, its inliers and their number."""
+    agrees, now = np.empty(a.shape[0], np.bool_), np.empty(a.shape[0], np.bool_)
+    count = _agreeing(a, b, pose, agrees)
     for _ in range(_REFINEMENTS):
         refined = _least_squares(a, b, agrees)
-        now = _agreeing(a, b, refined)
-        if now.sum() < agrees.sum():
+        count_now = _agreeing(a, b, refined, now)
+        if count_now < count:
             break
         unchanged = (now == agrees).all()
-        pose, agrees = refined, now
+        pose, count = refined, count_now
+        agrees, now = now, agrees
         if unchanged:
             break
-    return pose, agrees
+    return pose, agrees, count
 
 
-@njit
-def _agreeing(a: FloatArray, b: FloatArray, pose: FloatArray) -> NDArray[np.bool_]:
+@njit(allocates=False)
+def _agreeing(a: FloatArray, b: FloatArray, pose: se2.Pose, agrees: NDArray[np.bool_]) -> int:
+    """Write which matches are inliers of a motion into ``agrees``; returns their number."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    dx = pose[0] + cos * b[:, 0] - sin * b[:, 1] - a[:, 0]
-    dy = pose[1] + sin * b[:, 0] + cos * b[:, 1] - a[:, 1]
-    agrees: NDArray[np.bool_] = dx * dx + dy * dy <= INLIER_M * INLIER_M
-    return agrees
+    count = 0
+    for k in range(a.shape[0]):
+        dx = pose[0] + cos * b[k, 0] - sin * b[k, 1] - a[k, 0]
+        dy = pose[1] + sin * b[k, 0] + cos * b[k, 1] - a[k, 1]
+        agrees[k] = dx * dx + dy * dy <= INLIER_M * INLIER_M
+        count += agrees[k]
+    return count
 
 
-@njit
-def _least_squares(a: FloatArray, b: FloatArray, agrees: NDArray[np.bool_]) -> FloatArray:
+@njit(allocates=False)
+def _least_squares(a: FloatArray, b: FloatArray, agrees: NDArray[np.bool_]) -> se2.Pose:
     """The rigid motion with the least squared distances, from the centred sums of products."""
-    n = agrees.sum()
-    ax, ay = (a[:, 0] * agrees).sum() / n, (a[:, 1] * agrees).sum() / n
-    bx, by = (b[:, 0] * agrees).sum() / n, (b[:, 1] * agrees).sum() / n
-    dot = cross = 0.0
+    n = 0
+    ax = ay = bx = by = dot = cross = 0.0
+    for k in range(a.shape[0]):
+        if agrees[k]:
+            n += 1
+            ax, ay, bx, by = ax + a[k, 0], ay + a[k, 1], bx + b[k, 0], by + b[k, 1]
+    ax, ay, bx, by = ax / n, ay / n, bx / n, by / n
     for k in range(a.shape[0]):
         if agrees[k]:
             dot += (a[k, 0] - ax) * (b[k, 0] - bx) + (a[k, 1] - ay) * (b[k, 1] - by)
             cross += (b[k, 0] - bx) * (a[k, 1] - ay) - (b[k, 1] - by) * (a[k, 0] - ax)
     theta = np.arctan2(cross, dot)
     cos, sin = np.cos(theta), np.sin(theta)
-    return np.array([ax - (cos * bx - sin * by), ay - (sin * bx + cos * by), theta])
+    return ax - (cos * bx - sin * by), ay - (sin * bx + cos * by), theta
 
 
 @dataclass(frozen=True, slots=True)
