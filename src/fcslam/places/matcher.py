@@ -32,7 +32,7 @@ NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
 PLAUSIBLE_VIOLATION: Final = 0.1
 """Largest share of a new place's points in the free space of the stored one, at the motion that keypoints propose and
 before any alignment. Of true motions, 98 % have less."""
-MOST_DOUBTFUL: Final = 6
+MOST_DOUBTFUL: Final = 12
 """Motions with more that are verified for a new place: those with the least."""
 WHOLE_PLACES: Final = 256
 """Places that are kept with their descriptors, 10 kB each: the index holds descriptors by word."""

@@ -186,7 +186,7 @@ def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
         x, y = (cloud.points @ mounting.rotation.T)[:, :2].T
         seen = np.unique(np.rint(np.arctan2(y, x) / _SPACING_RAD))
         if len(seen) >= _FEWEST_DIRECTIONS:
-            gaps.append(int(np.quantile(np.diff(seen), 0.25)))  # larger gaps are also where nothing is seen
+            gaps.append(int(np.quantile(np.diff(seen), 0.1)))  # larger gaps are also where nothing is seen
     return DIRECTIONS // min(int(np.median(gaps or [1])), _COARSEST)
 
 
