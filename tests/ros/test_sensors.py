@@ -416,7 +416,7 @@ def test_sectors_of_a_turn_are_joined(robot):
         assert record.sweep.duration_s == pytest.approx(0.2 * 359 / 360)
 
 
-@pytest.mark.parametrize(("columns", "directions"), [(480, 720), (180, 180)])
+@pytest.mark.parametrize(("columns", "directions"), [(480, 720), (180, 360)])
 def test_point_clouds_wait_for_tf_and_then_are_scans(columns, directions):
     robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",))
     measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8, columns=columns)

@@ -10,7 +10,7 @@ at the mean time of all.
 """
 
 from collections.abc import Iterable
-from math import cos, pi, radians, tau
+from math import ceil, cos, pi, radians, tau
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -177,9 +177,9 @@ def scan_of_cloud(
 
 
 def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
-    """Directions in a full turn that a scan of these clouds has: as far apart as those that the sensor measures.
+    """Directions in a full turn of the scans of these clouds: so few that no empty ones part neighbouring returns.
 
-    Directions between them would be empty, or repeat their neighbours, and the normals of surfaces would be lost.
+    Otherwise, no return of a sparse scanner would have a normal.
     """
     gaps = []
     for cloud in clouds:
@@ -187,7 +187,8 @@ def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
         seen = np.unique(np.rint(np.arctan2(y, x) / _SPACING_RAD))
         if len(seen) >= _FEWEST_DIRECTIONS:
             gaps.append(int(np.quantile(np.diff(seen), 0.1)))  # larger gaps are also where nothing is seen
-    return DIRECTIONS // min(int(np.median(gaps or [1])), _COARSEST)
+    measured = min(int(np.median(gaps or [1])), _COARSEST)
+    return DIRECTIONS // ceil(measured / LARGEST_GAP)
 
 
 def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
