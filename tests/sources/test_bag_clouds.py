@@ -179,10 +179,12 @@ def test_a_cloud_in_another_unit_is_refused_with_what_to_check(tmp_path, unit):
         open_source(save(tmp_path / "run.mcap", drive(layout=layout))).survey()
 
 
-def test_a_body_that_is_wider_than_usual_is_left_out_with_a_note(tmp_path):
-    angles = np.linspace(-2.5, 2.5, 400)
-    deck = np.stack((0.7 * np.cos(angles), 0.7 * np.sin(angles), np.full(400, -0.1)), axis=1)
-    source = open_source(save(tmp_path / "deck.mcap", drive(8.6, 0.4, REALSENSE, deck)))
+@pytest.mark.parametrize(
+    ("columns", "angles"), [(480, np.linspace(-2.5, 2.5, 400)), (180, np.radians(np.arange(-144.0, 145.0, 2.0)))]
+)
+def test_a_body_that_is_wider_than_usual_is_left_out_with_a_note(tmp_path, columns, angles):
+    deck = np.stack((0.7 * np.cos(angles), 0.7 * np.sin(angles), np.full(len(angles), -0.1)), axis=1)
+    source = open_source(save(tmp_path / "deck.mcap", drive(8.6, 0.4, REALSENSE, deck, columns=columns)))
     assert any("from the base belong to the robot and are left out" in note for note in source.survey().notes)
     nearest = min(np.nanmin(each.ranges_m) for each in source.records() if isinstance(each, LaserScan))
     assert nearest > 0.75

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from fcslam.lidar.scan import point_scan
-from fcslam.records import LaserModel
+from fcslam.records import Beams, LaserModel
 from fcslam.sources.bags.camera import calibration_of
 from fcslam.sources.bags.clouds import cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LIVOX_CLOUDS, POINT_CLOUD, MessageCodec
-from fcslam.sources.point_clouds import DIRECTIONS, CloudBand, CloudMounting, directions_in, floor_in
+from fcslam.sources.point_clouds import DIRECTIONS, BodySample, CloudBand, CloudMounting, directions_in, floor_in
 from tests.sources.clouds import (
     DOUBLES,
     HESAI,
@@ -100,6 +100,17 @@ def test_few_returns_do_not_tell_the_directions_of_a_scanner():
     dense = cloud_of(cloud(STAMP, spinning(at_rest), VELODYNE), POINT_CLOUD, 0).cloud
     assert directions_in([few], mounting()) == directions_in([], mounting()) == DIRECTIONS
     assert directions_in([few, dense, dense], mounting()) == DIRECTIONS
+
+
+@pytest.mark.parametrize("directions", [DIRECTIONS, DIRECTIONS // 2])
+def test_the_body_is_measured_whichever_direction_a_scan_begins_with(directions):
+    sample, spacing = BodySample(), math.tau / directions
+    for number in range(40):
+        first = 9 * number - directions // 2
+        ranges = np.full(directions, 2.0 + 0.1 * number, np.float32)
+        ranges[(directions // 2 - first) % directions] = 1.0  # behind
+        sample.add((float(number), 0.0, 0.5 * number), Beams(directions, first * spacing, spacing), ranges)
+    assert sample.radius_m((0.3, 0.0, 0.0)) == pytest.approx(0.7)
 
 
 def test_points_in_no_order_are_seen_at_their_mean_time():
