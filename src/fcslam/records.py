@@ -41,7 +41,8 @@ def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar
     """Return a read-only array of ``dtype`` with the same shape; copies only a writeable array."""
     result: NDArray[Scalar] = np.asarray(array, dtype=dtype)
     if result.flags.writeable:
-        result = result.copy()
+        if result is array or result.base is not None:  # others may write to it
+            result = result.copy()
         result.setflags(write=False)
     return result
 

@@ -1,7 +1,5 @@
 """One surface does not overrule odometry that was right, several do."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -94,7 +92,7 @@ def test_odometry_corrects_a_match_near_it_only_if_it_is_exact_and_the_match_unc
     step = np.array((0.1, 0.0, 0.0))
     field, scan = field_of(points(ramp(25.0))), points(ramp(25.0, at_x=0.1), step)
     match = match_scan(scan, field, step, np.diag((100.0, 100.0, 400.0)))
-    match = replace(match, explained=explained * match.known)
+    match = match._replace(explained=explained * match.known)
     chosen, contradicts = resolve(scan, field, step, match, OdometryError(sigma_m, 0.02), 0.0)
     assert (chosen is match) == is_kept
     assert chosen.T_field_base[0] == pytest.approx(0.0 if is_kept else 0.1, abs=0.03)
@@ -105,7 +103,7 @@ def test_near_odometry_a_match_of_more_surfaces_is_kept():
     off = np.array((0.1, 0.0, 0.0))
     field, scan = field_of(points(room())), points(room())
     match = match_scan(scan, field, off, np.diag((100.0, 100.0, 400.0)))
-    match = replace(match, explained=0.7 * match.known)
+    match = match._replace(explained=0.7 * match.known)
     chosen, _ = resolve(scan, field, off, match, OdometryError(0.03, 0.02), 0.0)
     assert chosen.T_field_base[0] == pytest.approx(0.0, abs=0.02)
 
@@ -114,7 +112,7 @@ def test_near_odometry_a_match_of_more_surfaces_is_kept():
 def test_unclear_match_is_kept_only_if_it_agrees_with_odometry(sigma_m, explained, is_kept):
     field, scan = field_of(points(room())), points(room())
     off = match_scan(scan, field, np.array((0.1, 0.0, 0.0)), HELD)
-    match = replace(off, explained=explained * off.known)
+    match = off._replace(explained=explained * off.known)
     chosen, _ = resolve(scan, field, HERE, match, OdometryError(sigma_m, 0.02), 0.0)
     assert (chosen is match) == is_kept
 

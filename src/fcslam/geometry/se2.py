@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
 """A single pose as numbers."""
+_TURN = 2.0 * math.pi
 
 IDENTITY: Array = np.zeros(3)
 IDENTITY.setflags(write=False)
@@ -57,7 +58,11 @@ def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
 
 def motion(T_a_b: Array, T_a_c: Array) -> Pose:
     """``between`` of two single poses, shape (3,), as numbers."""
-    return _compose_one(_inverse_one(T_a_b.tolist()), T_a_c.tolist())
+    (x, y, theta), (dx, dy, turn) = T_a_b.tolist(), T_a_c.tolist()
+    cos, sin = math.cos(theta), math.sin(theta)
+    x, y, theta = -cos * x - sin * y, sin * x - cos * y, (math.pi - theta) % _TURN - math.pi
+    cos, sin = math.cos(theta), math.sin(theta)
+    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, (theta + turn + math.pi) % _TURN - math.pi
 
 
 def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
@@ -116,7 +121,7 @@ def _inverse_one(T_a_b: Iterable[float]) -> Pose:
 
 
 def _wrap_one(angle_rad: float) -> float:
-    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+    return (angle_rad + math.pi) % _TURN - math.pi
 
 
 def _sinc_terms(omega: Array) -> tuple[Array, Array]:

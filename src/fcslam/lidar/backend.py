@@ -168,9 +168,10 @@ def chained(motions: Sequence[Constraint]) -> tuple[FloatArray, FloatArray]:
         The motion from the first pose to the last, shape (3,), and its information in the tangent space at it (x, y,
         theta of the last pose), shape (3, 3), to first order in the errors.
     """
-    T_first_last, covariance = np.zeros(3), np.zeros((3, 3))
-    for motion in motions:
-        T_first_last = se2.compose(T_first_last, motion.T_i_j)
-        covariance = transport_covariance(covariance, motion.T_i_j) + np.linalg.inv(motion.information)
-    information = np.linalg.inv(covariance)
+    after = [se2.IDENTITY]  # motion from the end of each one to the end of the chain, where covariances are added
+    for motion in reversed(motions):
+        after.append(se2.compose(motion.T_i_j, after[-1]))
+    T_first_last = after.pop()
+    covariances = np.linalg.inv(np.array([motion.information for motion in motions]))
+    information = np.linalg.inv(transport_covariance(covariances, np.array(after[::-1])).sum(axis=0))
     return T_first_last, 0.5 * (information + information.T)

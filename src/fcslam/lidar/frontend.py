@@ -8,6 +8,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +16,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
+from fcslam.lidar.information import limited_information
 from fcslam.lidar.karto import KartoTracker
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
@@ -104,8 +106,7 @@ class LidarConfig(Settings):
     closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
 
 
-@dataclass(frozen=True, slots=True)
-class ScanPose:
+class ScanPose(NamedTuple):
     """Pose of a scan relative to the keyscan before it."""
 
     stamp: float
@@ -131,8 +132,7 @@ class MappedKeyscan:
     """Path length up to it, metres; turns count as ``TURN_AS_TRAVEL_M`` per radian."""
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """Everything that one scan added."""
 
     pose: ScanPose
@@ -288,19 +288,19 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     Returns:
         Information in the tangent space at ``motion`` (x, y, theta of the later keyscan), shape (3, 3).
     """
-    moved, turned = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
-    cos, sin = np.cos(tracked.T_local_base[2]), np.sin(tracked.T_local_base[2])
-    turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    x, y, turn = motion.tolist()
+    moved, turned = math.hypot(x, y), abs(turn)
     sigma_m = ODOMETRY_SIGMA_M + ODOMETRY_SIGMA_PER_TRAVEL * moved
     sigma_rad = ODOMETRY_SIGMA_RAD + ODOMETRY_SIGMA_PER_TURN * turned
-    prior = np.diag((sigma_m**-2, sigma_m**-2, sigma_rad**-2))
     if not odometry.is_measured or not tracked.information.any():  # no wheels, or they may have slipped
-        prior = odometry_error(moved, turned, odometry).information
-    covariance = np.linalg.inv(POINT_INFORMATION_SHARE * turn.T @ tracked.information @ turn + prior)
+        sigma_m, sigma_rad = odometry_error(moved, turned, odometry)
     floor_m, floor_rad = least_sigmas(moved, turned)
-    floor = np.diag((floor_m**2, floor_m**2, floor_rad**2))
-    information = np.linalg.inv(covariance + floor)
-    return np.asarray(0.5 * (information + information.T))
+    return limited_information(
+        POINT_INFORMATION_SHARE * tracked.information,
+        float(tracked.T_local_base[2]),
+        (sigma_m**-2, sigma_m**-2, sigma_rad**-2),
+        (floor_m**2, floor_m**2, floor_rad**2),
+    )
 
 
 def least_sigmas(moved_m: float, turned_rad: float) -> tuple[float, float]:

@@ -1,6 +1,5 @@
 """Scan matching: Gauss-Newton on the distances of a scan's points to the nearest surfels."""
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -55,8 +54,7 @@ EXPLAINED_M = 0.10
 """Distance, in metres, up to which a point lies on its surface."""
 
 
-@dataclass(frozen=True, slots=True)
-class ScanMatch:
+class ScanMatch(NamedTuple):
     """Pose of a scan in a field."""
 
     T_field_base: FloatArray
@@ -106,17 +104,17 @@ def match_scan(
     Returns:
         The pose, the information of the points, and how well they fit.
     """
-    pose, information, explained, known, log_likelihoods, velocity = _match(
-        _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
-        np.array(T_field_guess),  # a writable copy: code is compiled once
-        prior_information,
-        velocity_information,
-        field.arrays,
-        wide_scale_m,
-        clutter_scale_m,
+    return ScanMatch(
+        *_match(
+            _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s),
+            np.array(T_field_guess),  # a writable copy: code is compiled once
+            prior_information,
+            velocity_information,
+            field.arrays,
+            wide_scale_m,
+            clutter_scale_m,
+        )
     )
-    total = float(log_likelihoods.sum())
-    return ScanMatch(pose, information, explained, known, log_likelihoods, velocity, total)
 
 
 class _Points(NamedTuple):
@@ -165,7 +163,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
                 g[r] += prior[r, c] * difference[c]
                 H[r, c] += prior[r, c]
             H[r, r] += DAMPING
-        step = _solve(H, g)
+        step = solve(H, g)
         small = abs(step[0]) + abs(step[1]) < SMALL_STEP_M and abs(step[2]) < SMALL_STEP_RAD
         for r in range(3):
             pose[r] -= step[r]
@@ -180,15 +178,15 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     loss = _Loss(NARROW_SCALE_M, NARROW_SCALE_M, 1.0)
     _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
-    explained, known, log_likelihoods = _fit(scan, pose, velocity, field)
+    explained, known, log_likelihoods, total = _fit(scan, pose, velocity, field)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = velocity[0], velocity[1]
     velocity[0], velocity[1] = cos * x + sin * y, cos * y - sin * x
-    return pose, H, explained, known, log_likelihoods, velocity
+    return pose, H, explained, known, log_likelihoods, velocity, total
 
 
 @njit(allocates=False)
-def _solve(A, b):  # type: ignore[no-untyped-def]
+def solve(A, b):  # type: ignore[no-untyped-def]
     """Solution of A x = b for a positive definite A (3, 3), by its LDL decomposition; compiles faster than LAPACK."""
     l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
     d1 = A[1, 1] - l10 * A[1, 0]
@@ -235,9 +233,9 @@ def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_pri
             weight /= 1.0 + velocity_prior[r] * velocity[r] * velocity[r]
         own[r, r] += weight + DAMPING
         reduced[3, r] = s2 * velocity_moment[r] + weight * velocity[r]
-    reduced[3, 0], reduced[3, 1], reduced[3, 2] = _solve(own, reduced[3])
+    reduced[3, 0], reduced[3, 1], reduced[3, 2] = solve(own, reduced[3])
     for r in range(3):
-        reduced[r, 0], reduced[r, 1], reduced[r, 2] = _solve(own, mixed[r])
+        reduced[r, 0], reduced[r, 1], reduced[r, 2] = solve(own, mixed[r])
     for r in range(3):
         g[r] -= mixed[r, 0] * reduced[3, 0] + mixed[r, 1] * reduced[3, 1] + mixed[r, 2] * reduced[3, 2]
         for c in range(3):
@@ -375,11 +373,11 @@ def _swept_point(points, i, cos, sin, t, velocity):  # type: ignore[no-untyped-d
 
 @njit
 def _fit(scan, pose, velocity, field):  # type: ignore[no-untyped-def]
-    """Share of the points on a surface, share near any, and the log-likelihood of each, shape (N,)."""
+    """Share of the points on a surface, share near any, the log-likelihood of each, shape (N,), and its sum."""
     points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     explained = known = 0
-    log_likelihoods = np.zeros(len(points))
+    log_likelihoods, total = np.zeros(len(points)), 0.0
     swept = len(scan.times) > 0
     for i in range(len(points)):
         rx, ry = _swept_point(points, i, cos, sin, scan.times[i] if swept else 0.0, velocity)
@@ -406,5 +404,6 @@ def _fit(scan, pose, velocity, field):  # type: ignore[no-untyped-def]
             explained += 1
         likelihood_ratio = INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M))
         log_likelihoods[i] = INDEPENDENT * np.log1p(likelihood_ratio)
+        total += log_likelihoods[i]
     n = max(1, len(points))
-    return explained / n, known / n, log_likelihoods
+    return explained / n, known / n, log_likelihoods, total

@@ -1,8 +1,8 @@
 """Scan-to-submap tracking: every scan is matched; odometry only starts the match and steadies it."""
 
 import math
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,8 +73,7 @@ UNLIKELY = 10.0
 """A match whose log-probability is lower than usual by this starts a correlative search."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackedScan:
+class TrackedScan(NamedTuple):
     """One scan's pose in the tracker's own smooth frame."""
 
     T_local_base: FloatArray
@@ -88,8 +87,7 @@ class TrackedScan:
     """Times of the beams, and the motion as the scan was matched."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackingResult:
+class TrackingResult(NamedTuple):
     """The match of one scan, and the state of the tracker after it (see ``ScanTracker.commit``)."""
 
     tracked: TrackedScan

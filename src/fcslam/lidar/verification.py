@@ -9,12 +9,13 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.lidar.information import limited_information
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Agreement, Submap, agreement
 from fcslam.records import FloatArray, Reason, ReasonCode
 
-UNFIXED_INFORMATION = 1e-2
+UNFIXED = 1e-2, 1e-2, 1e-2
 """Information in a direction that no point fixes: a standard deviation of 10 m or 10 rad."""
 ALIGNED_POINTS = 400
 """Least number of aligned points of a submap; smaller submaps align all their points."""
@@ -30,6 +31,7 @@ SYMMETRY_M, SYMMETRY_RAD = 0.15, 0.03
 """Largest motion between the alignments of both directions."""
 CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD = 0.03, 0.006
 """Least standard deviations of a closure, however many points it has."""
+LEAST_VARIANCE = CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_RAD**2
 
 
 class Gate(Settings):
@@ -177,7 +179,8 @@ def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_
         max(side.overlap for side in sides),
         worse.normal_tensor,
     )
-    return Aligned(T_a_b, _information(forward.information + prior, T_a_b), worse, worse.weakest, gap)
+    information = limited_information(forward.information + prior, float(T_a_b[2]), UNFIXED, LEAST_VARIANCE)
+    return Aligned(T_a_b, information, worse, worse.weakest, gap)
 
 
 def judge(
@@ -257,16 +260,3 @@ def _information_of_inverse(information: FloatArray, T_a_b: FloatArray) -> Float
     jacobian = np.array([[-cos, -sin, sin * x - cos * y], [sin, -cos, cos * x + sin * y], [0.0, 0.0, -1.0]])
     inverse = np.linalg.inv(jacobian)
     return np.asarray(inverse.T @ information @ inverse)
-
-
-def _information(points: FloatArray, T_a_b: FloatArray) -> FloatArray:
-    """Information of the points in the coordinates of b, shape (3, 3), limited by the least standard deviations."""
-    turn = np.eye(3)
-    cos, sin = np.cos(T_a_b[2]), np.sin(T_a_b[2])
-    turn[:2, :2] = ((cos, -sin), (sin, cos))
-    covariance = np.linalg.inv(
-        turn.T @ points @ turn + np.diag((UNFIXED_INFORMATION, UNFIXED_INFORMATION, UNFIXED_INFORMATION))
-    )
-    floor = np.diag((CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_RAD**2))
-    information = np.linalg.inv(covariance + floor)
-    return np.asarray(0.5 * (information + information.T))

@@ -277,9 +277,14 @@ def _sampled(poses: FloatArray) -> NDArray[np.int64]:
 def _known_squares(occupancy: OccupancyMap) -> FloatArray:
     """Centres of the squares of ``CELL_M`` with known cells, shape (C, 2)."""
     rows, columns = np.nonzero(occupancy.cells)
-    points = np.array(occupancy.origin_xy) + occupancy.resolution_m * (np.stack((columns, rows), axis=-1) + 0.5)
-    squares: FloatArray = (np.unique(np.floor(points / CELL_M), axis=0) + 0.5) * CELL_M
-    return squares.reshape(-1, 2)
+    x, y = (
+        np.floor((origin + occupancy.resolution_m * (cells + 0.5)) / CELL_M).astype(np.int64)
+        for origin, cells in zip(occupancy.origin_xy, map(np.arange, occupancy.cells.shape[::-1]), strict=True)
+    )
+    is_known = np.zeros((x[-1] - x[0] + 1, y[-1] - y[0] + 1), np.bool_)
+    is_known[x[columns] - x[0], y[rows] - y[0]] = True
+    centres: FloatArray = (np.argwhere(is_known) + (x[0], y[0]) + 0.5) * CELL_M
+    return centres
 
 
 def _passes(centres: FloatArray, paths: Sequence[MappedPath]) -> tuple[NDArray[np.int64], FloatArray]:

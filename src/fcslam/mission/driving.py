@@ -18,7 +18,7 @@ from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError, InputError
 from fcslam.processes import needing_semaphores, obey_parent, start_method, trim_memory
-from fcslam.records import Keyscan, LaserScan
+from fcslam.records import Keyscan, LaserScan, Odometry
 from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
@@ -130,6 +130,8 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     stamps: list[float] = []
     turns = cycle(range(LEGS_PER_TRIM))
     for record in source.records():
+        if isinstance(record, Odometry):
+            continue  # scans carry their odometry
         packets += map(measure, robot.process(record))
         if robot.backlog > MOST_WAITING:
             packets += map(measure, robot.ready(wait=True))

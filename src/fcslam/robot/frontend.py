@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -81,8 +82,7 @@ class _Waiting:
     """The largest stamp so far."""
 
 
-@dataclass(frozen=True, slots=True)
-class NewestScan:
+class NewestScan(NamedTuple):
     """The tracker's result for the newest scan."""
 
     pose: ScanPose

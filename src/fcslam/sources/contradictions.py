@@ -105,7 +105,7 @@ class ScanWatch:
         if not self._repeated.admits(scan):
             self._audit.add(Fault.REPEATED_SCAN, number)
             return
-        if not count_returns(scan.ranges_m, scan.laser.max_range_m):
+        if not has_return(scan.ranges_m, scan.laser.max_range_m):
             self._audit.add(Fault.NO_RETURN, number)
         x, y, theta = scan.T_odom_base.tolist()
         if isnan(theta):
@@ -127,6 +127,12 @@ class ScanWatch:
             known.turn = seen
 
 
+def has_return(ranges_m: Ranges, max_range_m: float) -> bool:
+    """Whether a scan has a return; most have one in the middle, which is looked at first."""
+    middle = ranges_m[len(ranges_m) // 2] if len(ranges_m) else 0.0
+    return bool(0.0 < middle < max_range_m) or count_returns(ranges_m, max_range_m) > 0
+
+
 def count_returns(ranges_m: Ranges, max_range_m: float) -> int:
     """Number of beams of a scan with a return below the maximum range."""
     return int(np.count_nonzero((ranges_m > 0.0) & (ranges_m < max_range_m)))
@@ -134,9 +140,9 @@ def count_returns(ranges_m: Ranges, max_range_m: float) -> int:
 
 def _repeats(before: LaserScan, after: LaserScan) -> bool:
     """Whether both have the same ranges to the last bit, with enough returns, and the odometry moved or one stamp."""
-    if before.stamp != after.stamp and (stands_still(before, after) or np.isnan(after.T_odom_base).any()):
-        return False
     if before.ranges_m.tobytes() != after.ranges_m.tobytes():
+        return False
+    if before.stamp != after.stamp and (stands_still(before, after) or np.isnan(after.T_odom_base).any()):
         return False
     return count_returns(after.ranges_m, after.laser.max_range_m) >= FEWEST_RETURNS
 

@@ -3,6 +3,7 @@
 A robot maps with the ranges that it sends, ``rounded``, so that it and the cloud see the same numbers.
 """
 
+from array import array
 from collections.abc import Sequence
 from typing import Final
 
@@ -22,7 +23,6 @@ MAXIMUM_KEYPOINT_M = 32767 * KEYPOINT_STEP_M
 
 _RANGE_OF_CODE = (RANGE_STEP_M * np.arange(65536)).astype(np.float32)
 _RANGE_OF_CODE[_NO_RETURN] = np.inf
-_UPPER_TRIANGLE = np.array([0, 1, 2, 4, 5, 8])
 _MIRROR = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 
 
@@ -94,9 +94,8 @@ def dequantise_keypoints(codes: KeypointCodes) -> NDArray[np.float32]:
 
 def pack_information(information: FloatArray) -> list[float]:
     """Upper triangle xx, xy, xt, yy, yt, tt of a matrix (3, 3), rounded to float32 (infinite beyond its range)."""
-    with np.errstate(over="ignore"):
-        upper: list[float] = information.ravel()[_UPPER_TRIANGLE].astype(np.float32).tolist()
-    return upper
+    xx, xy, xt, _, yy, yt, _, _, tt = information.ravel().tolist()
+    return array("f", (xx, xy, xt, yy, yt, tt)).tolist()
 
 
 def unpack_information(upper: Sequence[float]) -> FloatArray:
