@@ -45,12 +45,12 @@ def pose_at(stamps):
     return np.stack([np.interp(stamps, dense, axis) for axis in axes], axis=-1)
 
 
-def ranges_at(stamps, rng):
+def ranges_at(stamps, rng, walls=WALLS):
     """A range for each beam, measured at its own time ``stamps`` (beam_count,)."""
     T_odom_laser = se2.compose(pose_at(stamps), LASER.T_base_laser)
     origins, angles = T_odom_laser[:, :2], T_odom_laser[:, 2] + LASER.angles_rad()
     ways = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-    begins, edges = WALLS[:, :2], WALLS[:, 2:] - WALLS[:, :2]
+    begins, edges = walls[:, :2], walls[:, 2:] - walls[:, :2]
     offsets = begins[None] - origins[:, None]
     cross = ways[:, None, 0] * edges[None, :, 1] - ways[:, None, 1] * edges[None, :, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -60,15 +60,15 @@ def ranges_at(stamps, rng):
     return (along.min(axis=1) + rng.normal(0.0, 0.005, len(angles))).astype(np.float32)
 
 
-def drive(seconds=20.0, states_sweep=True, odometry=None):
+def drive(seconds=20.0, states_sweep=True, odometry=None, begin_s=0.0, scan_s=SCAN_S, walls=WALLS):
     """Scans of the drive, with odometry ``odometry(stamp)`` at the stamp and in the sweep; None: unknown."""
-    rng = np.random.default_rng(3)
-    for stamp in np.arange(0.0, seconds, SCAN_S):
-        ranges = frozen(ranges_at(stamp + np.linspace(0.0, SWEEP_S, LASER.beam_count), rng), np.float32)
-        pose, sweep = np.full(3, np.nan), Sweep(0.0, SWEEP_S)
+    rng, sweep_s = np.random.default_rng(3), scan_s * SWEEP_S / SCAN_S
+    for stamp in np.arange(begin_s, begin_s + seconds, scan_s):
+        ranges = frozen(ranges_at(stamp + np.linspace(0.0, sweep_s, LASER.beam_count), rng, walls), np.float32)
+        pose, sweep = np.full(3, np.nan), Sweep(0.0, sweep_s)
         if odometry is not None:
             pose = odometry(stamp)
-            velocity = se2.between(pose, odometry(stamp + SWEEP_S)) / SWEEP_S
+            velocity = se2.between(pose, odometry(stamp + sweep_s)) / sweep_s
             sweep = sweep._replace(velocity=tuple(velocity.tolist()))
         yield LaserScan(float(stamp), ranges, LASER, frozen(pose), sweep if states_sweep else None)
 

@@ -124,13 +124,44 @@ def test_odometry_that_never_changes_is_not_used():
     frontend, _ = mapped(spinning.drive(odometry=lambda _: np.zeros(3)))
     assert frontend.prediction is not None
     assert len(frontend.tracks) == 2
-    assert spinning.error_m(frontend.tracks[1]) < 0.1  # it begins in motion, at an unknown velocity
+    assert spinning.error_m(frontend.tracks[1]) < 0.005
 
 
 def test_odometry_whose_heading_is_never_set_is_not_used():
     frontend, _ = mapped(spinning.drive(odometry=lambda stamp: spinning.pose_at(stamp) * (1.0, 1.0, 0.0)))
     assert frontend.prediction is not None
-    assert spinning.error_m(frontend.tracks[-1]) < 0.1
+    assert spinning.error_m(frontend.tracks[-1]) < 0.005
+
+
+@pytest.mark.parametrize("begin_s", [1.0, 1.6, 4.0])
+@pytest.mark.parametrize(("rate_hz", "most_m"), [(7.0, 0.005), (5.0, 0.01), (4.0, 0.025)])
+def test_without_odometry_a_robot_that_begins_in_a_turn_is_mapped(begin_s, rate_hz, most_m):
+    """It turns at up to 1.6 rad/s, so by 0.4 rad during a scan, and brakes at 2 rad/s^2."""
+    frontend, _ = mapped(spinning.drive(begin_s=begin_s, scan_s=1.0 / rate_hz))
+    assert len(frontend.tracks) == 1
+    assert len(frontend.tracks[0]) == round(20.0 * rate_hz)
+    assert spinning.error_m(frontend.tracks[0]) < most_m
+
+
+@pytest.mark.parametrize("at_s", [9.0, 10.0])
+def test_without_odometry_a_robot_put_into_another_room_during_its_drive_is_lost(at_s):
+    elsewhere = spinning.WALLS * (1.3, 1.5, 1.3, 1.5) + (0.5, 1.0, 0.5, 1.0)
+    drives = spinning.drive(at_s), spinning.drive(14.0, begin_s=at_s, walls=elsewhere)
+    frontend, _ = mapped(scan for part in drives for scan in part)
+    assert [len(track) * spinning.SCAN_S for track in frontend.tracks] == pytest.approx([at_s, 14.0], abs=0.4)
+    assert spinning.error_m(frontend.tracks[1]) < 0.01
+
+
+def test_the_first_scan_without_odometry_has_a_pose_before_the_second_comes():
+    scans, frontend = list(spinning.drive(2.0)), RobotFrontend("r", RobotConfig())
+    assert frontend.process(scans[0]) == []
+    assert frontend.newest.is_deferred
+    np.testing.assert_array_equal(frontend.scan_poses.in_odom(frontend.newest.pose), np.zeros(3))
+    assert {type(packet.body) for packet in frontend.process(scans[1])} >= {Keyscan}
+    assert not frontend.newest.is_deferred
+    alone, packets = mapped(scans[:1])
+    assert len(alone.scan_poses) == 1
+    assert sum(isinstance(packet.body, Keyscan) for packet in packets) == 1
 
 
 def test_a_robot_at_rest_keeps_its_odometry():

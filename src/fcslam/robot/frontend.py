@@ -21,6 +21,7 @@ from pydantic import Field
 
 from fcslam.errors import FeatureError
 from fcslam.geometry import se2
+from fcslam.lidar.first_motion import first_sweep
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, drove_on, has_moved_unseen, is_doubtful, is_lost
 from fcslam.lidar.odometry import WHEELS, OdometryModel
@@ -151,6 +152,10 @@ class RobotFrontend:
         """The newest scan of each laser that the map explained, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
         """Records since the first doubtful scan."""
+        self._beside = LidarFrontend(robot, config.lidar, PREDICTED)
+        """Matches deferred scans without odometry with each other."""
+        self._T_odom_beside = se2.IDENTITY
+        """Pose of the first one of them, shape (3,)."""
         self._T_local_deferred: FloatArray | None = None
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
         self._fixes: deque[GnssFix] = deque(maxlen=MOST_FIXES)
@@ -285,14 +290,30 @@ class RobotFrontend:
         newest = self.newest
         if self.prediction is None or newest is None:
             return
-        is_matched = newest.tracked.information.any() and not newest.is_deferred
-        T_smooth_base = self.scan_poses.in_odom(newest.pose) if is_matched else None
+        T_smooth_base = self.scan_poses.in_odom(newest.pose) if newest.tracked.information.any() else None
         self.prediction.observe(scan.stamp, T_smooth_base, newest.tracked.sweep)
 
     def _process_scan(self, scan: LaserScan) -> None:
         """Process a scan and learn the robot's motion from it."""
+        if self.prediction is not None and self.prediction.is_new and scan.sweep is not None:
+            if not self._deferred:  # the second scan shows the motion during the first one
+                self._deferred.append(scan)
+                self._previous, self.newest = scan, _unmatched(scan)
+                return
+            first = self._place_first(scan)
+            self._process_deferred()
+            self.prediction.begin(first)
+            scan = self.prediction.predict(scan)
         self._localize(scan)
-        self._observe(scan)
+        if not self._deferred:
+            self._observe(scan)
+
+    def _place_first(self, second: LaserScan) -> LaserScan:
+        """The first deferred scan, which begins a session, with the motion that the second one shows."""
+        first = self._deferred[0]
+        assert isinstance(first, LaserScan)  # images are deferred only behind a scan
+        self._deferred[0] = first = replace(first, sweep=first_sweep(first, second, PREDICTED))
+        return first
 
     def _localize(self, scan: LaserScan) -> None:
         before, self._previous = self._previous, scan
@@ -300,7 +321,7 @@ class RobotFrontend:
             self._process_deferred()
             self._end_session()
         # 1. Localize the scan; unless it is doubtful, process it.
-        tracking = self._lidar.localize(scan)
+        scan, tracking = self._matched(scan, self._lidar, self._in_odom(scan))
         may_be_frozen = self.prediction is None and self._wheels.may_be_frozen
         if not (may_be_frozen or is_doubtful(tracking, self._lidar, self._config.lost)):
             if self._deferred:
@@ -309,6 +330,8 @@ class RobotFrontend:
             self._map(scan, tracking)
             return
         # 2. Defer a doubtful scan until there are enough of them for a decision.
+        if self.prediction is not None:
+            scan = self._follow(self.prediction, scan, tracking)
         if self._T_local_deferred is None:
             self._T_local_deferred = tracking.tracked.T_local_base
         self._deferred.append(scan)
@@ -324,7 +347,41 @@ class RobotFrontend:
                 self._lidar.begin_local_map()
             else:
                 self._end_session()
+                if self.prediction is not None:
+                    self._place_first(scans[1])
         self._process_deferred()
+
+    def _matched(
+        self, scan: LaserScan, frontend: LidarFrontend, in_smooth: Callable[[TrackedScan], FloatArray]
+    ) -> tuple[LaserScan, TrackingResult]:
+        """Localize a scan; without odometry, its sweep is placed and localized again by the motion that was found."""
+        tracking = frontend.localize(scan)
+        if self.prediction is None or not tracking.tracked.information.any():
+            return scan, tracking
+        moving = self.prediction.moving(scan, in_smooth(tracking.tracked))
+        return (scan, tracking) if moving is scan else (moving, frontend.localize(moving))
+
+    def _in_odom(self, scan: LaserScan) -> Callable[[TrackedScan], FloatArray]:
+        """Where the scan is in the frame of its session, as it was localized."""
+        return lambda tracked: self.scan_poses.in_odom(self._lidar.scan_pose(scan.stamp, tracked))
+
+    def _follow(self, prediction: MotionPrediction, scan: LaserScan, tracking: TrackingResult) -> LaserScan:
+        """A doubtful scan of a robot without odometry, with its motion.
+
+        The first one is where the map has it. As they may show another place, the others are matched with each other.
+        """
+        if not self._deferred:
+            self._beside = LidarFrontend(self.robot, self._config.lidar, PREDICTED)
+            self._T_odom_beside = self._in_odom(scan)(tracking.tracked)
+            scan = prediction.follow(scan, self._T_odom_beside, tracking.tracked.sweep)
+            self._beside.process(scan)
+            return scan
+        origin = self._T_odom_beside
+        scan, beside = self._matched(scan, self._beside, lambda tracked: se2.compose(origin, tracked.T_local_base))
+        tracked = beside.tracked
+        scan = prediction.follow(scan, se2.compose(origin, tracked.T_local_base), tracked.sweep)
+        self._beside.process(scan, beside._replace(T_odom_base=scan.T_odom_base))
+        return scan
 
     def _end_session(self) -> None:
         """End a session and begin the next."""
@@ -424,6 +481,12 @@ def _moving_on(scan: LaserScan, before: LaserScan) -> LaserScan:
         return scan
     x, y, theta = (se2.log(se2.between(before.T_odom_base, scan.T_odom_base)) / elapsed_s).tolist()
     return replace(scan, sweep=scan.sweep._replace(velocity=(x, y, theta)))
+
+
+def _unmatched(scan: LaserScan) -> NewestScan:
+    """The first scan of a session before it is processed."""
+    tracked = TrackedScan(np.zeros(3), np.zeros((3, 3)), None, scan.sweep)
+    return NewestScan(ScanPose(scan.stamp, 0, se2.IDENTITY), tracked, math.nan, is_deferred=True)
 
 
 def _newest(pose: ScanPose, tracking: TrackingResult, is_deferred: bool) -> NewestScan:
