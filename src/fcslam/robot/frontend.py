@@ -152,8 +152,8 @@ class RobotFrontend:
         """The newest scan of each laser that the map explained, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
         """Records since the first doubtful scan."""
-        self._beside = LidarFrontend(robot, config.lidar, PREDICTED)
-        """Matches deferred scans without odometry with each other."""
+        self._beside: LidarFrontend | None = None
+        """Matches deferred scans without odometry with each other, from the second one on."""
         self._T_odom_beside = se2.IDENTITY
         """Pose of the first one of them, shape (3,)."""
         self._T_local_deferred: FloatArray | None = None
@@ -302,14 +302,14 @@ class RobotFrontend:
                 return
             first = self._place_first(scan)
             self._process_deferred()
-            self.prediction.begin(first)
+            self.prediction.begin(first, se2.IDENTITY)
             scan = self.prediction.predict(scan)
         self._localize(scan)
         if not self._deferred:
             self._observe(scan)
 
     def _place_first(self, second: LaserScan) -> LaserScan:
-        """The first deferred scan, which begins a session, with the motion that the second one shows."""
+        """The first deferred scan with the motion that the second one shows."""
         first = self._deferred[0]
         assert isinstance(first, LaserScan)  # images are deferred only behind a scan
         self._deferred[0] = first = replace(first, sweep=first_sweep(first, second, PREDICTED))
@@ -347,8 +347,6 @@ class RobotFrontend:
                 self._lidar.begin_local_map()
             else:
                 self._end_session()
-                if self.prediction is not None:
-                    self._place_first(scans[1])
         self._process_deferred()
 
     def _matched(
@@ -371,12 +369,15 @@ class RobotFrontend:
         The first one is where the map has it. As they may show another place, the others are matched with each other.
         """
         if not self._deferred:
-            self._beside = LidarFrontend(self.robot, self._config.lidar, PREDICTED)
-            self._T_odom_beside = self._in_odom(scan)(tracking.tracked)
-            scan = prediction.follow(scan, self._T_odom_beside, tracking.tracked.sweep)
-            self._beside.process(scan)
-            return scan
+            self._beside, self._T_odom_beside = None, self._in_odom(scan)(tracking.tracked)
+            return prediction.follow(scan, self._T_odom_beside, tracking.tracked.sweep)
         origin = self._T_odom_beside
+        if self._beside is None:
+            first = self._place_first(scan)
+            self._beside = LidarFrontend(self.robot, self._config.lidar, PREDICTED)
+            self._beside.process(first)
+            prediction.begin(first, origin)
+            scan = prediction.predict(scan)
         scan, beside = self._matched(scan, self._beside, lambda tracked: se2.compose(origin, tracked.T_local_base))
         tracked = beside.tracked
         scan = prediction.follow(scan, se2.compose(origin, tracked.T_local_base), tracked.sweep)

@@ -47,9 +47,10 @@ class MotionPrediction:
         self.is_new = True
         """Whether the robot has not begun to move."""
 
-    def begin(self, first: LaserScan) -> None:
-        """Go on from the first scan, whose sweep has the robot's motion."""
-        self.is_new, self._last, self._sweep = False, (first.stamp, np.zeros(3)), first.sweep
+    def begin(self, first: LaserScan, T_smooth_base: FloatArray) -> None:
+        """Go on from a scan whose sweep has the robot's motion; its pose, shape (3,), as in ``observe``."""
+        self.is_new, self._last, self._sweep = False, (first.stamp, T_smooth_base), first.sweep
+        self._T_odom_base = first.T_odom_base
 
     def predict(self, scan: LaserScan) -> LaserScan:
         """The next scan with its pose in a frame of the prediction's own, and with the motion during its sweep."""
