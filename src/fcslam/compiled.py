@@ -83,7 +83,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     _impl_class = _CachedCode
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """As numba's, but it does not load all that only the compiler needs, which takes 0.2 s and 8 MB."""
+        """As numba's, but it does not load all that only the compiler needs, which takes 0.2 s and 11 MB."""
         _load_array_functions()
         rtsys.initialize(target_context)
         with suppress(OSError), self._locked():
