@@ -200,6 +200,10 @@ class LidarFrontend:
         """Trust in odometry, learned from all matches so far."""
         return self._tracker.trust
 
+    def T_odom_base(self, T_local_base: FloatArray) -> FloatArray:
+        """Pose by odometry, shape (3,), of a scan that is predicted at a pose in the tracker's frame, shape (3,)."""
+        return self._tracker.T_odom_base(T_local_base)
+
     def begin_local_map(self) -> None:
         """Forget the surfaces seen so far. The next keyscan is tied to the one before by odometry alone."""
         self._tracker.empty_buffer()

@@ -4,7 +4,9 @@ A robot that was picked up and put down elsewhere, or whose odometry failed, see
 did. A single scan that explains little of the known area may come from a crowd or an opened door. So doubtful scans are
 deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
 
-A robot whose scans stopped while it drove on is lost, too: nobody saw the way.
+A robot whose scans stopped while it drove on is lost, too: nobody saw the way. Without odometry, nothing shows the
+motion in a gap of the scans. The scans after it are looked for in the map of the keyscans before it; unless they fit
+there in one way only, the robot is lost.
 
 The newest keyscans may contradict the scans although the robot drove on, as after a match to the ground. Then the scan
 before and one of the doubtful ones show one place, where odometry says. Such a robot only needs another local map.
@@ -24,7 +26,7 @@ from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import odometry_error
 from fcslam.lidar.scan import point_scan
-from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, TrackingResult
+from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED, TrackingResult
 from fcslam.lidar.verification import VERIFICATION, verify
 from fcslam.records import FloatArray, LaserScan
 
@@ -50,6 +52,15 @@ LOST_VIOLATION = 0.30
 """A lost robot sees a larger share of its points in known area in free space."""
 LEAST_OVERLAP = 0.25
 """Least share of all points in known area; below it, nothing is decided."""
+STAYED_M, LARGEST_SPEED, LONGEST_GAP_S = 1.0, 2.0, 5.0
+"""Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
+scans, m/s. After a longer gap, in seconds, that would be another room with the same walls: it must be where it was."""
+GAP_TRAVEL_M = 2.0
+"""``DOUBTFUL_TRAVEL_M`` after a gap, metres: more walls fit in fewer ways."""
+CLEAR, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
+"""The best alignment after a gap scores higher than the best one elsewhere by this factor. The one elsewhere counts as
+so many metres at least: a few walls are never unique. No larger share of the walls of one lies in free space of the
+other."""
 LARGEST_UNSEEN_M = 15.0
 """A robot that moved farther than this, in metres, between two scans is lost: nobody saw the way."""
 
@@ -73,33 +84,78 @@ def has_moved_unseen(before: LaserScan, now: LaserScan) -> bool:
 
 
 def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:
-    """Whether a scan may show another place than the scans before it."""
-    # False for a scan that was not matched, as both are NaN.
-    return frontend.settled_m >= SETTLED_M and tracking.explained < config.doubted * tracking.known
+    """Whether a scan may show another place than the scans before it.
+
+    So may a scan without odometry that was not accepted: nothing else says where the robot is.
+    """
+    if frontend.settled_m < SETTLED_M or not config.doubted:
+        return False
+    # Both are false for a scan that was not matched, as its shares are NaN.
+    is_rejected = not frontend.odometry.is_measured and tracking.explained < SUPPORTED
+    return is_rejected or tracking.explained < config.doubted * tracking.known
 
 
-def can_decide(scans: Sequence[LaserScan]) -> bool:
-    """Whether these consecutive doubtful scans are enough for a decision."""
+def can_decide(scans: Sequence[LaserScan], travel_m: float = DOUBTFUL_TRAVEL_M) -> bool:
+    """Whether these consecutive doubtful scans are enough for a decision, by the least travel over them in metres."""
     steps = se2.relative(np.array([scan.T_odom_base for scan in scans]))
-    far = len(scans) >= FEWEST_SCANS and np.hypot(steps[:, 0], steps[:, 1]).sum() >= DOUBTFUL_TRAVEL_M
+    far = len(scans) >= FEWEST_SCANS and np.hypot(steps[:, 0], steps[:, 1]).sum() >= travel_m
     return bool(far) or len(scans) >= MOST_SCANS
 
 
-def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: LidarFrontend) -> bool:
+def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
     """Whether deferred scans show another place than the newest keyscans of the front end.
 
     Args:
         scans: consecutive scans that the front end has not processed.
-        T_local_first: pose of the first of them in the tracker's local frame, shape (3,), metres and radians.
         frontend: the robot's front end; it does not change.
     """
     fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
     if not _are_consistent(scans, fresh):
         return False
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
+    T_local_first = frontend.localize(scans[0]).tracked.T_local_base
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
     worse = verify(before, now, predicted, VERIFICATION).worse
     return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
+
+
+def is_unplaced(scan: LaserScan, frontend: LidarFrontend) -> bool:
+    """Whether neither odometry nor the map says where a scan is."""
+    return not frontend.odometry.is_measured and not frontend.localize(scan).tracked.information.any()
+
+
+def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray | None:
+    """Where deferred scans are among the newest keyscans of the front end, wherever they were predicted.
+
+    Args:
+        scans: consecutive scans that the front end has not processed.
+        frontend: the robot's front end; it does not change.
+
+    Returns:
+        Pose of the first of them in the local frame of the tracker, shape (3,), metres and radians. None: no place is
+        clearly the best.
+    """
+    from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load, and few robots need them
+
+    fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
+    if not _are_consistent(scans, fresh):
+        return None
+    (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
+    found = two_best(before, now)
+    if found is None:
+        return None
+    best, rival = found
+    against_m = LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m)
+    if best.score_m < CLEAR * against_m or best.violation > LARGEST_VIOLATION:
+        return None
+    return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
+
+
+def is_in_reach(T_local_base: FloatArray, scan: LaserScan, frontend: LidarFrontend, gap_s: float) -> bool:
+    """Whether a robot without odometry may have come to a pose, shape (3,), in a gap of the scans before ``scan``."""
+    x, y, _ = se2.motion(frontend.localize(scan).tracked.T_local_base, T_local_base)
+    reach_m = STAYED_M + LARGEST_SPEED * (gap_s if gap_s <= LONGEST_GAP_S else 0.0)
+    return math.hypot(x, y) <= reach_m
 
 
 def drove_on(

@@ -212,6 +212,11 @@ class ScanTracker:
         """Trust in odometry, learned from all matches so far."""
         return self._trust
 
+    def T_odom_base(self, T_local_base: FloatArray) -> FloatArray:
+        """Pose by odometry, shape (3,), of a scan that is predicted at ``T_local_base``, shape (3,)."""
+        last = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
+        return se2.compose(last, se2.between(self._T_local_base, T_local_base))
+
     def empty_buffer(self) -> None:
         """Forget all keyscans: the pose goes on by odometry until the next one is inserted."""
         self._fields = []

@@ -23,7 +23,19 @@ from fcslam.errors import FeatureError
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import first_sweep
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
-from fcslam.lidar.lost import LostConfig, can_decide, drove_on, has_moved_unseen, is_doubtful, is_lost
+from fcslam.lidar.lost import (
+    DOUBTFUL_TRAVEL_M,
+    GAP_TRAVEL_M,
+    LostConfig,
+    can_decide,
+    drove_on,
+    has_moved_unseen,
+    is_doubtful,
+    is_in_reach,
+    is_lost,
+    is_unplaced,
+    relocated,
+)
 from fcslam.lidar.odometry import WHEELS, OdometryModel
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
 from fcslam.records import (
@@ -36,6 +48,7 @@ from fcslam.records import (
     LaserScan,
     SensorRecord,
     Sweep,
+    frozen,
 )
 from fcslam.robot.backend import (
     BackendInput,
@@ -156,8 +169,8 @@ class RobotFrontend:
         """Matches deferred scans without odometry with each other, from the second one on."""
         self._T_odom_beside = se2.IDENTITY
         """Pose of the first one of them, shape (3,)."""
-        self._T_local_deferred: FloatArray | None = None
-        """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
+        self._gap_s = 0.0
+        """Time before the first of them in which nothing shows the motion."""
         self._fixes: deque[GnssFix] = deque(maxlen=MOST_FIXES)
         """Fixes of satellite navigation that wait for the next scan."""
         self._fixed = -1
@@ -247,7 +260,7 @@ class RobotFrontend:
 
     def begin_session(self) -> None:
         """End the present session and begin another: the next scan is of another place, as after a ride in a lift."""
-        self._process_deferred()
+        self._end_deferral()
         if self.newest is None:
             self._lidar = LidarFrontend(self.robot, self._config.lidar, self.odometry_model)
         else:
@@ -256,7 +269,7 @@ class RobotFrontend:
 
     def finish(self) -> list[Packet]:
         """End the recording; returns all packets that are left."""
-        self._process_deferred()
+        self._end_deferral()
         self._submit(SessionEnd())
         return self.ready(wait=True)
 
@@ -274,12 +287,12 @@ class RobotFrontend:
 
     def _begin_without_odometry(self, prediction: MotionPrediction) -> None:
         """Begin a session whose motion is predicted, with the scans at which the odometry was frozen."""
-        frozen: list[LaserScan | CameraImage] = []
+        held: list[LaserScan | CameraImage] = []
         if self._wheels.may_be_frozen:
             self.scan_poses.cut(self._wheels.certain_s)
-            frozen, self._deferred, self._T_local_deferred = self._deferred, [], None
+            held, self._deferred = self._deferred, []
         self.begin_session()
-        for record in frozen:
+        for record in held:
             if isinstance(record, LaserScan):
                 self._process_scan(prediction.predict(record))
             else:
@@ -318,12 +331,16 @@ class RobotFrontend:
     def _localize(self, scan: LaserScan) -> None:
         before, self._previous = self._previous, scan
         if before is not None and has_moved_unseen(before, scan):
-            self._process_deferred()
+            self._end_deferral()
             self._end_session()
+        elif before is not None and self._is_unseen(before, scan):
+            self._end_deferral()
+            self._gap_s = scan.stamp - before.stamp
         # 1. Localize the scan; unless it is doubtful, process it.
+        predicted = scan
         scan, tracking = self._matched(scan, self._lidar, self._in_odom(scan))
         may_be_frozen = self.prediction is None and self._wheels.may_be_frozen
-        if not (may_be_frozen or is_doubtful(tracking, self._lidar, self._config.lost)):
+        if not (may_be_frozen or self._gap_s or is_doubtful(tracking, self._lidar, self._config.lost)):
             if self._deferred:
                 self._process_deferred()
                 tracking = self._lidar.localize(scan)
@@ -331,23 +348,64 @@ class RobotFrontend:
             return
         # 2. Defer a doubtful scan until there are enough of them for a decision.
         if self.prediction is not None:
-            scan = self._follow(self.prediction, scan, tracking)
-        if self._T_local_deferred is None:
-            self._T_local_deferred = tracking.tracked.T_local_base
+            scan = self._follow(self.prediction, predicted, tracking)
         self._deferred.append(scan)
         self.newest = _newest(self._lidar.scan_pose(scan.stamp, tracking.tracked), tracking, is_deferred=True)
-        scans = [record for record in self._deferred if isinstance(record, LaserScan)]
-        if may_be_frozen or not can_decide(scans):
-            return
-        # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them. If the
-        # robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
-        if is_lost(scans, self._T_local_deferred, self._lidar):
+        travel_m = GAP_TRAVEL_M if self._gap_s else DOUBTFUL_TRAVEL_M
+        if not may_be_frozen and can_decide(self._deferred_scans, travel_m):
+            self._decide()
+
+    @property
+    def _deferred_scans(self) -> list[LaserScan]:
+        return [record for record in self._deferred if isinstance(record, LaserScan)]
+
+    def _is_unseen(self, before: LaserScan, scan: LaserScan) -> bool:
+        """Whether nothing shows the motion between two scans: there is a gap, and no odometry."""
+        is_gap = self.prediction is not None and scan.stamp - before.stamp > LONGEST_S
+        return is_gap and self._newest is not None and self._config.lost.doubted > 0.0
+
+    def _decide(self) -> None:
+        """Decide about the deferred scans.
+
+        Another place: the robot is lost, and a new session begins with them. Same place: they are processed. If the
+        robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
+        """
+        scans = self._deferred_scans
+        if not self._gap_s and is_lost(scans, self._lidar):
             is_whole = self.odometry.jumps == self._jumps
             if is_whole and drove_on(self._explained, scans, self._lidar):
                 self._lidar.begin_local_map()
             else:
                 self._end_session()
+        elif self.prediction is not None:
+            T_local_first = relocated(scans, self._lidar)
+            if T_local_first is None:
+                is_elsewhere = self._gap_s > 0.0 or is_unplaced(scans[0], self._lidar)
+            else:
+                is_elsewhere = not is_in_reach(T_local_first, scans[0], self._lidar, self._gap_s)
+            if is_elsewhere:
+                self._end_session()
+            elif T_local_first is not None:
+                self._move_deferred(self.prediction, scans[0], T_local_first)
         self._process_deferred()
+
+    def _end_deferral(self) -> None:
+        """Process the deferred records before there are enough of them for a decision; decide after a gap."""
+        if self._gap_s and len(self._deferred_scans) > 1:
+            self._decide()
+        else:
+            self._process_deferred()
+
+    def _move_deferred(self, prediction: MotionPrediction, first: LaserScan, T_local_first: FloatArray) -> None:
+        """Predict the first deferred scan at a pose in the local frame, shape (3,), and the others after it."""
+        T = se2.compose(self._lidar.T_odom_base(T_local_first), se2.inverse(first.T_odom_base))
+        prediction.move(T)
+        self._deferred = [
+            replace(record, T_odom_base=frozen(se2.compose(T, record.T_odom_base)))
+            if isinstance(record, LaserScan)
+            else record
+            for record in self._deferred
+        ]
 
     def _matched(
         self, scan: LaserScan, frontend: LidarFrontend, in_smooth: Callable[[TrackedScan], FloatArray]
@@ -397,7 +455,7 @@ class RobotFrontend:
 
     def _process_deferred(self) -> None:
         """Process the deferred records normally."""
-        records, self._deferred, self._T_local_deferred = self._deferred, [], None
+        records, self._deferred, self._gap_s = self._deferred, [], 0.0
         for record in records:
             if isinstance(record, LaserScan):
                 self._map(record, self._lidar.localize(record))

@@ -102,6 +102,10 @@ class MotionPrediction:
         self.observe(scan.stamp, T_smooth_base, sweep)
         return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
 
+    def move(self, T: FloatArray) -> None:
+        """Move the frame of the predictions by ``T``, shape (3,), as the robot was found elsewhere."""
+        self._T_odom_base, self._T_odom_last = se2.compose(T, self._T_odom_base), se2.compose(T, self._T_odom_last)
+
     def observe(self, stamp: float, T_smooth_base: FloatArray | None, sweep: Sweep | None) -> None:
         """Where the tracker found the scan.
 
