@@ -152,6 +152,44 @@ def test_without_odometry_a_robot_put_into_another_room_during_its_drive_is_lost
     assert spinning.error_m(frontend.tracks[1]) < 0.01
 
 
+def cut(scans, begin_s, end_s):
+    return [scan for scan in scans if not begin_s <= scan.stamp < end_s]
+
+
+@pytest.mark.parametrize(("begin_s", "end_s"), [(5.0, 7.5), (9.0, 12.0), (11.0, 13.0), (7.0, 10.5)])
+def test_without_odometry_a_robot_that_drives_on_in_a_gap_of_its_scans_is_found_again(begin_s, end_s):
+    """It moves by up to 1.0 m and 2.3 rad in these gaps."""
+    scans = cut(spinning.drive(25.0), begin_s, end_s)
+    frontend, _ = mapped(scans)
+    assert len(frontend.tracks) == 1
+    assert len(frontend.tracks[0]) == len(scans)
+    assert spinning.error_m(frontend.tracks[0]) < 0.01
+
+
+@pytest.mark.parametrize("gap_s", [2.0, 3.0])
+def test_without_odometry_a_robot_put_into_another_room_in_a_gap_is_lost(gap_s):
+    elsewhere = spinning.WALLS * (1.3, 1.5, 1.3, 1.5) + (0.5, 1.0, 0.5, 1.0)
+    drives = spinning.drive(9.0), spinning.drive(14.0, begin_s=9.0 + gap_s, walls=elsewhere)
+    frontend, _ = mapped(scan for part in drives for scan in part)
+    assert [len(track) * spinning.SCAN_S for track in frontend.tracks] == pytest.approx([9.0, 14.0], abs=0.2)
+    assert all(spinning.error_m(track) < 0.01 for track in frontend.tracks)
+
+
+@pytest.mark.parametrize(("moved_s", "sessions"), [(0.0, 1), (12.0, 2)])
+def test_after_a_long_gap_without_odometry_a_robot_must_be_where_it_was(moved_s, sessions):
+    """It moves by 2.5 m."""
+    later = (replace(scan, stamp=scan.stamp + 60.0 - moved_s) for scan in spinning.drive(8.0, begin_s=9.0 + moved_s))
+    frontend, _ = mapped([*spinning.drive(9.0), *later])
+    assert len(frontend.tracks) == sessions
+
+
+def test_a_few_scans_between_two_gaps_do_not_enter_a_map_at_a_wrong_place():
+    scans = cut(cut(spinning.drive(25.0), 8.0, 10.5), 11.0, 13.5)
+    frontend, _ = mapped(scans)
+    assert sum(len(track) for track in frontend.tracks) == len(scans)
+    assert all(spinning.error_m(track) < 0.02 for track in frontend.tracks)
+
+
 def test_the_first_scan_without_odometry_has_a_pose_before_the_second_comes():
     scans, frontend = list(spinning.drive(2.0)), RobotFrontend("r", RobotConfig())
     assert frontend.process(scans[0]) == []
