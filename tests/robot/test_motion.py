@@ -8,7 +8,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.records import Keyscan, Odometry, frozen
-from fcslam.robot.calibrating import calibrated
+from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
 from tests.robot import spinning
@@ -85,6 +85,27 @@ def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
     assert spinning.error_m(frontend.tracks[0]) < 0.02
     keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
     assert max(abs(keyscan.sweep.velocity[2]) for keyscan in keyscans) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("first_s", "last_s"), [(0.0, spinning.SWEEP_S), (spinning.SWEEP_S, 0.0), (0.0, 0.0)], ids=["ccw", "cw", "at once"]
+)
+def test_without_odometry_the_motion_shows_the_times_of_beams_that_a_bag_does_not_state(tmp_path, first_s, last_s):
+    rng, beams_s = np.random.default_rng(3), np.linspace(first_s, last_s, spinning.LASER.beam_count)
+    write_bag(
+        tmp_path / "r.mcap",
+        [
+            replace(scan, stamp=scan.stamp + spinning.BEGIN_S, ranges_m=frozen(ranges, np.float32))
+            for scan in spinning.drive(states_sweep=False)
+            for ranges in [spinning.ranges_at(scan.stamp + beams_s, rng)]
+        ],
+    )
+    bag = open_source(tmp_path / "r.mcap")
+    sweep = calibrate_bag(bag, LidarConfig()).correction.sweep
+    assert sweep is None if first_s == last_s else sweep == pytest.approx((first_s, last_s), abs=0.003)
+    frontend, _ = mapped(calibrated(bag, LidarConfig()).records())
+    assert len(frontend.tracks) == 1
+    assert spinning.error_m(frontend.tracks[0]) < 0.01
 
 
 def test_a_drive_along_one_circle_fixes_no_mounting(tmp_path, monkeypatch):

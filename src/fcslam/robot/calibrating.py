@@ -208,7 +208,8 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig, is_bent: bool) -> Calibr
     if len(motions.stamps) < 2:
         return Calibrated(MotionCalibration(), BagCorrection(), ())
     if odometry is None:
-        odometry = OdometryTrack(motions.stamps, _unwrapped(motions.T_local_base))
+        known = np.isfinite(motions.T_local_base[:, 0])
+        odometry = OdometryTrack(motions.stamps[known], _unwrapped(motions.T_local_base[known]))
         calibration = MotionCalibration(sweep_share=calibrate(motions, odometry).sweep_share)
     else:
         calibration = calibrate(motions, odometry)
@@ -309,7 +310,7 @@ def _tracked(
         prediction.observe(scan.stamp, tracked.tracked.T_local_base if is_matched else None, sweep)
         turn = float(sweep.displacement(sweep.last_s)[2] - sweep.displacement(sweep.first_s)[2])
         stamps.append(scan.stamp)
-        poses.append(tracked.tracked.T_local_base if is_matched or not stamps else unknown)
+        poses.append(tracked.tracked.T_local_base if is_matched else unknown)
         turned.append(turn if is_matched else np.nan)
         times.append((sweep.first_s, sweep.last_s))
         turn_rad += abs(turn)
@@ -377,11 +378,15 @@ def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nom
     if not is_late and not is_other:
         return _mounted(calibration, BagCorrection(), [])
     delay_s = calibration.delay.value if calibration.delay is not None and is_late else 0.0
-    taken = share.value if share is not None and is_other else nominal
-    if abs(abs(taken) - 1.0) < WHOLE_SHARE:
-        taken = math.copysign(1.0, taken)
+    taken = nominal
+    if share is not None and is_other:
+        is_whole = abs(abs(share.value) - 1.0) < max(WHOLE_SHARE, share.sigma)
+        taken = math.copysign(1.0, share.value) if is_whole else share.value
     first_s = assumed[0] * nominal + delay_s
     last_s = first_s + (0.0 if abs(taken) < AT_ONCE_SHARE else taken) * (assumed[1] - assumed[0])
+    if calibration.delay is None:  # without odometry, the stamp is taken to be that of the beam measured first
+        earliest_s = min(first_s, last_s, 0.0)
+        first_s, last_s = first_s - earliest_s, last_s - earliest_s
     correction, lines = BagCorrection(), []
     where = _stamped(first_s, last_s)
     if where is None:  # no beam is measured at the stamp: another clock
