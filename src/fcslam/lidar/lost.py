@@ -55,6 +55,8 @@ LEAST_OVERLAP = 0.25
 STAYED_M, LARGEST_SPEED, LONGEST_GAP_S = 1.0, 2.0, 5.0
 """Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
 scans, m/s. After a longer gap, in seconds, that would be another room with the same walls: it must be where it was."""
+SEEN_S = 2.0
+"""After a shorter gap, in seconds, a robot that is found nowhere counts as where it was: a match finds it again."""
 GAP_TRAVEL_M = 2.0
 """``DOUBTFUL_TRAVEL_M`` after a gap, metres: more walls fit in fewer ways."""
 CLEAR, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
@@ -132,8 +134,8 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
         frontend: the robot's front end; it does not change.
 
     Returns:
-        Pose of the first of them in the local frame of the tracker, shape (3,), metres and radians. None: no place is
-        clearly the best.
+        Pose of the first of them in the local frame of the tracker, shape (3,), metres and radians: where they fit
+        clearly best, or else where they were predicted if they agree with the keyscans there. None: neither.
     """
     from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load, and few robots need them
 
@@ -146,9 +148,13 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
         return None
     best, rival = found
     against_m = LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m)
-    if best.score_m < CLEAR * against_m or best.violation > LARGEST_VIOLATION:
-        return None
-    return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
+    if best.score_m >= CLEAR * against_m and best.violation <= LARGEST_VIOLATION:
+        return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
+    T_local_first = frontend.localize(scans[0]).tracked.T_local_base
+    predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
+    worse, gate = verify(before, now, predicted, VERIFICATION).worse, VERIFICATION.loose
+    agrees = worse.explained >= gate.explained and worse.violation <= gate.violation and worse.overlap >= gate.overlap
+    return T_local_first if agrees else None
 
 
 def is_in_reach(T_local_base: FloatArray, scan: LaserScan, frontend: LidarFrontend, gap_s: float) -> bool:

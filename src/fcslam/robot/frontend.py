@@ -26,6 +26,7 @@ from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import (
     DOUBTFUL_TRAVEL_M,
     GAP_TRAVEL_M,
+    SEEN_S,
     LostConfig,
     can_decide,
     drove_on,
@@ -378,15 +379,11 @@ class RobotFrontend:
             else:
                 self._end_session()
         elif self.prediction is not None:
-            T_local_first = relocated(scans, self._lidar)
-            if T_local_first is None:
-                is_elsewhere = self._gap_s > 0.0 or is_unplaced(scans[0], self._lidar)
-            else:
-                is_elsewhere = not is_in_reach(T_local_first, scans[0], self._lidar, self._gap_s)
-            if is_elsewhere:
+            found = relocated(scans, self._lidar)
+            if found is not None and is_in_reach(found, scans[0], self._lidar, self._gap_s):
+                self._move_deferred(self.prediction, scans[0], found)
+            elif (found is not None and not self._gap_s) or self._gap_s > SEEN_S or is_unplaced(scans[0], self._lidar):
                 self._end_session()
-            elif T_local_first is not None:
-                self._move_deferred(self.prediction, scans[0], T_local_first)
         self._process_deferred()
 
     def _end_deferral(self) -> None:
