@@ -204,8 +204,11 @@ def test_after_a_long_gap_without_odometry_a_robot_must_be_where_it_was(moved_s,
     assert len(frontend.tracks) == sessions
 
 
-def test_a_few_scans_between_two_gaps_do_not_enter_a_map_at_a_wrong_place():
-    scans = cut(cut(spinning.drive(25.0), 8.0, 10.5), 11.0, 13.5)
+@pytest.mark.parametrize("gaps", [[(8.0, 10.5), (11.0, 13.5)], [(5.0, 7.5), (9.0, 10.2)], [(7.0, 10.5), (12.0, 13.2)]])
+def test_a_few_scans_between_two_gaps_do_not_enter_a_map_at_a_wrong_place(gaps):
+    scans = list(spinning.drive(25.0))
+    for gap in gaps:
+        scans = cut(scans, *gap)
     frontend, _ = mapped(scans)
     assert sum(len(track) for track in frontend.tracks) == len(scans)
     assert all(spinning.error_m(track) < 0.02 for track in frontend.tracks)

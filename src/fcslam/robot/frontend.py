@@ -334,8 +334,9 @@ class RobotFrontend:
         if before is not None and has_moved_unseen(before, scan):
             self._end_deferral()
             self._end_session()
-        elif before is not None and self._is_unseen(before, scan):
+        elif before is not None and self.prediction is not None and self._is_unseen(before, scan):
             self._end_deferral()
+            scan = self.prediction.predict(scan)  # the frame of the predictions may have moved
             self._gap_s = scan.stamp - before.stamp
         # 1. Localize the scan; unless it is doubtful, process it.
         predicted = scan
@@ -361,8 +362,8 @@ class RobotFrontend:
         return [record for record in self._deferred if isinstance(record, LaserScan)]
 
     def _is_unseen(self, before: LaserScan, scan: LaserScan) -> bool:
-        """Whether nothing shows the motion between two scans: there is a gap, and no odometry."""
-        is_gap = self.prediction is not None and scan.stamp - before.stamp > LONGEST_S
+        """Whether nothing shows the motion between two scans without odometry: there is a gap."""
+        is_gap = scan.stamp - before.stamp > LONGEST_S
         return is_gap and self._newest is not None and self._config.lost.doubted > 0.0
 
     def _decide(self) -> None:
