@@ -1,4 +1,4 @@
-"""After the warm-up, no pose waits for the compiler, not even that of a lost robot or after a gap in the scans."""
+"""After the warm-up, no pose waits for the compiler, not even that of a robot that is lost."""
 
 import json
 import subprocess
@@ -14,7 +14,6 @@ from fcslam.records import Channel
 from fcslam.robot.backend_runner import WorkerBackend
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.warmup import warm_up_tracking
-from tests.robot import spinning
 from tests.robot.kidnapping import kidnapping
 from tests.robot.test_backend_runner import Held
 
@@ -26,7 +25,7 @@ def compiled():
     }
 
 config, executor = RobotConfig(channels=(Channel.LIDAR,)), Held()
-robot, without_odometry = (RobotFrontend(name, config, WorkerBackend(name, config, executor)) for name in "rs")
+robot = RobotFrontend("r", config, WorkerBackend("r", config, executor))
 executor.holds = True  # only the front end works
 scans, _ = kidnapping()
 cold = compiled()
@@ -34,11 +33,7 @@ warm_up_tracking(config)
 warm = compiled()
 for scan in scans:
     robot.process(scan)
-for scan in spinning.drive(16.0):
-    if not 6.0 < scan.stamp < 9.0:
-        without_odometry.process(scan)
-tracks = len(robot.tracks), len(without_odometry.tracks)
-print(json.dumps([cold != warm, gc.get_freeze_count() > 0, *tracks, warm == compiled()]))
+print(json.dumps([cold != warm, gc.get_freeze_count() > 0, len(robot.tracks), warm == compiled()]))
 """
 
 
@@ -46,4 +41,4 @@ print(json.dumps([cold != warm, gc.get_freeze_count() > 0, *tracks, warm == comp
 def test_after_the_warm_up_a_robot_finds_all_its_code_compiled():
     root = Path(__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", SCRIPT], cwd=root, capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout) == [True, True, 2, 1, True]
+    assert json.loads(done.stdout) == [True, True, 2, True]
