@@ -5,8 +5,8 @@ did. A single scan that explains little of the known area may come from a crowd 
 deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
 
 A robot whose scans stopped while it drove on is lost, too: nobody saw the way. Without odometry, nothing shows the
-motion in a gap of the scans. The scans after it are looked for in the map of the keyscans before it; unless they fit
-there in one way only, the robot is lost.
+motion in a gap of the scans. The scans after it are looked for in the map of the keyscans before it. The robot is lost
+unless they fit there in one way only, or agree with the map where they were matched.
 
 The newest keyscans may contradict the scans although the robot drove on, as after a match to the ground. Then the scan
 before and one of the doubtful ones show one place, where odometry says. Such a robot only needs another local map.
