@@ -179,7 +179,7 @@ def cut(scans, begin_s, end_s):
 
 @pytest.mark.parametrize(("begin_s", "end_s"), [(5.0, 7.5), (9.0, 12.0), (11.0, 13.0), (7.0, 10.5)])
 def test_without_odometry_a_robot_that_drives_on_in_a_gap_of_its_scans_is_found_again(begin_s, end_s):
-    """It moves by up to 1.0 m and 2.3 rad in these gaps."""
+    """It moves by up to 1.0 m and 2.1 rad in these gaps."""
     scans = cut(spinning.drive(25.0), begin_s, end_s)
     frontend, _ = mapped(scans)
     assert len(frontend.tracks) == 1

@@ -26,6 +26,7 @@ from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import odometry_error
 from fcslam.lidar.scan import point_scan
+from fcslam.lidar.submap import Agreement
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED, TrackingResult
 from fcslam.lidar.verification import VERIFICATION, verify
 from fcslam.records import FloatArray, LaserScan
@@ -114,10 +115,7 @@ def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
     fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
     if not _are_consistent(scans, fresh):
         return False
-    (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
-    T_local_first = frontend.localize(scans[0]).tracked.T_local_base
-    predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
-    worse = verify(before, now, predicted, VERIFICATION).worse
+    worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh)
     return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
 
 
@@ -151,10 +149,19 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
     if best.score_m >= CLEAR * against_m and best.violation <= LARGEST_VIOLATION:
         return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
     T_local_first = frontend.localize(scans[0]).tracked.T_local_base
-    predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
-    worse, gate = verify(before, now, predicted, VERIFICATION).worse, VERIFICATION.loose
+    worse, gate = _agreement_at(T_local_first, frontend, fresh), VERIFICATION.loose
     agrees = worse.explained >= gate.explained and worse.violation <= gate.violation and worse.overlap >= gate.overlap
     return T_local_first if agrees else None
+
+
+def _agreement_at(T_local_first: FloatArray, frontend: LidarFrontend, fresh: LidarFrontend) -> Agreement:
+    """How well the map of the deferred scans in ``fresh`` agrees with the newest keyscans of the front end.
+
+    ``T_local_first``, shape (3,), is the pose of the first of them, where the alignment begins.
+    """
+    (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
+    predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
+    return verify(before, now, predicted, VERIFICATION).worse
 
 
 def is_in_reach(T_local_base: FloatArray, scan: LaserScan, frontend: LidarFrontend, gap_s: float) -> bool:
