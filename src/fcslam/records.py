@@ -491,6 +491,8 @@ class ReasonCode(StrEnum):
     FEW_PLACES = "few_separate_places"
     NOT_UNIQUE = "alignment_not_unique"
     MAPS_CONTRADICT = "maps_contradict"
+    WALLS_DIFFER = "walls_differ"
+    LOOK_ALIKE = "fits_elsewhere"
     NO_LEAD = "no_clear_lead"
     RIVAL_PLACES = "rival_has_more_places"
     OUTSIDE_CLUSTER = "outside_dominant_cluster"
@@ -524,6 +526,8 @@ _REASON_TEXT = {
     ReasonCode.FEW_PLACES: "they agree from {value} separate places, {limit} needed",
     ReasonCode.NOT_UNIQUE: "the alignment is not unique: its score is {value} times the best elsewhere, {limit} needed",
     ReasonCode.MAPS_CONTRADICT: "a share of {value} of the aligned maps' surfaces lies in free space, {limit} allowed",
+    ReasonCode.WALLS_DIFFER: "their walls lie farther apart than those of one place: likeness {value}, {limit} needed",
+    ReasonCode.LOOK_ALIKE: "the maps fit elsewhere, too: {value} times as well, {limit} allowed",
     ReasonCode.NO_LEAD: "{value} times as many closures agree as contradict them, {limit} times needed",
     ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
     ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",

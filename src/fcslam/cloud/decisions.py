@@ -5,6 +5,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple
+from functools import partial
 
 import numpy as np
 
@@ -19,9 +20,6 @@ from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
-from fcslam.graph.consistency import Closures
-from fcslam.graph.evidence import Uniqueness
-from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.scan import keyscan_points
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
@@ -40,9 +38,6 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 
-EXAMINED_GROWTH = 1.5
-"""The maps of two sessions are compared again when their cluster has grown by this factor: at each place, it would take
-longer than all else."""
 CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
 the same evidence would be weighed again at every place."""
@@ -64,8 +59,6 @@ class ClosureDecisions:
         self._sessions = sessions
         self._graph = graph
         self._comparison = MapComparison(sessions, config.matcher.verification, config.consistency.separation_m)
-        self._examined: dict[frozenset[str], int] = {}
-        """Size of the cluster when the maps of two sessions were compared last."""
         self._short: dict[frozenset[str], int] = {}
         """Closures of two sessions when their evidence fell short last."""
         self.closures = ClosureLog()
@@ -156,7 +149,7 @@ class ClosureDecisions:
             self.closures,
             self._config.consistency,
             self._config.contradiction,
-            self._comparison.uniqueness,
+            partial(self._comparison.fit, growth=1.0) if final else self._comparison.fit,
             self._comparison.overlap,
         )
         self.maps = [list(sessions) for sessions in fusion.maps]
@@ -170,7 +163,6 @@ class ClosureDecisions:
         """The state that ``restore`` needs."""
         return {
             "closures": self.closures.state(),
-            "examined": [(sorted(pair), size) for pair, size in self._examined.items()],
             "short": [(sorted(pair), size) for pair, size in self._short.items()],
             "comparison": self._comparison.state(),
             "maps": self.maps,
@@ -184,7 +176,6 @@ class ClosureDecisions:
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         self.closures.restore(state["closures"])
-        self._examined = {frozenset(pair): size for pair, size in state["examined"]}
         self._short = {frozenset(pair): size for pair, size in state["short"]}
         self._comparison.restore(state["comparison"])
         self.maps, self.version = state["maps"], state["version"]
@@ -287,7 +278,7 @@ class ClosureDecisions:
         entries, pair = self.closures.evidence(a, b), frozenset((a, b))
         if DECIDED_EACH_TIME < len(entries) < DECIDED_GROWTH * self._short.get(pair, 0):
             return
-        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._examine)
+        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
         joined = b in self.map_of(a)
         self._contested |= joined and decision.contested
         if decision.shortfall is not None:
@@ -314,14 +305,6 @@ class ClosureDecisions:
         """Why the maps of two sessions must not be joined, if paths contradict each other."""
         pairs = (frozenset((x, y)) for x in self.map_of(a) for y in self.map_of(b))
         return next((self._apart[pair] for pair in pairs if pair in self._apart), None)
-
-    def _examine(self, sessions: tuple[str, str], a: Trajectory, b: Trajectory, members: Closures) -> Uniqueness | None:
-        """Compare the maps of two sessions if their cluster is new or has grown much."""
-        pair = frozenset(sessions)
-        if len(members) < EXAMINED_GROWTH * self._examined.get(pair, 0):
-            return None
-        self._examined[pair] = len(members)
-        return self._comparison.uniqueness(sessions, a, b, members)
 
     def _join(self, members: list[ClosureEntry], a: str, b: str) -> None:
         """Move the younger map into the older one's frame."""

@@ -9,12 +9,12 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures, ConsistencySettings
-from fcslam.graph.evidence import Uniqueness
+from fcslam.graph.evidence import MapFit
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray
 
-ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures], Uniqueness | None]
-"""As ``MapComparison.uniqueness``."""
+ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures], MapFit | None]
+"""As ``MapComparison.fit``."""
 
 CONSISTENCY = "fleet.consistency"
 """Section of the configuration that holds the rule for joining maps."""

@@ -1,29 +1,53 @@
 """Comparison of the maps of two sessions: exhaustive around the places that match, or where a joint map lays them."""
 
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.graph.bridges import Overlap
 from fcslam.graph.cluster import relative_frame
 from fcslam.graph.consistency import Closures
-from fcslam.graph.evidence import Uniqueness
+from fcslam.graph.evidence import MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
-from fcslam.lidar.scan import keyscan_points
-from fcslam.lidar.submap import Submap, build_submap
+from fcslam.lidar.map_agreement import Agreement, LocalMap, compare, local_map, total
+from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.submap import RADIUS_M, Submap, build_submap
 from fcslam.lidar.verification import PARTIAL, VerificationConfig
-from fcslam.records import FloatArray, KeyscanId, frozen
+from fcslam.records import FloatArray, Keyscan, KeyscanId, frozen
 from fcslam.storage.state_file import State
 
-REACH_M = 20.0
-"""Keyscans up to this far from the middle of the matching places make a map: over a corridor's door period, to both
-sides."""
+REACH_M = 45.0
+"""Keyscans up to this far from the middle of the matching places make a map: of both wings of a building that repeats
+itself."""
 MOST_KEYSCANS = 300
 """Most keyscans of such a map; of more, evenly spaced ones."""
 LEAST_RIVAL_M = 5.0
 """The best transform elsewhere scores at least as much: maps with little surface are never unique."""
+
+GROWTH = 1.5
+"""The maps of two sessions are compared again when their cluster, or their paths together, have grown by this factor:
+at each place, it would take longer than all else."""
+MOST_TRANSFORMS = 3
+"""Comparisons of two sessions that are kept, at different transforms."""
+
+LOCAL_M = 8.0
+"""Keyscans up to this far from a place make its local map."""
+LOCAL_RADIUS_M = 14.0
+"""Radius of a local map."""
+FEWEST_LOCAL_KEYSCANS, MOST_LOCAL_KEYSCANS = 4, 30
+PLACES_APART_M = 4.0
+MOST_LOCAL_MAPS = 16
+"""Most places at which local maps are compared; of more, evenly spaced ones."""
+FARTHEST_M = 20.0
+"""A closure gives the transform between two maps up to this far along the path: beyond, drift counts."""
+DRIFT_M, DRIFT_RAD = 0.5, 0.1
+"""Local maps are aligned within these: farther off, another wall is the nearest one."""
+RIVALS = 2
+"""Transforms elsewhere at which local maps are compared: those with the best scores."""
 
 NEAR_M = 3.0
 """Paths of two robots this close together show the same surfaces, unless a wall is between them."""
@@ -57,10 +81,14 @@ class _Compared:
     """Pose of keyscan j in keyscan i, shape (3,), by the transform that was compared."""
     keyscans: int
     """Number of keyscans of the map that has fewer."""
-    uniqueness: Uniqueness
+    closures: int
+    """Number of closures in the cluster."""
+    size: int
+    """Number of keyscans of both sessions."""
+    fit: MapFit
 
     def reversed(self) -> "_Compared":
-        return _Compared(self.j, self.i, frozen(se2.inverse(self.T_i_j)), self.keyscans, self.uniqueness)
+        return replace(self, i=self.j, j=self.i, T_i_j=frozen(se2.inverse(self.T_i_j)))
 
 
 class MapComparison:
@@ -70,28 +98,45 @@ class MapComparison:
         self._sessions = sessions
         self._verification = verification
         self._separation_m = separation_m
-        self._compared: dict[frozenset[str], _Compared] = {}
-        """The comparison of each pair of sessions that had most keyscans: later, places may be forgotten."""
+        self._compared: dict[frozenset[str], list[_Compared]] = {}
+        """The last comparisons of each pair of sessions, one for each transform: later, places may be forgotten."""
 
-    def uniqueness(
-        self, sessions: tuple[str, str], a: Trajectory, b: Trajectory, members: Closures
-    ) -> Uniqueness | None:
-        """Compare the transform of a cluster with the best one elsewhere.
+    def fit(
+        self, sessions: tuple[str, str], a: Trajectory, b: Trajectory, members: Closures, growth: float = GROWTH
+    ) -> MapFit | None:
+        """Compare two maps at the transform of a cluster, and at the best transforms elsewhere.
 
         Args:
             sessions: names of a and b.
             a, b: their trajectories, each in its own coordinate frame.
             members: at least one closure from a to b; together they give the transform.
+            growth: factor by which the cluster or the paths must have grown since an earlier comparison.
 
         Returns:
-            The comparison; None if a session has no keyscan left around the places. If keyscans were released since an
-            earlier comparison at the same transform, that one.
+            The comparison; None if a session has no keyscan left around the places. An earlier one at the same
+            transform counts until the cluster or the paths have grown. It counts for good if keyscans
+            were released since.
         """
-        earlier = self._compared.get(frozenset(sessions))
-        found = self._compare(sessions, a, b, members, earlier)
+        pair = frozenset(sessions)
+        T_a_b, size = relative_frame(a, b, members), len(a) + len(b)
+        earlier = [each for each in self._compared.get(pair, ()) if self._is_at(each, sessions, a, b, T_a_b)]
+        if earlier and len(members) < growth * earlier[0].closures and size < growth * earlier[0].size:
+            return earlier[0].fit
+        found = self._compare(sessions, a, b, members, T_a_b, earlier)
         if found is not None:
-            self._compared[frozenset(sessions)] = found
-        return None if found is None else found.uniqueness
+            others = [each for each in self._compared.get(pair, ()) if each not in earlier]
+            self._compared[pair] = [found, *others[: MOST_TRANSFORMS - 1]]
+        return None if found is None else found.fit
+
+    @staticmethod
+    def _is_at(
+        compared: "_Compared", sessions: tuple[str, str], a: Trajectory, b: Trajectory, T_a_b: FloatArray
+    ) -> bool:
+        from fcslam.lidar.uniqueness import is_elsewhere
+
+        before = compared if compared.i.robot == sessions[0] else compared.reversed()
+        T_i_j = _between(a.poses[before.i.number], T_a_b, b.poses[before.j.number])
+        return not is_elsewhere(T_i_j, before.T_i_j, np.zeros((1, 2)))
 
     def _compare(
         self,
@@ -99,29 +144,34 @@ class MapComparison:
         a: Trajectory,
         b: Trajectory,
         members: Closures,
-        earlier: _Compared | None,
-    ) -> _Compared | None:
+        T_a_b: FloatArray,
+        earlier: "list[_Compared]",
+    ) -> "_Compared | None":
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
-        from fcslam.lidar.uniqueness import align_map, best_elsewhere, is_elsewhere
+        from fcslam.lidar.uniqueness import align_map, rivals_of
 
-        near_a = self._map_around(sessions[0], a.poses, a.poses[members.i, :2].mean(axis=0), REACH_M)
-        near_b = self._map_around(sessions[1], b.poses, b.poses[members.j, :2].mean(axis=0), REACH_M)
-        T_a_b = relative_frame(a, b, members)
-        if earlier is not None and not (near_a and near_b and near_a.is_complete and near_b.is_complete):
-            before = earlier if earlier.i.robot == sessions[0] else earlier.reversed()
-            T_i_j = _between(a.poses[before.i.number], T_a_b, b.poses[before.j.number])
-            has_more = not (near_a and near_b) or before.keyscans > min(near_a.keyscans, near_b.keyscans)
-            if has_more and not is_elsewhere(T_i_j, before.T_i_j, np.zeros((1, 2))):
-                return before
+        near_a = self._map_around(sessions[0], a.poses, a.poses[members.i, :2].mean(axis=0))
+        near_b = self._map_around(sessions[1], b.poses, b.poses[members.j, :2].mean(axis=0))
+        keyscans = min(near_a.keyscans if near_a else 0, near_b.keyscans if near_b else 0)
+        is_complete = near_a is not None and near_b is not None and near_a.is_complete and near_b.is_complete
+        if earlier and not is_complete and earlier[0].keyscans > keyscans:
+            return earlier[0]
         if near_a is None or near_b is None:
             return None
         i, j = near_a.anchor, near_b.anchor
-        T_i_j = _between(a.poses[i.number], T_a_b, b.poses[j.number])
+        T_a_i, T_b_j = a.poses[i.number], b.poses[j.number]
+        T_i_j = _between(T_a_i, T_a_b, T_b_j)
         best = align_map(near_a.submap, near_b.submap, T_i_j)
-        rival = best_elsewhere(near_a.submap, near_b.submap, best.T_a_b)
-        against_m = max(LEAST_RIVAL_M, rival.score_m) if rival is not None else LEAST_RIVAL_M
-        uniqueness = Uniqueness(max(0.0, best.score_m) / against_m, best.violation)
-        return _Compared(i, j, frozen(T_i_j), min(near_a.keyscans, near_b.keyscans), uniqueness)
+        rivals = rivals_of(near_a.submap, near_b.submap, best.T_a_b)
+        ratio = max(0.0, best.score_m) / max([LEAST_RIVAL_M, *(rival.score_m for rival in rivals)])
+        local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (a.poses, b.poses))
+        fit = _fit(local_maps.agreement(_transforms(a, b, members)), ratio, best.violation)
+        for rival in rivals[:RIVALS]:
+            T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
+            found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
+            if found.support > fit.rival_support and refutation(_fit(found)) is None:
+                fit = replace(fit, rival_support=found.support)
+        return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit)
 
     def overlap(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> Overlap:
         """Compare the maps of two sessions at separate places where their paths are close together.
@@ -137,12 +187,7 @@ class MapComparison:
         found_m, found_rows = cKDTree(poses_b[:, :2]).query(poses_a[:, :2], distance_upper_bound=NEAR_M)
         distance_m, nearest = np.asarray(found_m), np.asarray(found_rows)
         rows = np.flatnonzero(np.isfinite(distance_m))
-        chosen: list[int] = []
-        for row in rows.tolist():
-            if all(np.hypot(*(poses_a[row, :2] - poses_a[k, :2])) >= self._separation_m for k in chosen):
-                chosen.append(row)
-        if len(chosen) > MOST_PLACES:
-            chosen = [chosen[k] for k in np.linspace(0, len(chosen) - 1, MOST_PLACES).astype(np.int64)]
+        chosen = _at_most(_separate(poses_a, rows, self._separation_m), MOST_PLACES)
         agreeing = contradicting = 0
         for row in chosen:
             near_a = self._map_around(sessions[0], poses_a, poses_a[row, :2], OVERLAP_REACH_M)
@@ -159,29 +204,131 @@ class MapComparison:
 
     def state(self) -> State:
         """The state that ``restore`` needs."""
-        rows = [(c.i, c.j, c.T_i_j.tolist(), c.keyscans, astuple(c.uniqueness)) for c in self._compared.values()]
+        rows = [
+            (c.i, c.j, c.T_i_j.tolist(), c.keyscans, c.closures, c.size, astuple(c.fit))
+            for each in self._compared.values()
+            for c in each
+        ]
         return {"compared": rows}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        for i, j, T_i_j, keyscans, uniqueness in state["compared"]:
-            compared = _Compared(KeyscanId(*i), KeyscanId(*j), frozen(T_i_j), keyscans, Uniqueness(*uniqueness))
-            self._compared[frozenset((compared.i.robot, compared.j.robot))] = compared
+        for i, j, T_i_j, keyscans, closures, size, fit in state["compared"]:
+            compared = _Compared(KeyscanId(*i), KeyscanId(*j), frozen(T_i_j), keyscans, closures, size, MapFit(*fit))
+            self._compared.setdefault(frozenset((compared.i.robot, compared.j.robot)), []).append(compared)
 
-    def _map_around(self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float) -> _Near | None:
+    def _map_around(
+        self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float = REACH_M
+    ) -> _Near | None:
         """The session's map around a point (2,) in the frame of the poses (N, 3)."""
-        distance_m = np.hypot(*(poses[:, :2] - middle).T)
-        keyscans = [keyscan for keyscan in self._sessions.keyscans(session) if distance_m[keyscan.id.number] <= reach_m]
+        keyscans = self._keyscans_around(session, poses, middle, reach_m, MOST_KEYSCANS)
         if not keyscans:
             return None
-        is_complete = len(keyscans) == np.count_nonzero(distance_m <= reach_m)
-        if len(keyscans) > MOST_KEYSCANS:
-            rows = np.linspace(0, len(keyscans) - 1, MOST_KEYSCANS).astype(np.int64)
-            keyscans = [keyscans[row] for row in rows]
-        anchor = min((keyscan.id for keyscan in keyscans), key=lambda id_: distance_m[id_.number])
+        distance_m = np.hypot(*(poses[:, :2] - middle).T)
+        is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= reach_m)))
+        anchor = min((keyscan.id for keyscan in keyscans), key=lambda id_: float(distance_m[id_.number]))
+        submap = build_submap(self._scans(session, keyscans, poses, anchor), max(reach_m, RADIUS_M))
+        return _Near(submap, anchor, len(keyscans), is_complete)
+
+    def _keyscans_around(
+        self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float, most: int
+    ) -> list[Keyscan]:
+        """The keyscans of a session that are left around a point (2,); of many, ``most`` evenly spaced ones."""
+        distance_m = np.hypot(*(poses[:, :2] - middle).T)
+        keyscans = [keyscan for keyscan in self._sessions.keyscans(session) if distance_m[keyscan.id.number] <= reach_m]
+        return [keyscans[row] for row in _at_most(np.arange(len(keyscans)), most)]
+
+    def _scans(
+        self, session: str, keyscans: Sequence[Keyscan], poses: FloatArray, anchor: KeyscanId
+    ) -> list[tuple[PointScan, FloatArray]]:
         lasers, T_anchor = self._sessions.lasers(session), poses[anchor.number]
-        scans = [(keyscan_points(k, lasers), se2.between(T_anchor, poses[k.id.number])) for k in keyscans]
-        return _Near(build_submap(scans), anchor, len(keyscans), is_complete)
+        return [(keyscan_points(k, lasers), se2.between(T_anchor, poses[k.id.number])) for k in keyscans]
+
+
+def _fit(agreement: Agreement, ratio: float = 0.0, violation: float = 0.0) -> MapFit:
+    support, expected, known_m, contradicting_m = agreement
+    return MapFit(ratio, violation, support, expected, -np.inf, known_m, contradicting_m)
+
+
+class _LocalMaps:
+    """Local maps of two sessions around separate places of the second one's path, which are built once."""
+
+    def __init__(
+        self,
+        keyscans_around: Callable[[str, FloatArray, FloatArray, float, int], list[Keyscan]],
+        scans: Callable[[str, Sequence[Keyscan], FloatArray, KeyscanId], list[tuple[PointScan, FloatArray]]],
+        sessions: tuple[str, str],
+        poses: tuple[FloatArray, FloatArray],
+    ) -> None:
+        """``poses`` (N, 3) of both sessions' keyscans, each in its own frame, metres and radians."""
+        self._keyscans_around, self._scans = keyscans_around, scans
+        self._sessions, self._poses = sessions, poses
+        self._built: dict[tuple[int, int], LocalMap | None] = {}
+        self._places = _separate(poses[1], np.arange(len(poses[1])), PLACES_APART_M)
+
+    def agreement(self, T_a_b: FloatArray) -> Agreement:
+        """Compare the local maps of both sessions wherever the first one was near a place of the second.
+
+        ``T_a_b`` between their frames at each keyscan of b, shape (N, 3), metres and radians; NaN: not known.
+        """
+        from scipy.spatial import cKDTree
+
+        from fcslam.lidar.uniqueness import align_map
+
+        poses_a, poses_b = self._poses
+        places = [row for row in self._places if np.isfinite(T_a_b[row, 0])]
+        in_a = se2.compose(T_a_b[places], poses_b[places])
+        found_m, found_rows = cKDTree(poses_a[:, :2]).query(in_a[:, :2], distance_upper_bound=LOCAL_M)
+        nearest = np.asarray(found_rows)
+        near = _at_most(np.flatnonzero(np.isfinite(found_m)), MOST_LOCAL_MAPS)
+        agreements = []
+        for i, j in ((int(nearest[k]), int(places[k])) for k in near):
+            map_a, map_b = self._at(0, i), self._at(1, j)
+            if map_a is None or map_b is None:
+                continue
+            T_i_j = _between(poses_a[i], T_a_b[j], poses_b[j])
+            aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
+            off = se2.between(T_i_j, aligned)
+            is_near = np.hypot(off[0], off[1]) < DRIFT_M and abs(off[2]) < DRIFT_RAD
+            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j))
+        return total(agreements)
+
+    def _at(self, side: int, row: int) -> LocalMap | None:
+        """The local map around a keyscan of one of the sessions; None with too few keyscans."""
+        if (side, row) not in self._built:
+            session, poses = self._sessions[side], self._poses[side]
+            keyscans = self._keyscans_around(session, poses, poses[row, :2], LOCAL_M, MOST_LOCAL_KEYSCANS)
+            scans = self._scans(session, keyscans, poses, KeyscanId(session, row))
+            is_enough = len(scans) >= FEWEST_LOCAL_KEYSCANS
+            self._built[side, row] = local_map(scans, LOCAL_RADIUS_M) if is_enough else None
+        return self._built[side, row]
+
+
+def _separate(poses: FloatArray, rows: NDArray[np.int64], apart_m: float) -> NDArray[np.int64]:
+    """Those of the rows of poses (N, 3) that lie at least so far from those before."""
+    chosen: list[int] = []
+    for row in rows.tolist():
+        if not chosen or np.hypot(*(poses[row, :2] - poses[chosen, :2]).T).min() >= apart_m:
+            chosen.append(row)
+    return np.array(chosen, np.int64)
+
+
+def _at_most(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """The rows, or ``most`` evenly spaced ones."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
+
+
+def _transforms(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
+    """T_a_b (M, 3) at each keyscan of b by the closure that is nearest along b's path, so that drift does not count.
+
+    NaN farther than ``FARTHEST_M`` of path from any closure.
+    """
+    distance_m = np.abs(b.travel_m[:, None] - b.travel_m[members.j][None])
+    nearest = np.argmin(distance_m, axis=1)
+    T_a_b = se2.compose(se2.compose(a.poses[members.i], members.T_i_j), se2.inverse(b.poses[members.j]))
+    T: FloatArray = T_a_b[nearest]
+    T[distance_m.min(axis=1) > FARTHEST_M] = np.nan
+    return T
 
 
 def _between(T_a_i: FloatArray, T_a_b: FloatArray, T_b_j: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from fcslam.cloud.result import Fusion
 from fcslam.cloud.sessions import robot_of
 from fcslam.graph.bridges import Overlap
 from fcslam.graph.consistency import Closures, ConsistencySettings
-from fcslam.graph.evidence import Uniqueness
+from fcslam.graph.evidence import MapFit
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import Trajectory
@@ -41,7 +41,7 @@ def reevaluate(
     _enter(graph, (entry for entry in entries if entry.edge is None))
     robots = list(graph.robots())
 
-    def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> Uniqueness | None:
+    def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> MapFit | None:
         return examine((robots[a], robots[b]), path_a, path_b, members)
 
     def compare_pair(a: int, b: int, poses_a: FloatArray, poses_b: FloatArray) -> Overlap:

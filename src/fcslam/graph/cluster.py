@@ -10,12 +10,18 @@ from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
-from fcslam.graph.evidence import ClusterEvidence, Uniqueness, shortfall
+from fcslam.graph.evidence import ClusterEvidence, MapFit, shortfall
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
 
-Examine = Callable[[NDArray[np.int64]], Uniqueness | None]
-"""Compares the transform of some closures, given by their rows, shape (M,), with the best transform elsewhere."""
+Examine = Callable[[NDArray[np.int64]], MapFit | None]
+"""Compares the maps at the transform of some closures, given by their rows, shape (M,), and elsewhere."""
+
+_NO_LEAD = ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES
+_MAPS_DECIDE = ReasonCode.FEW_PLACES, *_NO_LEAD
+"""Reasons that a comparison of the maps may refute."""
+_MAPS_REFUTE = ReasonCode.MAPS_CONTRADICT, ReasonCode.WALLS_DIFFER, ReasonCode.LOOK_ALIKE
+"""Reasons of that comparison against a cluster; the one that contradicts it may be right."""
 
 DIRECTION_M = 1.0
 """Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
@@ -30,14 +36,15 @@ class ClusterDecision:
     """Whether one cluster of closures is dominant."""
 
     members: tuple[int, ...]
-    """Largest cluster of pairwise consistent closures."""
+    """Largest cluster of pairwise consistent closures, or the runner-up if only there the maps agree."""
     runner_up: tuple[int, ...]
     """Largest cluster that contradicts it: its closures are inconsistent with at least half of the members."""
     evidence: ClusterEvidence
     exact: bool
     """Whether both clusters are proven to be the largest."""
     contested: bool
-    """Whether the runner-up would be enough to join two maps as well, and the cluster is not clearly larger."""
+    """Whether the runner-up would be enough to join two maps as well and the cluster is not clearly larger, or the maps
+    do not agree."""
     shortfall: Reason | None
     """Why the cluster is not dominant; its setting is one of ``ConsistencySettings``."""
 
@@ -75,7 +82,7 @@ def decide_cluster(
         closures: K closures from a to b.
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: what a cluster needs.
-        examine: called where only the amount of evidence is open.
+        examine: compares the maps at the transform of a cluster.
 
     Returns:
         The decision; its members are rows of ``closures``.
@@ -154,8 +161,11 @@ def dominant_cluster(
     False closures from repeated structure are consistent with one another, too. So the cluster must have:
 
     - an informative member;
-    - a clear lead over the largest cluster that contradicts it: ``lead`` times as many closures, and no fewer places;
-    - enough evidence: members from separate places, or a unique alignment of the maps (``fcslam.graph.evidence``).
+    - maps that agree at its transform, and there clearly better than at any other (``fcslam.graph.evidence``). If they
+      do not, the largest cluster that contradicts it is tried;
+    - without a comparison of the maps, a clear lead over the cluster that contradicts it: ``lead`` times as many
+      closures, and no fewer places;
+    - enough evidence: members from separate places, or a unique alignment of the maps.
 
     Args:
         consistent: which pairs of closures are consistent, shape (K, K), from ``pairwise_consistency``.
@@ -163,7 +173,7 @@ def dominant_cluster(
             one coordinate frame.
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: what a cluster needs.
-        examine: called with the members where only the amount of evidence is open.
+        examine: called with the members of a cluster that has enough closures; None: the maps cannot be compared.
         shared_tags: counts the tags among the members that both robots saw from several keyscans.
 
     Returns:
@@ -171,29 +181,42 @@ def dominant_cluster(
     """
     xy, informs = np.asarray(places, dtype=np.float64), np.asarray(informative, dtype=bool)
     xy = xy.reshape(len(xy), xy.size // (2 * max(1, len(xy))), 2)
+
+    def decide(rows: NDArray[np.int64], rivals: NDArray[np.int64]) -> tuple[ClusterEvidence, Reason | None]:
+        evidence = replace(
+            evidence_of(xy[rows], informs[rows], shared_tags(rows), settings.separation_m),
+            rival_closures=len(rivals),
+            rival_places=count_separate_places(xy[rivals], settings.separation_m),
+        )
+        by_count = shortfall(evidence, settings)
+        if by_count is not None and by_count.code not in _MAPS_DECIDE:
+            return evidence, by_count
+        fit = examine(rows)
+        if fit is not None and by_count is not None and by_count.code in _NO_LEAD:
+            rival = examine(rivals)
+            fit = replace(fit, rival_support=max(fit.rival_support, rival.support if rival else np.inf))
+        evidence = replace(evidence, fit=fit)
+        return evidence, shortfall(evidence, settings)
+
     largest = maximum_clique(consistent)
-    members = list(largest.members)
+    members = np.array(largest.members, dtype=np.int64)
     others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
     others = np.setdiff1d(others, members)
     second = maximum_clique(consistent[np.ix_(others, others)])
     runner_up = others[list(second.members)]
-    rows = np.array(members, dtype=np.int64)
-    evidence = replace(
-        evidence_of(xy[members], informs[members], shared_tags(rows), settings.separation_m),
-        rival_closures=len(runner_up),
-        rival_places=count_separate_places(xy[runner_up], settings.separation_m),
-    )
-    reason = shortfall(evidence, settings)
-    if reason is not None and reason.code is ReasonCode.FEW_PLACES:
-        evidence = replace(evidence, uniqueness=examine(rows))
-        reason = shortfall(evidence, settings)
-    has_no_lead = reason is not None and reason.code in (ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES)
+    evidence, reason = decide(members, runner_up)
+    if reason is not None and reason.code in _MAPS_REFUTE:
+        rival_evidence, rival_reason = decide(runner_up, members)
+        if rival_reason is None:
+            members, runner_up, evidence, reason = runner_up, members, rival_evidence, None
+    has_no_lead = reason is not None and reason.code in _NO_LEAD
     return ClusterDecision(
-        members=largest.members,
+        members=tuple(members.tolist()),
         runner_up=tuple(runner_up.tolist()),
         evidence=evidence,
         exact=largest.exact and second.exact,
-        contested=has_no_lead and evidence.rival_places >= settings.minimum_evidence,
+        contested=(has_no_lead and evidence.rival_places >= settings.minimum_evidence)
+        or (reason is not None and reason.code in _MAPS_REFUTE),
         shortfall=reason,
     )
 

@@ -25,7 +25,7 @@ from fcslam.graph.cluster import (
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
 from fcslam.graph.contradiction import Strains, contradicting_robots
-from fcslam.graph.evidence import Uniqueness, shortfall
+from fcslam.graph.evidence import MapFit, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
@@ -34,7 +34,7 @@ from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode, frozen
 
-ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], Uniqueness | None]
+ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], MapFit | None]
 """Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
 the numbers of the robots, their own trajectories, and the closures."""
 
@@ -232,7 +232,7 @@ def _examine(
     own: Sequence[Trajectory],
     closures: Closures,
     members: NDArray[np.int64],
-) -> Uniqueness | None:
+) -> MapFit | None:
     a, b = robots
     return examine(a, b, own[a], own[b], closures.select(members))
 
@@ -392,7 +392,7 @@ def _is_confirmed(
     closures = link.closures.select(members)
     positions = closure_positions(own[link.a], own[link.b], closures)
     found = evidence_of(positions, informative[link.edges[members]], closures.shared_tags(), settings.separation_m)
-    remaining = replace(found, uniqueness=link.decision.evidence.uniqueness)
+    remaining = replace(found, fit=link.decision.evidence.fit)
     return 3 * len(members) > 2 * len(link.members) and shortfall(remaining, settings) is None
 
 

@@ -87,12 +87,17 @@ def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | No
     Returns:
         The alignment; None if a map is empty or no other transform puts a surface on a surface.
     """
+    return next(iter(rivals_of(a, b, T_a_b)), None)
+
+
+def rivals_of(a: Submap, b: Submap, T_a_b: FloatArray) -> list[MapAlignment]:
+    """The alignments of two maps elsewhere than ``T_a_b``, the best ones first; as ``best_elsewhere``."""
     if not len(a.surface) or not len(b.surface):
-        return None
+        return []
     middle = b.surface.points.mean(axis=0, keepdims=True)
     refined = (align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [T_a_b]))
     rivals = (rival for rival in refined if is_elsewhere(rival.T_a_b, T_a_b, middle))
-    return max(rivals, key=lambda rival: rival.score_m, default=None)
+    return sorted(rivals, key=lambda rival: -rival.score_m)
 
 
 def two_best(

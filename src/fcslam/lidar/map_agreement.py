@@ -1,0 +1,206 @@
+"""Whether two local maps show the same place: how far their walls lie apart, and which walls contradict.
+
+Places that look alike differ in detail. At the right transform, the walls of two maps lie on each other as well as the
+walls of two halves of one robot's own scans. At a wrong one, they lie some centimetres off, and some stand in the free
+space of the other map.
+
+Walls are compared in stretches of ``STRETCH_M``, whose offset ``o`` from the wall of the other map is a mean over their
+points. With the noise ``s`` of such an offset in the maps themselves, its log-likelihood ratio is
+
+    log p(o | same) - log p(o | other)
+    p(o | same)  = (1 - u) N(o; 0, s^2 + SAME_M^2) + u U
+    p(o | other) = (1 - u) N(o; 0, s^2 + OTHER_M^2) + u U
+
+where ``U`` is uniform over the reach of a comparison, and ``u`` the share of things that moved. A stretch in free space
+has the ratio of the shares of such stretches in maps of the same place and of another.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.compiled import njit
+from fcslam.geometry import se2
+from fcslam.lidar.field import EMPTY, label_at
+from fcslam.lidar.scan import PointScan
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, VIOLATION_M, Submap, build_submap
+from fcslam.records import FloatArray
+
+STRETCH_M: Final = 0.5
+"""Length of a stretch of wall: one independent measurement."""
+FEWEST_POINTS: Final = 3
+"""Least points of a stretch; points are ``SPACING_M`` apart."""
+SAME_M, OTHER_M = 0.012, 0.05
+"""Standard deviations of an offset in the same place (drift within a local map) and in another that looks alike, by
+comparisons of recorded and simulated floors."""
+MOVED: Final = 0.2
+"""Share of stretches whose offset is arbitrary, as of furniture that moved."""
+IN_FREE, IN_FREE_ELSEWHERE = 0.02, 0.11
+"""Shares of stretches in free space, in the same place and in another, for maps that do not contradict themselves."""
+LONGEST_SELF: Final = 0.15
+"""The share by which a map contradicts itself raises both by no more than this."""
+WALL_M: Final = 0.8
+"""Walls of at least this length contradict; shorter things are people, furniture and doors."""
+WIDEST_NOISE_M: Final = 0.1
+PARALLEL: Final = 0.7
+"""Least product of the normals of two points on one wall."""
+
+_UNKNOWN, _ON_WALL, _IN_FREE, _DEEP_IN_FREE = range(4)
+
+
+class Agreement(NamedTuple):
+    """How well two local maps agree at a transform; the sums over several places add up (``total``)."""
+
+    support: float = 0.0
+    """Log-likelihood ratio of the same place to another, nats."""
+    expected: float = 0.0
+    """Its expectation if the maps show the same place."""
+    known_m: float = 0.0
+    """Walls of each map in known area of the other, metres, summed over both maps."""
+    contradicting_m: float = 0.0
+    """Those of ``WALL_M`` or more in the other's free space, farther than the reach of its walls."""
+
+
+def total(agreements: Sequence[Agreement]) -> Agreement:
+    """The agreement over all places; zero without any."""
+    return Agreement(*(sum(values) for values in zip(*agreements, strict=True))) if agreements else Agreement()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalMap:
+    """A submap and its own noise."""
+
+    submap: Submap
+    noise_m: float
+    """Standard deviation of the offsets of stretches between two halves of its scans."""
+    in_free: float
+    """Share of the stretches of one half in the free space of the other."""
+
+
+def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) -> LocalMap:
+    """The map of at least two scans, as for ``build_submap``."""
+    whole, even, odd = (build_submap(part, radius_m) for part in (scans, scans[::2], scans[1::2]))
+    compared = [_stretches(even, odd, np.zeros(3)), _stretches(odd, even, np.zeros(3))]
+    offsets = np.abs(np.concatenate([each.offsets_m for each in compared]))
+    noise_m = min(WIDEST_NOISE_M, float(np.quantile(offsets, 0.68))) if len(offsets) else WIDEST_NOISE_M
+    in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
+    return LocalMap(whole, noise_m, in_free)
+
+
+def compare(a: LocalMap, b: LocalMap, T_a_b: FloatArray) -> Agreement:
+    """Compare two local maps at a transform (3,), metres and radians, each map's walls with the other map."""
+    noise_m = max(a.noise_m, b.noise_m)
+    in_free = IN_FREE + min(LONGEST_SELF, max(a.in_free, b.in_free))
+    in_free_elsewhere = in_free + IN_FREE_ELSEWHERE - IN_FREE
+    on_wall = np.log((1.0 - in_free) / (1.0 - in_free_elsewhere))
+    inside = np.log(in_free / in_free_elsewhere)
+    mean = (1.0 - in_free) * (_expected_ratio(noise_m) + on_wall) + in_free * inside
+    found = []
+    for query, target, T in ((b, a, T_a_b), (a, b, se2.inverse(T_a_b))):
+        stretches = _stretches(query.submap, target.submap, T)
+        count = len(stretches.offsets_m) + stretches.in_free
+        ratios = _log_ratio(stretches.offsets_m, noise_m) + on_wall
+        support = float(ratios.sum() + stretches.in_free * inside)
+        found.append(Agreement(support, count * mean, STRETCH_M * count, stretches.contradicting_m))
+    return total(found)
+
+
+def _log_ratio(offsets_m: FloatArray, noise_m: float) -> FloatArray:
+    """Log-likelihood ratios of offsets, the same place to another."""
+    return np.asarray(np.log(_density(offsets_m, noise_m, SAME_M) / _density(offsets_m, noise_m, OTHER_M)))
+
+
+def _density(offsets_m: FloatArray, noise_m: float, place_m: float) -> FloatArray:
+    sigma_m = np.hypot(noise_m, place_m)
+    normal = np.exp(-0.5 * (offsets_m / sigma_m) ** 2) / (np.sqrt(2.0 * np.pi) * sigma_m)
+    return np.asarray((1.0 - MOVED) * normal + MOVED / (2.0 * VIOLATION_M))
+
+
+def _expected_ratio(noise_m: float) -> float:
+    """Mean log-likelihood ratio of an offset in the same place."""
+    offsets_m = np.linspace(-VIOLATION_M, VIOLATION_M, 601)
+    weights = _density(offsets_m, noise_m, SAME_M)
+    return float((weights * _log_ratio(offsets_m, noise_m)).sum() / weights.sum())
+
+
+class _Stretches(NamedTuple):
+    """The stretches of wall of one map in known area of another."""
+
+    offsets_m: FloatArray
+    """Of those on a wall, along its normal, shape (K,)."""
+    in_free: int
+    """How many lie in free space."""
+    contradicting_m: float
+
+
+def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _Stretches:
+    points, normals = query.surface.points, query.surface.normals
+    field, free = target.field.arrays, target.free
+    offsets_m, states = _offsets(points, normals, T_target_query, field, free.cells, free.corner)
+    known = states != _UNKNOWN
+    if not known.any():
+        return _Stretches(np.empty(0), 0, 0.0)
+    cells = np.floor(points[known] / STRETCH_M).astype(np.int64)
+    facing = np.round(np.arctan2(normals[known, 1], normals[known, 0]) / (0.5 * np.pi)).astype(np.int64) % 4
+    _, number = np.unique(np.column_stack((cells, facing)), axis=0, return_inverse=True)
+    number = number.ravel()
+    on_wall = states[known] == _ON_WALL
+    walls, counts = (np.bincount(number, weights=each) for each in (on_wall, np.ones(len(number))))
+    sums_m = np.bincount(number, weights=np.where(on_wall, offsets_m[known], 0.0))
+    is_wall, is_free = walls >= FEWEST_POINTS, (counts >= FEWEST_POINTS) & (2.0 * walls < counts)
+    contradicting_m = _length_m(points[states == _DEEP_IN_FREE])
+    return _Stretches(sums_m[is_wall] / walls[is_wall], int(np.count_nonzero(is_free & ~is_wall)), contradicting_m)
+
+
+def _length_m(points: FloatArray) -> float:
+    """Length of the walls of at least ``WALL_M`` among points ``SPACING_M`` apart, shape (N, 2)."""
+    from scipy.ndimage import label  # most robots are alone, and SciPy takes long to load
+
+    if not len(points):
+        return 0.0
+    cells = np.floor((points - points.min(axis=0)) / SPACING_M).astype(np.int64)
+    image = np.zeros(cells.max(axis=0) + 1, bool)
+    image[tuple(cells.T)] = True
+    wall = label(_grown(image), np.ones((3, 3)))[0][tuple(cells.T)]
+    walls = (points[wall == number] for number in np.unique(wall))
+    return SPACING_M * sum(len(each) for each in walls if np.hypot(*np.ptp(each, axis=0)) >= WALL_M)
+
+
+def _grown(image: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The image and the cells beside it, so that points with a gap of a cell are connected."""
+    padded, grown = np.pad(image, 1), image.copy()
+    rows, columns = image.shape
+    for row in range(3):
+        for column in range(3):
+            grown |= padded[row : row + rows, column : column + columns]
+    return grown
+
+
+@njit
+def _offsets(points, normals, T, field, free, free_corner):  # type: ignore[no-untyped-def]
+    """Offset of each point from the wall that it lies on, and its state."""
+    cos, sin = np.cos(T[2]), np.sin(T[2])
+    offsets, states = np.zeros(len(points)), np.zeros(len(points), np.int8)
+    for i in range(len(points)):
+        x = T[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = T[1] + sin * points[i, 0] + cos * points[i, 1]
+        label, distance = label_at(x, y, field), 10.0
+        if label != EMPTY:
+            s = field.surfels[label]
+            dx, dy = x - s[0], y - s[1]
+            distance = np.hypot(dx, dy)
+            mx = cos * normals[i, 0] - sin * normals[i, 1]
+            my = sin * normals[i, 0] + cos * normals[i, 1]
+            if distance < VIOLATION_M and s[2] * mx + s[3] * my > PARALLEL:
+                offsets[i] = dx * s[2] + dy * s[3]
+                states[i] = _ON_WALL
+                continue
+        column = int(np.floor((x - free_corner[0]) / FREE_CELL_M))
+        row = int(np.floor((y - free_corner[1]) / FREE_CELL_M))
+        inside = column >= 0 and row >= 0 and column < free.shape[1] and row < free.shape[0] and free[row, column]
+        if inside and distance > VIOLATION_M:
+            states[i] = _IN_FREE if label != EMPTY else _DEEP_IN_FREE
+    return offsets, states
