@@ -13,7 +13,7 @@ from fcslam.graph.cluster import relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
-from fcslam.lidar.map_agreement import Agreement, LocalMap, compare, local_map, total
+from fcslam.lidar.map_agreement import LocalSubmap, PlaceAgreement, compare, local_map, total
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import RADIUS_M, Submap, build_submap
 from fcslam.lidar.verification import PARTIAL, VerificationConfig
@@ -245,7 +245,7 @@ class MapComparison:
         return [(keyscan_points(k, lasers), se2.between(T_anchor, poses[k.id.number])) for k in keyscans]
 
 
-def _fit(agreement: Agreement, ratio: float = 0.0, violation: float = 0.0) -> MapFit:
+def _fit(agreement: PlaceAgreement, ratio: float = 0.0, violation: float = 0.0) -> MapFit:
     support, expected, known_m, contradicting_m = agreement
     return MapFit(ratio, violation, support, expected, -np.inf, known_m, contradicting_m)
 
@@ -263,10 +263,10 @@ class _LocalMaps:
         """``poses`` (N, 3) of both sessions' keyscans, each in its own frame, metres and radians."""
         self._keyscans_around, self._scans = keyscans_around, scans
         self._sessions, self._poses = sessions, poses
-        self._built: dict[tuple[int, int], LocalMap | None] = {}
+        self._built: dict[tuple[int, int], LocalSubmap | None] = {}
         self._places = _separate(poses[1], np.arange(len(poses[1])), PLACES_APART_M)
 
-    def agreement(self, T_a_b: FloatArray) -> Agreement:
+    def agreement(self, T_a_b: FloatArray) -> PlaceAgreement:
         """Compare the local maps of both sessions wherever the first one was near a place of the second.
 
         ``T_a_b`` between their frames at each keyscan of b, shape (N, 3), metres and radians; NaN: not known.
@@ -293,7 +293,7 @@ class _LocalMaps:
             agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j))
         return total(agreements)
 
-    def _at(self, side: int, row: int) -> LocalMap | None:
+    def _at(self, side: int, row: int) -> LocalSubmap | None:
         """The local map around a keyscan of one of the sessions; None with too few keyscans."""
         if (side, row) not in self._built:
             session, poses = self._sessions[side], self._poses[side]

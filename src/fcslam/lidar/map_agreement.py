@@ -51,7 +51,7 @@ PARALLEL: Final = 0.7
 _UNKNOWN, _ON_WALL, _IN_FREE, _DEEP_IN_FREE = range(4)
 
 
-class Agreement(NamedTuple):
+class PlaceAgreement(NamedTuple):
     """How well two local maps agree at a transform; the sums over several places add up (``total``)."""
 
     support: float = 0.0
@@ -64,13 +64,13 @@ class Agreement(NamedTuple):
     """Those of ``WALL_M`` or more in the other's free space, farther than the reach of its walls."""
 
 
-def total(agreements: Sequence[Agreement]) -> Agreement:
+def total(agreements: Sequence[PlaceAgreement]) -> PlaceAgreement:
     """The agreement over all places; zero without any."""
-    return Agreement(*(sum(values) for values in zip(*agreements, strict=True))) if agreements else Agreement()
+    return PlaceAgreement(*(sum(values) for values in zip(*agreements, strict=True))) if agreements else PlaceAgreement()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LocalMap:
+class LocalSubmap:
     """A submap and its own noise."""
 
     submap: Submap
@@ -80,17 +80,17 @@ class LocalMap:
     """Share of the stretches of one half in the free space of the other."""
 
 
-def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) -> LocalMap:
+def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) -> LocalSubmap:
     """The map of at least two scans, as for ``build_submap``."""
     whole, even, odd = (build_submap(part, radius_m) for part in (scans, scans[::2], scans[1::2]))
     compared = [_stretches(even, odd, np.zeros(3)), _stretches(odd, even, np.zeros(3))]
     offsets = np.abs(np.concatenate([each.offsets_m for each in compared]))
     noise_m = min(WIDEST_NOISE_M, float(np.quantile(offsets, 0.68))) if len(offsets) else WIDEST_NOISE_M
     in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
-    return LocalMap(whole, noise_m, in_free)
+    return LocalSubmap(whole, noise_m, in_free)
 
 
-def compare(a: LocalMap, b: LocalMap, T_a_b: FloatArray) -> Agreement:
+def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray) -> PlaceAgreement:
     """Compare two local maps at a transform (3,), metres and radians, each map's walls with the other map."""
     noise_m = max(a.noise_m, b.noise_m)
     in_free = IN_FREE + min(LONGEST_SELF, max(a.in_free, b.in_free))
@@ -104,7 +104,7 @@ def compare(a: LocalMap, b: LocalMap, T_a_b: FloatArray) -> Agreement:
         count = len(stretches.offsets_m) + stretches.in_free
         ratios = _log_ratio(stretches.offsets_m, noise_m) + on_wall
         support = float(ratios.sum() + stretches.in_free * inside)
-        found.append(Agreement(support, count * mean, STRETCH_M * count, stretches.contradicting_m))
+        found.append(PlaceAgreement(support, count * mean, STRETCH_M * count, stretches.contradicting_m))
     return total(found)
 
 
