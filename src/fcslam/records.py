@@ -527,7 +527,7 @@ _REASON_TEXT = {
     ReasonCode.NOT_UNIQUE: "the alignment is not unique: its score is {value} times the best elsewhere, {limit} needed",
     ReasonCode.MAPS_CONTRADICT: "a share of {value} of the aligned maps' surfaces lies in free space, {limit} allowed",
     ReasonCode.WALLS_DIFFER: "their walls lie farther apart than those of one place: likeness {value}, {limit} needed",
-    ReasonCode.LOOK_ALIKE: "the maps fit elsewhere, too: {value} times as well, {limit} allowed",
+    ReasonCode.LOOK_ALIKE: "the maps fit only {value} times as well as elsewhere, {limit} times needed",
     ReasonCode.NO_LEAD: "{value} times as many closures agree as contradict them, {limit} times needed",
     ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
     ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",

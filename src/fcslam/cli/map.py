@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from fcslam.sources.faults import Faults
 
 
+MOST_JOINS = 6
+"""Most joins that are printed; all are in joins.csv."""
+
+
 class AlignTo(StrEnum):
     """What maps can be aligned with."""
 
@@ -262,11 +266,22 @@ def _report(
     if maps > 1:
         typer.echo(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
     if joined:
+        _print_joins(run)
         _print_separations(run)
     for line in anchoring_lines(run.map_files):
         typer.echo(line)
     for name in sorted(name for name in run.map_files if name.endswith(".png")):
         typer.echo(f"map: {output / name}")
+
+
+def _print_joins(run: "Run") -> None:
+    """Say on what evidence robots share a map; those from fewest places first."""
+    for join in sorted(run.joins, key=lambda join: join.places)[:MOST_JOINS]:
+        typer.echo(str(join))
+    if len(run.joins) > MOST_JOINS:
+        typer.echo(f"{len(run.joins) - MOST_JOINS} more joins, from more places: joins.csv")
+    if run.joins:
+        typer.echo("a LiDAR cannot tell exact copies of a wing or floor apart: --floor, --start and tags can")
 
 
 def _print_separations(run: "Run") -> None:

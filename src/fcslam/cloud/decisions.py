@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from functools import partial
 
 import numpy as np
@@ -20,6 +20,7 @@ from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
+from fcslam.graph.evidence import ClusterEvidence, MapFit
 from fcslam.lidar.scan import keyscan_points
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
@@ -64,6 +65,8 @@ class ClosureDecisions:
         self.closures = ClosureLog()
         self.maps: list[list[str]] = []
         """Sessions by map; maps, and the sessions in them, in the order in which they started."""
+        self.joins: dict[frozenset[str], ClusterEvidence] = {}
+        """On what evidence two sessions share a map."""
         self.version = 0
         """How often the joint graph was solved."""
         self._changes: tuple[Change, ...] = ()
@@ -152,7 +155,7 @@ class ClosureDecisions:
             partial(self._comparison.fit, growth=1.0) if final else self._comparison.fit,
             self._comparison.overlap,
         )
-        self.maps = [list(sessions) for sessions in fusion.maps]
+        self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
         self._apart = dict(fusion.apart)
         self._short.clear()
         self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
@@ -166,6 +169,7 @@ class ClosureDecisions:
             "short": [(sorted(pair), size) for pair, size in self._short.items()],
             "comparison": self._comparison.state(),
             "maps": self.maps,
+            "joins": [(sorted(pair), astuple(evidence)) for pair, evidence in self.joins.items()],
             "version": self.version,
             "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
             "contested": self._contested,
@@ -179,6 +183,8 @@ class ClosureDecisions:
         self._short = {frozenset(pair): size for pair, size in state["short"]}
         self._comparison.restore(state["comparison"])
         self.maps, self.version = state["maps"], state["version"]
+        for pair, (*counts, fit) in state["joins"]:
+            self.joins[frozenset(pair)] = replace(ClusterEvidence(*counts), fit=fit and MapFit(*fit))
         changes = (read_edit(*change) for change in state["changes"])
         self._changes = tuple(change for change in changes if not isinstance(change, Undo))
         self._contested, self._postponed_until = state["contested"], state["postponed_until"]
@@ -290,6 +296,7 @@ class ClosureDecisions:
             self._contested = True
             _explain(entries, apart)
             return
+        self.joins[pair] = decision.evidence
         members = [entries[k] for k in decision.members]
         if not joined:
             self._join(members, a, b)

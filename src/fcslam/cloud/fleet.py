@@ -217,7 +217,11 @@ class Fleet:
         own: dict[str, FloatArray] = {session: frozen(self._graph.chain(session)) for session in sessions}
         entries = self._present_closures()
         fusion = self._rigid_fusion() or Fusion(
-            self._present_maps(), poses, own, tuple(entry.closure for entry in entries)
+            self._present_maps(),
+            poses,
+            own,
+            tuple(entry.closure for entry in entries),
+            {pair: evidence for pair, evidence in self._decisions.joins.items() if pair <= set(sessions)},
         )
         return conclude(self._sessions, self._graph, entries, fusion, self._decisions.version, self._decisions.changes)
 

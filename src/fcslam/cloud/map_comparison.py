@@ -25,8 +25,6 @@ REACH_M = 45.0
 itself."""
 MOST_KEYSCANS = 300
 """Most keyscans of such a map; of more, evenly spaced ones."""
-LEAST_RIVAL_M = 5.0
-"""The best transform elsewhere scores at least as much: maps with little surface are never unique."""
 
 GROWTH = 1.5
 """The maps of two sessions are compared again when their cluster, or their paths together, have grown by this factor:
@@ -163,9 +161,11 @@ class MapComparison:
         T_i_j = _between(T_a_i, T_a_b, T_b_j)
         best = align_map(near_a.submap, near_b.submap, T_i_j)
         rivals = rivals_of(near_a.submap, near_b.submap, best.T_a_b)
-        ratio = max(0.0, best.score_m) / max([LEAST_RIVAL_M, *(rival.score_m for rival in rivals)])
         local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (a.poses, b.poses))
-        fit = _fit(local_maps.agreement(_transforms(a, b, members)), ratio, best.violation)
+        fit = replace(
+            _fit(local_maps.agreement(_transforms(a, b, members))),
+            seen_m=best.known_m,
+        )
         for rival in rivals[:RIVALS]:
             T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
             found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
@@ -245,9 +245,9 @@ class MapComparison:
         return [(keyscan_points(k, lasers), se2.between(T_anchor, poses[k.id.number])) for k in keyscans]
 
 
-def _fit(agreement: PlaceAgreement, ratio: float = 0.0, violation: float = 0.0) -> MapFit:
-    support, expected, known_m, contradicting_m = agreement
-    return MapFit(ratio, violation, support, expected, -np.inf, known_m, contradicting_m)
+def _fit(agreement: PlaceAgreement) -> MapFit:
+    support, expected, compared_m, contradicting_m = agreement
+    return MapFit(support, expected, -np.inf, compared_m, contradicting_m)
 
 
 class _LocalMaps:

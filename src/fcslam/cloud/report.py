@@ -12,13 +12,14 @@ from fcslam.cloud.placement import region_files, with_regions
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
+from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
 from fcslam.processes import trim_memory
 from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, frozen
-from fcslam.runs import QUALITY, ClosureRow, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs import QUALITY, ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
@@ -82,6 +83,7 @@ def run_of(
     return Run(
         trajectories=trajectories,
         closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
+        joins=tuple(_join(pair, evidence) for pair, evidence in result.joins.items()),
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
@@ -89,6 +91,15 @@ def run_of(
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
         quality=_quality_files(certificates, fused),
     )
+
+
+def _join(pair: frozenset[str], evidence: ClusterEvidence) -> Join:
+    robot_i, robot_j = sorted(pair)
+    counts, fit = (evidence.closures, evidence.separate_places), evidence.fit
+    if fit is None:
+        return Join(robot_i, robot_j, *counts, math.nan, math.nan, math.nan, math.nan)
+    elsewhere = max(0.0, fit.rival_support / fit.support) if fit.support > 0.0 else 0.0
+    return Join(robot_i, robot_j, *counts, fit.seen_m, fit.contradiction * fit.seen_m, fit.likeness, elsewhere)
 
 
 def traffic_metrics(ledger: Ledger, tracks: Mapping[str, Track]) -> list[Metric]:

@@ -12,6 +12,7 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.placement import PlacedRegion, T_placed_map, placed_regions
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
+from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import (
     Change,
@@ -79,6 +80,8 @@ class FleetResult:
     """All keyscans at their optimized poses, with the accepted constraints."""
     regions: tuple[PlacedRegion, ...] = ()
     """Regions that users drew in the maps."""
+    joins: Mapping[frozenset[str], ClusterEvidence] = field(default_factory=dict)
+    """On what evidence two robots share a map, where closures between them agree."""
     sightings: tuple[TagSighting, ...] = ()
     """Of the tags that the robots saw."""
 
@@ -95,6 +98,8 @@ class Fusion:
     """Every robot's keyscans in its own map, shape (N, 3)."""
     closures: tuple[LoopClosure, ...]
     """In the order in which they were found, decided."""
+    joins: Mapping[frozenset[str], ClusterEvidence] = field(default_factory=dict)
+    """As in ``FleetResult``."""
     apart: Mapping[frozenset[str], Reason] = field(default_factory=dict)
     """Pairs of robots that must not share a map, because paths contradict each other."""
 
@@ -152,7 +157,8 @@ def conclude(
         if closure.status is not ClosureStatus.ACCEPTED
     }
     regions = placed_regions(index, sessions, fusion.pose, changes)
-    return FleetResult(robots, fusion.closures, corrections, graph.held(fusion.T_map_base, left_out), regions)
+    held = graph.held(fusion.T_map_base, left_out)
+    return FleetResult(robots, fusion.closures, corrections, held, regions, joins=fusion.joins)
 
 
 def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change]) -> Fusion:

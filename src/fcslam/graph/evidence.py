@@ -1,10 +1,13 @@
 """Evidence for a transform between two maps: one measure and one rule, pure functions of counts.
 
-Each separate place whose closures agree is one independent test of the transform: it counts one. Where the maps
-overlap in few places, an exhaustive alignment of them tells whether the transform is the only one that fits. It adds
-the ratio of its score to the best score elsewhere, less one. A corridor with equal doors scores nearly as well one door
-farther, so its alignment adds next to nothing. An unmistakable room replaces two further places. So does a tag that
-both robots saw: its number is unmistakable, but it may be there twice, and then the maps contradict each other.
+Each separate place whose closures agree is one independent test of the transform: it counts one. Whatever their number,
+the maps have the last word. At the transform, the walls of one place lie on each other, no long wall of one map stands
+in free space of the other, and the maps fit nowhere else as well.
+
+Where closures come from few places, the ratio of the support of the maps there to that elsewhere, less one, counts as
+further places. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing. A tag that
+both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and then the maps
+contradict each other.
 """
 
 import math
@@ -15,15 +18,17 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.records import Reason, ReasonCode
 
-LEAST_KNOWN_M = 10.0
-"""Walls of each map in known area of the other that a comparison needs, metres, summed over both maps."""
+LEAST_COMPARED_M = 5.0
+"""Least ``MapFit.compared_m`` that refutes a transform."""
 LARGEST_CONTRADICTION = 0.02
 """Largest share of walls in the other map's free space. One floor in three years had up to 0.010, robots of one day up
 to 0.006, and refurnished or partly equal floors from 0.037 on."""
-LEAST_LIKENESS = 0.85
-"""Least ``MapFit.likeness``: see `docs/results/real-buildings.md`."""
-LARGEST_RIVAL = 0.85
-"""Largest support of a transform elsewhere, as a share of that of the transform."""
+LEAST_LIKENESS = 0.65
+"""Least ``MapFit.likeness``. In one place it was 0.69 to 1.9, in places that look alike 0.62 or less."""
+LEAST_RIVAL = 20.0
+"""The support elsewhere is taken to be at least this, nats: maps with little wall in common are never unique."""
+LEAST_RATIO = 1.2
+"""Least ``MapFit.ratio``, however many places agree."""
 TAG_PLACES = 2.0
 """Further places that a tag replaces, which both robots saw, if their maps do not contradict each other."""
 
@@ -40,12 +45,6 @@ class EvidenceSettings(Settings):
         description="evidence that a cluster needs to join two maps: its separate places, plus the ratio by which the "
         "alignment of the maps scores better than the best one elsewhere, less one",
     )
-    violation: float = Field(
-        default=0.03,
-        ge=0.0,
-        le=1.0,
-        description="largest share of one map's surfaces in the other's free space at which an alignment is evidence",
-    )
     lead: float = Field(
         default=2.0,
         ge=1.0,
@@ -60,20 +59,23 @@ class MapFit:
     Likelihoods are those of ``fcslam.lidar.map_agreement``, summed over all places that both robots saw.
     """
 
-    ratio: float
-    """Score at the transform, divided by the best score elsewhere."""
-    violation: float
-    """Share of one map's surfaces in the other's free space: the worse of both directions."""
     support: float = 0.0
     """Log-likelihood ratio of the same places to others that look alike, nats."""
     expected: float = 0.0
     """Its expectation if the places are the same."""
     rival_support: float = -math.inf
     """The largest ``support`` of a transform elsewhere."""
-    known_m: float = 0.0
-    """Walls of each map in known area of the other, metres, summed over both maps."""
+    compared_m: float = 0.0
+    """Walls of each map that were compared with the other, metres, summed over both maps and all places."""
     contradicting_m: float = 0.0
     """Those in the other's free space, metres."""
+    seen_m: float = 0.0
+    """Wall of one map in known area of the other, metres: of both maps, the one with less."""
+
+    @property
+    def ratio(self) -> float:
+        """Support at the transform, divided by the largest elsewhere."""
+        return max(0.0, self.support) / max(LEAST_RIVAL, self.rival_support)
 
     @property
     def likeness(self) -> float:
@@ -83,7 +85,7 @@ class MapFit:
     @property
     def contradiction(self) -> float:
         """Share of the walls in the other's free space."""
-        return self.contradicting_m / self.known_m if self.known_m > 0.0 else 0.0
+        return self.contradicting_m / self.compared_m if self.compared_m > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason |
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
     if not evidence.informative:
         return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
-    if evidence.fit is not None and evidence.fit.known_m >= LEAST_KNOWN_M:
+    if evidence.fit is not None and evidence.fit.compared_m >= LEAST_COMPARED_M:
         refuted = refutation(evidence.fit)
         if refuted is not None:
             return refuted
@@ -130,8 +132,8 @@ def refutation(fit: MapFit) -> Reason | None:
         return Reason(ReasonCode.MAPS_CONTRADICT, fit.contradiction, LARGEST_CONTRADICTION)
     if fit.likeness < LEAST_LIKENESS:
         return Reason(ReasonCode.WALLS_DIFFER, fit.likeness, LEAST_LIKENESS)
-    if fit.rival_support > LARGEST_RIVAL * fit.support:
-        return Reason(ReasonCode.LOOK_ALIKE, fit.rival_support / fit.support, LARGEST_RIVAL)
+    if fit.ratio < LEAST_RATIO:
+        return Reason(ReasonCode.LOOK_ALIKE, fit.ratio, LEAST_RATIO)
     return None
 
 
@@ -141,8 +143,6 @@ def _amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> 
         return None
     if fit is None:
         return Reason(ReasonCode.FEW_PLACES, places, least, "minimum_evidence")
-    if fit.violation > settings.violation:
-        return Reason(ReasonCode.MAPS_CONTRADICT, fit.violation, settings.violation, "violation")
     if places + max(0.0, fit.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0) >= least:
         return None
     return Reason(ReasonCode.NOT_UNIQUE, fit.ratio, 1.0 + least - places, "minimum_evidence")

@@ -8,11 +8,12 @@ Walls are compared in stretches of ``STRETCH_M``, whose offset ``o`` from the wa
 points. With the noise ``s`` of such an offset in the maps themselves, its log-likelihood ratio is
 
     log p(o | same) - log p(o | other)
-    p(o | same)  = (1 - u) N(o; 0, s^2 + SAME_M^2) + u U
-    p(o | other) = (1 - u) N(o; 0, s^2 + OTHER_M^2) + u U
+    p(o | same)  = (1 - u) N(o; 0, s^2 + SAME_M^2)  + u U,  u = MOVED
+    p(o | other) = (1 - v) N(o; 0, s^2 + OTHER_M^2) + v U,  v = UNLIKE
 
-where ``U`` is uniform over the reach of a comparison, and ``u`` the share of things that moved. A stretch in free space
-has the ratio of the shares of such stretches in maps of the same place and of another.
+where ``U`` is uniform over the reach of a comparison. A stretch in free space has the ratio of the shares of such
+stretches in maps of the same place and of another. The halves of a robot's scans are those before and after the middle
+of its path there, so that the noise includes the drift in between.
 """
 
 from collections.abc import Sequence
@@ -33,18 +34,20 @@ STRETCH_M: Final = 0.5
 """Length of a stretch of wall: one independent measurement."""
 FEWEST_POINTS: Final = 3
 """Least points of a stretch; points are ``SPACING_M`` apart."""
-SAME_M, OTHER_M = 0.012, 0.05
-"""Standard deviations of an offset in the same place (drift within a local map) and in another that looks alike, by
-comparisons of recorded and simulated floors."""
-MOVED: Final = 0.2
-"""Share of stretches whose offset is arbitrary, as of furniture that moved."""
+SAME_M, OTHER_M = 0.004, 0.03
+"""Standard deviations of an offset, beyond the noise, in the same place and in another that looks alike, by comparisons
+of recorded logs and of drives in published floors."""
+MOVED, UNLIKE = 0.1, 0.4
+"""Shares of stretches whose offset is arbitrary: furniture that moved, and walls of another place."""
 IN_FREE, IN_FREE_ELSEWHERE = 0.02, 0.11
 """Shares of stretches in free space, in the same place and in another, for maps that do not contradict themselves."""
 LONGEST_SELF: Final = 0.15
 """The share by which a map contradicts itself raises both by no more than this."""
 WALL_M: Final = 0.8
 """Walls of at least this length contradict; shorter things are people, furniture and doors."""
-WIDEST_NOISE_M: Final = 0.1
+FEWEST_STRETCHES: Final = 20
+"""Of fewer stretches, the noise is taken to be ``NOISE_M``, that of a common laser."""
+NOISE_M, WIDEST_NOISE_M = 0.01, 0.1
 PARALLEL: Final = 0.7
 """Least product of the normals of two points on one wall."""
 
@@ -58,7 +61,7 @@ class PlaceAgreement(NamedTuple):
     """Log-likelihood ratio of the same place to another, nats."""
     expected: float = 0.0
     """Its expectation if the maps show the same place."""
-    known_m: float = 0.0
+    compared_m: float = 0.0
     """Walls of each map in known area of the other, metres, summed over both maps."""
     contradicting_m: float = 0.0
     """Those of ``WALL_M`` or more in the other's free space, farther than the reach of its walls."""
@@ -66,7 +69,7 @@ class PlaceAgreement(NamedTuple):
 
 def total(agreements: Sequence[PlaceAgreement]) -> PlaceAgreement:
     """The agreement over all places; zero without any."""
-    return PlaceAgreement(*(sum(values) for values in zip(*agreements, strict=True))) if agreements else PlaceAgreement()
+    return PlaceAgreement(*(float(sum(values)) for values in zip(PlaceAgreement(), *agreements, strict=True)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,10 +85,12 @@ class LocalSubmap:
 
 def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) -> LocalSubmap:
     """The map of at least two scans, as for ``build_submap``."""
-    whole, even, odd = (build_submap(part, radius_m) for part in (scans, scans[::2], scans[1::2]))
-    compared = [_stretches(even, odd, np.zeros(3)), _stretches(odd, even, np.zeros(3))]
+    middle = len(scans) // 2
+    whole, first, second = (build_submap(part, radius_m) for part in (scans, scans[:middle], scans[middle:]))
+    compared = [_stretches(first, second, np.zeros(3)), _stretches(second, first, np.zeros(3))]
     offsets = np.abs(np.concatenate([each.offsets_m for each in compared]))
-    noise_m = min(WIDEST_NOISE_M, float(np.quantile(offsets, 0.68))) if len(offsets) else WIDEST_NOISE_M
+    enough = len(offsets) >= FEWEST_STRETCHES
+    noise_m = min(WIDEST_NOISE_M, float(np.quantile(offsets, 0.68))) if enough else NOISE_M
     in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
     return LocalSubmap(whole, noise_m, in_free)
 
@@ -110,19 +115,19 @@ def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray) -> PlaceAgreement
 
 def _log_ratio(offsets_m: FloatArray, noise_m: float) -> FloatArray:
     """Log-likelihood ratios of offsets, the same place to another."""
-    return np.asarray(np.log(_density(offsets_m, noise_m, SAME_M) / _density(offsets_m, noise_m, OTHER_M)))
+    same = _density(offsets_m, np.hypot(noise_m, SAME_M), MOVED)
+    return np.asarray(np.log(same / _density(offsets_m, np.hypot(noise_m, OTHER_M), UNLIKE)))
 
 
-def _density(offsets_m: FloatArray, noise_m: float, place_m: float) -> FloatArray:
-    sigma_m = np.hypot(noise_m, place_m)
+def _density(offsets_m: FloatArray, sigma_m: float, uniform: float) -> FloatArray:
     normal = np.exp(-0.5 * (offsets_m / sigma_m) ** 2) / (np.sqrt(2.0 * np.pi) * sigma_m)
-    return np.asarray((1.0 - MOVED) * normal + MOVED / (2.0 * VIOLATION_M))
+    return np.asarray((1.0 - uniform) * normal + uniform / (2.0 * VIOLATION_M))
 
 
 def _expected_ratio(noise_m: float) -> float:
     """Mean log-likelihood ratio of an offset in the same place."""
     offsets_m = np.linspace(-VIOLATION_M, VIOLATION_M, 601)
-    weights = _density(offsets_m, noise_m, SAME_M)
+    weights = _density(offsets_m, float(np.hypot(noise_m, SAME_M)), MOVED)
     return float((weights * _log_ratio(offsets_m, noise_m)).sum() / weights.sum())
 
 
@@ -151,8 +156,14 @@ def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _St
     walls, counts = (np.bincount(number, weights=each) for each in (on_wall, np.ones(len(number))))
     sums_m = np.bincount(number, weights=np.where(on_wall, offsets_m[known], 0.0))
     is_wall, is_free = walls >= FEWEST_POINTS, (counts >= FEWEST_POINTS) & (2.0 * walls < counts)
-    contradicting_m = _length_m(points[states == _DEEP_IN_FREE])
+    contradicting_m = _length_m(points[(states == _DEEP_IN_FREE) & ~_seen_through(query)])
     return _Stretches(sums_m[is_wall] / walls[is_wall], int(np.count_nonzero(is_free & ~is_wall)), contradicting_m)
+
+
+def _seen_through(submap: Submap) -> NDArray[np.bool_]:
+    """Which points of a submap its own robot saw through, as of a railing, shape (N,)."""
+    column, row = np.floor((submap.surface.points - submap.free.corner) / FREE_CELL_M).astype(np.int64).T
+    return np.asarray(submap.free.cells[row, column])
 
 
 def _length_m(points: FloatArray) -> float:

@@ -13,7 +13,7 @@ from fcslam.runs.folder import (
     prepare_output,
 )
 from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
+from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.separations import Separation, separations
 from fcslam.runs.tables import metrics_json, read_tum, write_tum
 
@@ -25,6 +25,7 @@ __all__ = [
     "QUALITY",
     "TRAJECTORIES",
     "ClosureRow",
+    "Join",
     "LocalMap",
     "LocalizedPoses",
     "Metric",

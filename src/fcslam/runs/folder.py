@@ -2,6 +2,7 @@
 
     trajectories/<robot>.tum   stamp x y z qx qy qz qw: pose of base in the robot's map at every laser scan
     robots.csv                 robot, map, path_length_m, scans, floor
+    joins.csv                  on what evidence robots share a map, a line for each two with closures between them
     closures.csv               every loop closure considered, with its status and reason
     pose_graph.g2o             the optimized pose graph
     metrics.json               [{name, value, unit}]
@@ -29,15 +30,17 @@ from pathlib import Path
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.records import StrPath
 from fcslam.runs.map_files import OccupancyMap, parse_map
-from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
+from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
     metrics_json,
     read_closures,
+    read_joins,
     read_localized,
     read_metrics,
     read_robots,
     read_tum,
     write_closures,
+    write_joins,
     write_localized,
     write_robots,
     write_tum,
@@ -46,7 +49,7 @@ from fcslam.storage.files import bring_back, replacing_folder
 from fcslam.storage.own_files import write_own
 from fcslam.untrusted import read_bytes, read_text
 
-TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
+TRAJECTORIES, LOCAL, ROBOTS, CLOSURES, JOINS = "trajectories", "local", "robots.csv", "closures.csv", "joins.csv"
 LOCALIZATION, MISSION, STATE = "localization", "mission.fcslam", "mission.state"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 QUALITY = "quality"
@@ -70,6 +73,8 @@ class Run:
     """By robot."""
     closures: tuple[ClosureRow, ...] = ()
     """Every loop closure considered between robots and every one within a robot, with its status and the reason."""
+    joins: tuple[Join, ...] = ()
+    """On what evidence robots share a map, for each two with closures between them that agree."""
     metrics: Mapping[str, Metric] = field(default_factory=dict)
     """By name."""
     config_yaml: str = ""
@@ -198,6 +203,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         return Run(
             trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
             closures=read_closures(path / CLOSURES, path),
+            joins=read_joins(path / JOINS, path) if (path / JOINS).exists() else (),
             metrics=read_metrics(path / METRICS, path),
             config_yaml=read_text(path / CONFIG, path),
             pose_graph_g2o=read_text(path / POSE_GRAPH, path) if maps else "",
@@ -232,6 +238,7 @@ def _write(run: Run, folder: Path) -> None:
         write_own(folder / STATE, run.state)
     write_robots(folder / ROBOTS, run.trajectories.values())
     write_closures(folder / CLOSURES, run.closures)
+    write_joins(folder / JOINS, run.joins)
     (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")
     (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
     (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")

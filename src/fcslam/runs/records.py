@@ -1,5 +1,6 @@
 """Records of a run. Arrays in them are read-only."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,6 +98,38 @@ class ClosureRow:
     status: ClosureStatus
     reason: Reason
     """Why the closure has this status."""
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """On what evidence two robots share a map. A line of joins.csv."""
+
+    robot_i: str
+    robot_j: str
+    closures: int
+    """Closures between them that agree."""
+    places: int
+    """Separate places of these closures."""
+    seen_m: float
+    """Wall that both robots saw, metres; NaN if the maps were not compared."""
+    contradicting_m: float
+    """Wall of one robot in the free space of the other, metres."""
+    likeness: float
+    """How well the walls lie on each other: about 1 in one place, 0 or less in places that only look alike."""
+    elsewhere: float
+    """How well the maps fit at the best other transform, as a share; 0 if they fit nowhere else."""
+
+    def __str__(self) -> str:
+        """One line for users."""
+        places = f"{self.places} place{'' if self.places == 1 else 's'}"
+        what = f"{self.robot_i} and {self.robot_j}: {self.closures} closures from {places}"
+        if math.isnan(self.seen_m):
+            return f"{what}; their maps could not be compared"
+        share = 100.0 * self.contradicting_m / self.seen_m if self.seen_m else 0.0
+        seen = (
+            f"{what}; {self.seen_m:.0f} m of wall seen by both, {self.contradicting_m:.1f} m ({share:.1f} %) contradict"
+        )
+        return seen + (f"; elsewhere the maps fit {self.elsewhere:.2f} times as well" if self.elsewhere > 0.0 else "")
 
 
 @dataclass(frozen=True, slots=True)

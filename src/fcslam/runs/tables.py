@@ -5,6 +5,7 @@ import io
 import json
 import math
 from collections.abc import Iterable
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from fcslam.errors import EvaluationError
 from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, frozen
-from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTrajectory
+from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, Metric, RobotTrajectory
 from fcslam.untrusted import read_text
 
 _Value = TypeVar("_Value")
@@ -24,6 +25,7 @@ _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "quality"]
 _REASON_COLUMNS = ["reason", "value", "limit", "setting"]
 _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", *_REASON_COLUMNS]
+_JOIN_COLUMNS = [field.name for field in fields(Join)]
 _TUM_LINE = "%.9f %.9f %.9f 0 0 0 %.9f %.9f\n"
 
 
@@ -99,6 +101,35 @@ def read_closures(path: Path, within: Path | None = None) -> tuple[ClosureRow, .
         ValueError: a column is missing or a value is not what the column holds.
     """
     return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS, within))
+
+
+def write_joins(path: Path, joins: Iterable[Join]) -> None:
+    """Write joins.csv; empty cells where the maps were not compared."""
+    _write_csv(path, _JOIN_COLUMNS, ([_cell(value) for value in astuple(join)] for join in joins))
+
+
+def _cell(value: str | float) -> str | float:
+    if not isinstance(value, float):
+        return value
+    return "" if math.isnan(value) else f"{value:.6f}"
+
+
+def read_joins(path: Path, within: Path | None = None) -> tuple[Join, ...]:
+    """Every line of joins.csv; ``within``: see ``untrusted.open_file``.
+
+    Raises:
+        ValueError: a column is missing or a value is not what the column holds.
+    """
+    return tuple(
+        Join(
+            row["robot_i"],
+            row["robot_j"],
+            int(row["closures"]),
+            int(row["places"]),
+            *(float(row[column] or "nan") for column in _JOIN_COLUMNS[4:]),
+        )
+        for row in _read_csv(path, _JOIN_COLUMNS, within)
+    )
 
 
 def write_localized(path: Path, poses: LocalizedPoses) -> None:
