@@ -33,7 +33,7 @@ def driven(scans, config=ROBOT):
         ((1, 2), {}),
         ((3, 4), {"laser": SHORT, "closed_s": 5.0}),
         ((7, 8), {"laser": NOT_ALL_AROUND}),
-        ((9, 10), {"odometry": False, "closed_s": 20.0}),
+        ((15, 16), {"odometry": False, "closed_s": 20.0}),
         ((11, 12, 11), {}),
     ],
 )

@@ -54,9 +54,9 @@ LOST_EXPLAINED = 0.60
 """A lost robot sees a smaller share of its points in known area on a surface."""
 LOST_VIOLATION = 0.30
 """A lost robot sees a larger share of its points in known area in free space."""
-RODE = 0.75
+RODE, RODE_OVERLAP = 0.73, 0.40
 """A robot that leaves a closed cabin on another floor sees a smaller share on a surface, less the share in free space.
-The cabin says where its door is, so a part of the walls decides."""
+The cabin says where its door is, so a part of the walls decides; but a larger share of them lies in known area."""
 LEAST_OVERLAP = 0.25
 """Least share of all points in known area; below it, nothing is decided."""
 STAYED_M, LARGEST_SPEED, LONGEST_GAP_S = 1.0, 2.0, 5.0
@@ -143,7 +143,7 @@ def rode(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float) -
     if not _are_consistent(scans, fresh):
         return False
     worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh, closed_s)
-    return worse.overlap >= LEAST_OVERLAP and worse.explained - worse.violation < RODE
+    return worse.overlap >= RODE_OVERLAP and worse.explained - worse.violation < RODE
 
 
 def is_unplaced(scan: LaserScan, frontend: LidarFrontend) -> bool:
