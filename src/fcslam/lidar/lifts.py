@@ -68,7 +68,7 @@ def _seen_area_m2(scan: LaserScan) -> float:
     if step_rad * int(valid.sum()) < LEAST_SPAN_RAD:
         return math.inf
     seen_m = np.where(valid & (ranges_m < scan.laser.max_range_m), ranges_m, np.where(valid, np.inf, 0.0))
-    seen_m[1:-1] = np.minimum(seen_m[1:-1], np.maximum(seen_m[:-2], seen_m[2:]))  # single beams get lost
+    seen_m[2:-2] = np.minimum(seen_m[2:-2], np.maximum(seen_m[:-4], seen_m[4:]))  # some beams get lost
     if (seen_m > REACH_M).mean() > OPEN:
         return math.inf
     seen_m = np.minimum(seen_m, REACH_M)
