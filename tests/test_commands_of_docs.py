@@ -49,7 +49,7 @@ OF = {LONG: ANNA, MEETS: BEN}
 """Sample logs of other names. The long one has relations over 20 s."""
 LOGS = {
     "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "monday.clf.gz": ANNA, "monday.clf.xz": ANNA,
-    "building.clf.gz": LONG, "intel.clf.xz": LONG,
+    "building.clf.gz": LONG, "lift.clf.gz": LONG, "intel.clf.xz": LONG,
     "robot2.log": BEN, "robot2.clf": BEN, "tuesday.clf.gz": BEN, "tuesday.clf.xz": MEETS,
     "robot3.log": CLEO, "today.clf.gz": CLEO, "today.clf.xz": CLEO,
     "examples/logs/anna.clf.xz": ANNA, "examples/logs/ben.clf.xz": BEN, "examples/logs/cleo.clf.xz": CLEO,

@@ -133,3 +133,18 @@ def test_no_closure_by_hand_joins_floors(mapped):
 def test_floors_that_cannot_be(logs, floors, reason):
     with pytest.raises(ConfigError, match=reason):
         fcslam.map_recordings(logs[:1], floors=floors)
+
+
+def test_a_recording_has_several_floors(logs, tmp_path):
+    stamps = [record.stamp for record in open_source(logs[0]).records() if isinstance(record, LaserScan)]
+    cuts = {"b": len(stamps) // 3, "c": 2 * len(stamps) // 3}
+    named = {f"x@{stamps[k] - stamps[0]:.3f}": floor for floor, k in cuts.items()}
+    run = fcslam.map_recordings({"x": logs[0]}, floors={"x": "a", **named}, output=tmp_path / "run", processes=2)
+    assert [(each.robot, each.floor) for each in run.trajectories.values()] == [("x", "a"), ("x+1", "b"), ("x+2", "c")]
+    assert [len(each.stamps) for each in run.trajectories.values()] == pytest.approx([len(stamps) / 3] * 3, abs=2)
+    assert len({each.map_index for each in run.trajectories.values()}) == 3
+
+
+def test_a_robot_may_ride_before_its_first_floor_has_a_name(logs):
+    run = fcslam.map_recordings({"x": logs[0]}, floors={"x@5": "2"})
+    assert [each.floor for each in run.trajectories.values()] == ["", "2"]

@@ -76,7 +76,8 @@ def map_recordings(
         onto: mission file, or run folder with one, of an earlier mission that goes on. The run is that of all
             recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
             the cloud. Without recordings it is mapped again, with the edits that it has.
-        floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
+        floors: the floor on which all recordings were made, or a mapping of robot names to floors. The name
+            ``"anna@44"`` is the robot ``anna`` from 44 s after its first scan on, in a new session. Places of different
             floors are never compared, so each floor has maps of its own.
         anchors: what is known about the building, such as its floor plan, from ``read_anchors``.
 

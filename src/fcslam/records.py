@@ -185,6 +185,8 @@ class LaserScan:
     on_teammates: NDArray[np.bool_] | None = None
     """Beams that hit another robot of the fleet, shape (beam_count,): they stay in the scan, but no scan is matched by
     them. None: none is known."""
+    new_floor: str = ""
+    """Floor that the robot is on from this scan on, which a new session maps; empty: none is named."""
 
     @property
     def matched_ranges_m(self) -> Ranges:

@@ -440,6 +440,7 @@ def test_the_command_refuses_before_the_long_work(tmp_path, log, monkeypatch, ca
         (["2"], {"a": "2", "b": "2"}),
         (["b=-1"], {"b": "-1"}),
         (["1", "b=2"], {"a": "1", "b": "2"}),
+        (["1", "b@9.5=2", "b@30=1"], {"a": "1", "b": "1", "b@9.5": "2", "b@30": "1"}),
     ],
 )
 def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
@@ -454,6 +455,12 @@ def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
         (["x=1"], "a floor names 'x', but the robots are r"),
         (["r="], "floor '' is not 1 to 16 of"),
         (["=1"], "a floor names ''"),
+        (["x@1=1"], "a floor names 'x', but the robots are r"),
+        (["r@1=1", "r@1=2"], "r@1 can be on one floor only"),
+        (["r@soon=1"], "expected NAME@TIME with seconds after the first scan, such as anna@44"),
+        (["r@0=1"], "expected NAME@TIME"),
+        (["r@1e9=1"], "a floor begins 1e+09 s after the first scan, but r has"),
+        (["r@1="], "floor '' is not 1 to 16 of"),
         (["x" * 17], "is not 1 to 16 of"),
         (["a\x1b[2J"], "is not 1 to 16 of"),
     ],

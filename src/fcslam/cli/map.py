@@ -1,6 +1,7 @@
 """`fcslam map`: recordings of several robots in, one map out."""
 
 import gc
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from fcslam.mission.mission import Beginning, MissionConfig, Progress
     from fcslam.mission.mission_file import SavedMission
     from fcslam.page.live_map import LiveMap
-    from fcslam.runs import Run
+    from fcslam.runs import RobotTrajectory, Run
     from fcslam.sources import Source
     from fcslam.sources.faults import Faults
 
@@ -64,9 +65,9 @@ def map_recordings(
     floor: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="[NAME=]FLOOR",
-            help="Floor of all LOGs, or of the robot NAME. Places of different floors are never compared. Can be "
-            "repeated.",
+            metavar="[NAME[@TIME]=]FLOOR",
+            help="Floor of all LOGs, or of the robot NAME; with @TIME, from so many seconds after its first scan on, "
+            "in a new session. Places of different floors are never compared. Can be repeated.",
         ),
     ] = None,
     plan: Annotated[
@@ -227,7 +228,6 @@ def _report(
     from rich.table import Table
 
     from fcslam.anchoring.anchors import anchoring_lines
-    from fcslam.cloud.sessions import robot_and_epoch
     from fcslam.metrics.jumps import find_jumps
 
     values = {name: metric.value for name, metric in run.metrics.items()}
@@ -248,16 +248,8 @@ def _report(
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )
-    ends: dict[str, float] = {}
-    for session in run.trajectories.values():
-        robot, epoch = robot_and_epoch(session.robot)
-        if epoch > earlier.epochs(robot):  # the first session of a recording began with it
-            begin_s = session.stamps[0]
-            why = f"{robot} was lost; this session begins at {begin_s:.3f} s"
-            if begin_s < ends.get(robot, begin_s):
-                why = f"the clock stepped back; this session begins at {begin_s:.3f} s"
-            typer.echo(f"{session.robot}: {why}")
-        ends[robot] = session.stamps[-1]
+    for line in _session_lines(run, earlier):
+        typer.echo(line)
     for trajectory in run.trajectories.values():
         jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
         if jumps is not None:
@@ -281,7 +273,32 @@ def _print_joins(run: "Run") -> None:
     if len(run.joins) > MOST_JOINS:
         typer.echo(f"{len(run.joins) - MOST_JOINS} more joins, from more places: joins.csv")
     if run.joins:
-        typer.echo("a LiDAR cannot tell exact copies of a wing or floor apart: --floor, --start and tags can")
+        typer.echo("a LiDAR cannot tell exact copies of a wing or floor apart; --floor, --start and tags do")
+
+
+def _session_lines(run: "Run", earlier: "SavedMission") -> Iterator[str]:
+    """Say why each further session of a recording began."""
+    from fcslam.cloud.sessions import robot_and_epoch
+
+    before: dict[str, RobotTrajectory] = {}
+    first_s: dict[str, float] = {}
+    for session in run.trajectories.values():
+        robot, epoch = robot_and_epoch(session.robot)
+        last, begin_s = before.get(robot, session), session.stamps[0]
+        before[robot] = session
+        if epoch <= earlier.epochs(robot):  # the first session of a recording began with it
+            first_s[robot] = begin_s
+            continue
+        remedy = ""
+        if begin_s < last.stamps[-1] and last is not session:
+            why = "the clock stepped back"
+        elif session.floor and session.floor != last.floor:
+            why = f"{robot} came to floor {session.floor}"
+        else:
+            why = f"{robot} was lost or rode in a lift"
+            after_s = math.floor(10.0 * (begin_s - first_s.get(robot, begin_s))) / 10.0
+            remedy = f"; if it is on another floor then, give --floor {robot}@{after_s:.1f}=FLOOR"
+        yield f"{session.robot}: {why}; this session begins at {begin_s:.3f} s{remedy}"
 
 
 def _print_separations(run: "Run") -> None:

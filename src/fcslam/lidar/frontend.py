@@ -210,14 +210,18 @@ class LidarFrontend:
         self._recent.clear()
         self._begun_m = self.travel_m
 
-    def recent_submap(self) -> tuple[Submap, FloatArray]:
+    def recent_submap(self, until_s: float = math.inf) -> tuple[Submap, FloatArray]:
         """The submap of the last ``SUBMAP_REACH_M`` of travel.
 
+        Args:
+            until_s: later keyscans are left out, seconds, as long as one is left.
+
         Returns:
-            The submap, in the base of the newest keyscan, and ``T_local_base`` of this keyscan, shape (3,).
+            The submap, in the base of its newest keyscan, and ``T_local_base`` of this keyscan, shape (3,).
         """
-        anchor = self._recent[-1].T_local_base
-        return build_submap([(k.points, se2.between(anchor, k.T_local_base)) for k in self._recent]), anchor
+        keyscans = [keyscan for keyscan in self._recent if keyscan.record.stamp < until_s] or [self._recent[0]]
+        anchor = keyscans[-1].T_local_base
+        return build_submap([(k.points, se2.between(anchor, k.T_local_base)) for k in keyscans]), anchor
 
     def _is_keyscan(self, tracked: TrackedScan, laser: int) -> bool:
         """Whether the robot moved enough since the last keyscan of this laser; so each of them maps what it sees."""

@@ -4,6 +4,9 @@ A robot that was picked up and put down elsewhere, or whose odometry failed, see
 did. A single scan that explains little of the known area may come from a crowd or an opened door. So doubtful scans are
 deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
 
+A robot that leaves a closed cabin may be on another floor, where much looks alike. So all its scans from the opening of
+the door on are deferred, and compared with those from before the door closed.
+
 A robot whose scans stopped while it drove on is lost, too: nobody saw the way. Without odometry, nothing shows the
 motion in a gap of the scans. The scans after it are looked for in the map of the keyscans before it. The robot is lost
 unless they fit there in one way only, or agree with the map where they were matched.
@@ -51,6 +54,9 @@ LOST_EXPLAINED = 0.60
 """A lost robot sees a smaller share of its points in known area on a surface."""
 LOST_VIOLATION = 0.30
 """A lost robot sees a larger share of its points in known area in free space."""
+RODE, RODE_OVERLAP = 0.73, 0.40
+"""A robot that leaves a closed cabin on another floor sees a smaller share on a surface, less the share in free space.
+The cabin says where its door is, so a part of the walls decides; but a larger share of them lies in known area."""
 LEAST_OVERLAP = 0.25
 """Least share of all points in known area; below it, nothing is decided."""
 STAYED_M, LARGEST_SPEED, LONGEST_GAP_S = 1.0, 2.0, 5.0
@@ -86,23 +92,29 @@ def has_moved_unseen(before: LaserScan, now: LaserScan) -> bool:
     return math.hypot(x, y) > LARGEST_UNSEEN_M
 
 
-def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:
+def is_doubtful(
+    tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig, is_leaving: bool = False
+) -> bool:
     """Whether a scan may show another place than the scans before it.
 
-    So may a scan without odometry that was not accepted: nothing else says where the robot is.
+    So may a scan without odometry that was not accepted: nothing else says where the robot is. And so may all scans
+    while the robot leaves a closed cabin.
     """
     if frontend.settled_m < SETTLED_M or not config.doubted:
         return False
     # Both are false for a scan that was not matched, as its shares are NaN.
     is_rejected = not frontend.odometry.is_measured and tracking.explained < SUPPORTED
-    return is_rejected or tracking.explained < config.doubted * tracking.known
+    return is_leaving or is_rejected or tracking.explained < config.doubted * tracking.known
 
 
-def can_decide(scans: Sequence[LaserScan], travel_m: float = DOUBTFUL_TRAVEL_M) -> bool:
-    """Whether these consecutive doubtful scans are enough for a decision, by the least travel over them in metres."""
+def can_decide(scans: Sequence[LaserScan], travel_m: float = DOUBTFUL_TRAVEL_M, most: int = MOST_SCANS) -> bool:
+    """Whether these consecutive doubtful scans are enough for a decision, by the least travel over them in metres.
+
+    ``most`` scans are enough without it.
+    """
     steps = se2.relative(np.array([scan.T_odom_base for scan in scans]))
     far = len(scans) >= FEWEST_SCANS and np.hypot(steps[:, 0], steps[:, 1]).sum() >= travel_m
-    return bool(far) or len(scans) >= MOST_SCANS
+    return bool(far) or len(scans) >= most
 
 
 def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
@@ -117,6 +129,21 @@ def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
         return False
     worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh)
     return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
+
+
+def rode(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float) -> bool:
+    """Whether deferred scans of a robot that left a cabin contradict what was behind its door before.
+
+    Args:
+        scans: consecutive scans since the door opened, which the front end has not processed.
+        frontend: the robot's front end; it does not change.
+        closed_s: stamp at which the door closed, seconds.
+    """
+    fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
+    if not _are_consistent(scans, fresh):
+        return False
+    worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh, closed_s)
+    return worse.overlap >= RODE_OVERLAP and worse.explained - worse.violation < RODE
 
 
 def is_unplaced(scan: LaserScan, frontend: LidarFrontend) -> bool:
@@ -154,12 +181,15 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
     return T_local_first if agrees else None
 
 
-def _agreement_at(T_local_first: FloatArray, frontend: LidarFrontend, fresh: LidarFrontend) -> Agreement:
+def _agreement_at(
+    T_local_first: FloatArray, frontend: LidarFrontend, fresh: LidarFrontend, until_s: float = math.inf
+) -> Agreement:
     """How well the map of the deferred scans in ``fresh`` agrees with the newest keyscans of the front end.
 
-    ``T_local_first``, shape (3,), is the pose of the first of them, where the alignment begins.
+    ``T_local_first``, shape (3,), is the pose of the first of them, where the alignment begins. Keyscans later than
+    ``until_s``, seconds, are left out.
     """
-    (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
+    (before, T_local_before), (now, T_first_now) = frontend.recent_submap(until_s), fresh.recent_submap()
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
     return verify(before, now, predicted, VERIFICATION).worse
 

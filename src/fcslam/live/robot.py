@@ -125,8 +125,7 @@ class Robot(LiveTracker):
             InputError: the name, a laser, the configuration, the floor, the address, a file or the state folder cannot
                 be used, or the worker does not start.
         """
-        self._floors = {0: _checked_floor(floor)}
-        """Floor by the first part that is on it."""
+        _check_floor(floor)
         super().__init__(name, laser, settings_of(config), on_event)
         self._camera = checked_camera(camera)
         self._clock = wiring.clock
@@ -168,6 +167,7 @@ class Robot(LiveTracker):
             known = 0 if outbox is None else outbox.begin(*wiring.playback)
             keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)
+            self._frontend.change_floor(floor)
             self._outbox = outbox
             if outbox is not None and folder is not None:
                 # Not the seed of the configuration: robots must not retry at the same moments.
@@ -215,16 +215,13 @@ class Robot(LiveTracker):
         Raises:
             InputError: it is not a floor.
         """
-        _checked_floor(floor)
+        _check_floor(floor)
         with self._lock:
-            if floor != self._floor(self._part):
-                if len(self._frontend.scan_poses):
-                    self._frontend.begin_session()
-                self._floors[self._part] = floor
+            self._frontend.change_floor(floor)
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: its place in the map, its connection, and counts since its start."""
-        uplink, localizer = self._uplink, self._map_poses.localizer(self._part)
+        uplink, localizer, tracks = self._uplink, self._map_poses.localizer(self._part), self._frontend.tracks
         failure = self._frontend.backend_failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
@@ -235,7 +232,7 @@ class Robot(LiveTracker):
             map_index=localizer.map_index,
             correction_age_s=localizer.age_s,
             quality=localizer.quality,
-            times_lost=self._part - self._first_on_floor(self._part),
+            times_lost=self._part - max(part for part, track in enumerate(tracks) if track.is_new_floor),
             notices=notices,
         )
         if uplink is None:
@@ -335,7 +332,7 @@ class Robot(LiveTracker):
         index = self._map_poses.localizer(part).map_index
         T_map_base = se2.compose(poses[keyscans], offsets)
         return RobotTrajectory(
-            self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base), self._floor(part)
+            self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base), track.floor
         )
 
     def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
@@ -494,7 +491,6 @@ class Robot(LiveTracker):
         """Pass the next packets on."""
         if not packets:
             return
-        packets = [packet.on_floor(self._floor(packet.epoch)) for packet in packets]
         self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
         if self._joint is not None:
             self._joint.add(packets)
@@ -515,17 +511,10 @@ class Robot(LiveTracker):
     def _is_server_away(self) -> bool:
         return self._uplink is None or self._uplink.trouble is not None
 
-    def _floor(self, part: int) -> str:
-        return self._floors[self._first_on_floor(part)]
-
-    def _first_on_floor(self, part: int) -> int:
-        """The part with which the robot came to the floor of this one."""
-        return max(first for first in self._floors if first <= part)
-
     def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
         localizer = self._map_poses.localizer(self._part)
         corrected = localizer.T_map_base(T_smooth_base)
-        is_found = self._part in self._floors or localizer.quality > 0.0
+        is_found = self._frontend.scan_poses.is_new_floor or localizer.quality > 0.0
         return RobotPose(
             newest.pose.stamp,
             frozen(T_smooth_base if corrected is None else corrected),
@@ -544,8 +533,10 @@ class Robot(LiveTracker):
         part, correction = self._part, self._map_poses.localizer(self._part).correction
         if part > self._newest_part:
             self._newest_part, self._applied = part, None
-            if part in self._floors:
-                self._event(EventKind.FLOOR, f"on floor {self._floors[part] or 'without a name'}, in a new session")
+            track = self._frontend.scan_poses
+            if track.is_new_floor:
+                where = f"floor {track.floor}" if track.floor else "a floor without a name: it rode in a lift; name it"
+                self._event(EventKind.FLOOR, f"in a new session, on {where}")
             else:
                 self._event(
                     EventKind.LOST,
@@ -579,7 +570,8 @@ class Robot(LiveTracker):
             self._event(EventKind.OFFLINE, f"the robot goes on, and its packets wait: {trouble}")
 
     def _tell_correction(self, before: Correction | None, now: Correction) -> None:
-        if self._part not in self._floors and now.quality > 0.0 and (before is None or before.quality == 0.0):
+        is_new_floor = self._frontend.scan_poses.is_new_floor
+        if not is_new_floor and now.quality > 0.0 and (before is None or before.quality == 0.0):
             self._event(EventKind.RELOCALIZED, f"relocalized in map {now.map_index}, quality {now.quality:.2f}")
         elif (before is None and self._uplink is not None) or (before and now.map_index != before.map_index):
             self._event(EventKind.JOINED, f"now in map {now.map_index}")
@@ -591,13 +583,12 @@ class Robot(LiveTracker):
             self._event(EventKind.CORRECTED, f"corrected by {distance_m:.3f} m and {turned_rad:.4f} rad")
 
 
-def _checked_floor(floor: str) -> str:
+def _check_floor(floor: str) -> None:
     try:
         if floor:
             check_floor(floor)
     except PacketError as error:
         raise InputError(str(error)) from error
-    return floor
 
 
 def _keyframe_folder(state: Path | None, playback: Playback) -> Path:

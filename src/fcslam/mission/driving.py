@@ -24,7 +24,6 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
 from fcslam.sources.faults import Fault, Faults
-from fcslam.wire.messages import Hello
 from fcslam.wire.packets import SizedPacket, decode, measure, readdress
 
 SCANS_PER_LEG: Final = 50
@@ -148,19 +147,6 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)
-
-
-def on_floor(legs: Iterator[Leg], floor: str) -> Iterator[Leg]:
-    """The legs of a robot whose sessions name a floor; empty: none."""
-    if not floor:
-        yield from legs
-        return
-    for leg in legs:
-        packets = (
-            measure(sized.packet.on_floor(floor)) if isinstance(sized.packet.body, Hello) else sized
-            for sized in leg.packets
-        )
-        yield replace(leg, packets=tuple(packets))
 
 
 def continued(legs: Iterator[Leg], first_epoch: int) -> Iterator[Leg]:

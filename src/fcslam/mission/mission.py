@@ -27,7 +27,8 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.metrics.jumps import JumpLimits
-from fcslam.mission.driving import Drive, Leg, continued, on_floor, one_by_one
+from fcslam.mission.driving import Drive, Leg, continued, one_by_one
+from fcslam.mission.floors import on_floors
 from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
 from fcslam.mission.mission_store import StoredPacket
 from fcslam.places.matcher import MatchDecision
@@ -39,7 +40,6 @@ from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
 from fcslam.storage.state_file import State
-from fcslam.wire.checks import check_floor
 from fcslam.wire.ledger import Counter, Ledger, Traffic
 from fcslam.wire.messages import Packet, PacketKind
 from fcslam.wire.packets import Label, SizedPacket, decode, measure
@@ -106,7 +106,8 @@ class Beginning:
     vetoes: tuple[Veto, ...] = ()
     """Closures that must not count."""
     floors: Mapping[str, str] = field(default_factory=dict)
-    """Floor of each recording that has one, by its robot's name; places of different floors are never compared."""
+    """Floor of each recording that has one, by its robot's name, or by NAME@TIME from a time on, in seconds since the
+    first scan. Places of different floors are never compared."""
     anchors: Anchors = Anchors()  # noqa: RUF009
     """What is known about the building; it places the maps, and joins none."""
     verify_pairs: VerifyPairs = verify_here
@@ -141,21 +142,17 @@ def run_mission(
         ConfigError: a veto, a floor or a start names a robot that is not there, or a floor is not valid.
         OutputError: a robot's name cannot be a file name.
     """
-    onto, floors = beginning.onto, beginning.floors
+    onto = beginning.onto
     check_robots(sources)
     recordings = [source.name for source in sources]
     known = [*onto.robots, *recordings]
     _check_known("a veto", (name for veto in beginning.vetoes for name in (veto.robot_i, veto.robot_j)), known)
     _check_known("a start", config.fleet.starts, known)
-    _check_known("a floor", floors, recordings)
-    _check_floors(floors)
+    sources = on_floors(sources, beginning.floors)
     cloud = MissionCloud(config, beginning)
     meter = _Meter(watch, cloud, known)
     with drive(sources, config.robot) as robots:
-        new = [
-            on_floor(continued(legs, onto.epochs(source.name)), floors.get(source.name, ""))
-            for legs, source in zip(robots, sources, strict=True)
-        ]
+        new = [continued(legs, onto.epochs(name)) for legs, name in zip(robots, recordings, strict=True)]
         streams = [_packets(legs, meter) for legs in new]
         first, streams = _first(streams)
         if cloud.resume(first):
@@ -365,14 +362,6 @@ def check_robots(sources: Sequence[Source]) -> None:
         except PacketError as error:
             raise SourceError(f"{error}; a robot is named by its file, so rename it, or give NAME=LOG") from error
     check_names(names)
-
-
-def _check_floors(floors: Mapping[str, str]) -> None:
-    for floor in floors.values():
-        try:
-            check_floor(floor)
-        except PacketError as error:
-            raise ConfigError(str(error)) from error
 
 
 def _check_known(what: str, names: Iterable[str], robots: Sequence[str]) -> None:

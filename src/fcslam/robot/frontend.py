@@ -5,7 +5,8 @@ beside it: packets then come out later, but in the same order and with the same 
 
 While scans are doubtful (``fcslam.lidar.lost``), records are deferred. If they show the same place as before, they are
 processed normally. If they show another place, the robot is lost: its session ends before the doubtful scans, and a new
-one begins with them, as after a restart. So no unmeasured motion enters a map.
+one begins with them, as after a restart. So no unmeasured motion enters a map. After a ride in a lift
+(``fcslam.lidar.lifts``), the new session is on a floor without a name: the cloud finds out whether it knows this one.
 """
 
 import math
@@ -23,9 +24,11 @@ from fcslam.errors import FeatureError
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import first_sweep
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
+from fcslam.lidar.lifts import LEAVING_M, LEAVING_SCANS, Cabin
 from fcslam.lidar.lost import (
     DOUBTFUL_TRAVEL_M,
     GAP_TRAVEL_M,
+    MOST_SCANS,
     SEEN_S,
     LostConfig,
     can_decide,
@@ -36,6 +39,7 @@ from fcslam.lidar.lost import (
     is_lost,
     is_unplaced,
     relocated,
+    rode,
 )
 from fcslam.lidar.odometry import WHEELS, OdometryModel
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
@@ -170,6 +174,7 @@ class RobotFrontend:
         """Matches deferred scans without odometry with each other, from the second one on."""
         self._T_odom_beside = se2.IDENTITY
         """Pose of the first one of them, shape (3,)."""
+        self._cabin = Cabin()
         self._gap_s = 0.0
         """Time before the first of them in which nothing shows the motion."""
         self._fixes: deque[GnssFix] = deque(maxlen=MOST_FIXES)
@@ -208,6 +213,8 @@ class RobotFrontend:
         """Process the next record of the recording; returns the packets that are ready."""
         match record:
             case LaserScan():
+                if record.new_floor:
+                    self.change_floor(record.new_floor)
                 if is_clock_step(self._before_s, record.stamp):
                     self.begin_session()
                     self.prediction = MotionPrediction() if self.prediction else None
@@ -232,7 +239,8 @@ class RobotFrontend:
             for body in self._bodies(done):
                 if isinstance(body, Hello):
                     self._hello = body
-                packets.append(Packet(self.robot, done.epoch, self._sequence, done.time, body))
+                packet = Packet(self.robot, done.epoch, self._sequence, done.time, body)
+                packets.append(packet.on_floor(self.tracks[done.epoch].floor))
                 self._sequence += 1
             if isinstance(done.input, SessionEnd):
                 self._sequence, self._hello = 0, None
@@ -258,6 +266,13 @@ class RobotFrontend:
     def place_keyframes(self) -> None:
         """Have the back end write where the keyframes are, if it keeps them."""
         self._submit(PlaceKeyframes())
+
+    def change_floor(self, floor: str) -> None:
+        """Go on in a new session on another floor, 1 to 16 letters, digits and ``. _ + -``; empty: without a name."""
+        if floor != self.scan_poses.floor:
+            if len(self.scan_poses):
+                self.begin_session()
+            self.scan_poses.floor, self.scan_poses.is_new_floor = floor, True
 
     def begin_session(self) -> None:
         """End the present session and begin another: the next scan is of another place, as after a ride in a lift."""
@@ -340,9 +355,11 @@ class RobotFrontend:
             self._gap_s = scan.stamp - before.stamp
         # 1. Localize the scan; unless it is doubtful, process it.
         predicted = scan
+        self._cabin.add(scan)
         scan, tracking = self._matched(scan, self._lidar, self._in_odom(scan))
         may_be_frozen = self.prediction is None and self._wheels.may_be_frozen
-        if not (may_be_frozen or self._gap_s or is_doubtful(tracking, self._lidar, self._config.lost)):
+        is_leaving = self._cabin.is_leaving
+        if not (may_be_frozen or self._gap_s or is_doubtful(tracking, self._lidar, self._config.lost, is_leaving)):
             if self._deferred:
                 self._process_deferred()
                 tracking = self._lidar.localize(scan)
@@ -353,8 +370,10 @@ class RobotFrontend:
             scan = self._follow(self.prediction, predicted, tracking)
         self._deferred.append(scan)
         self.newest = _newest(self._lidar.scan_pose(scan.stamp, tracking.tracked), tracking, is_deferred=True)
-        travel_m = GAP_TRAVEL_M if self._gap_s else DOUBTFUL_TRAVEL_M
-        if not may_be_frozen and can_decide(self._deferred_scans, travel_m):
+        travel_m, most = GAP_TRAVEL_M if self._gap_s else DOUBTFUL_TRAVEL_M, MOST_SCANS
+        if is_leaving:
+            travel_m, most = LEAVING_M, LEAVING_SCANS
+        if not may_be_frozen and can_decide(self._deferred_scans, travel_m, most):
             self._decide()
 
     @property
@@ -373,7 +392,11 @@ class RobotFrontend:
         robot drove on, its newest keyscans are wrong: another local map begins, tied to the past by odometry.
         """
         scans = self._deferred_scans
-        if not self._gap_s and is_lost(scans, self._lidar):
+        if not self._gap_s and self._cabin.is_leaving:
+            if rode(scans, self._lidar, self._cabin.closed_s):
+                self._end_session()
+                self.scan_poses.floor, self.scan_poses.is_new_floor = "", True
+        elif not self._gap_s and is_lost(scans, self._lidar):
             is_whole = self.odometry.jumps == self._jumps
             if is_whole and drove_on(self._explained, scans, self._lidar):
                 self._lidar.begin_local_map()
@@ -385,6 +408,7 @@ class RobotFrontend:
                 self._move_deferred(self.prediction, scans[0], found)
             elif (found is not None and not self._gap_s) or self._gap_s > SEEN_S or is_unplaced(scans[0], self._lidar):
                 self._end_session()
+        self._cabin.leave()
         self._process_deferred()
 
     def _end_deferral(self) -> None:
@@ -449,7 +473,8 @@ class RobotFrontend:
         """Begin a session."""
         self._lidar = LidarFrontend(self.robot, self._config.lidar, self.odometry_model)
         self._newest, self._scans, self._explained, self._fixed = None, {}, {}, -1
-        self.tracks.append(ScanTrack())
+        self._cabin.leave()
+        self.tracks.append(ScanTrack(self.tracks[-1].floor) if self.tracks else ScanTrack(is_new_floor=True))
 
     def _process_deferred(self) -> None:
         """Process the deferred records normally."""

@@ -15,7 +15,11 @@ class ScanTrack:
     """Each scan has a fixed offset to a keyscan, and each keyscan a pose in ``odom``, the frame of the session's first
     keyscan. It grows by 36 bytes a scan."""
 
-    def __init__(self) -> None:
+    def __init__(self, floor: str = "", is_new_floor: bool = False) -> None:
+        self.floor = floor
+        """Floor of the session; empty: it has no name."""
+        self.is_new_floor = is_new_floor
+        """Whether the robot came to the floor with this session; otherwise it was lost there."""
         self._stamps, self._keyscans, self._T_keyscan_base = array("d"), array("i"), array("d")
         self._T_odom_keyscan = array("d", np.zeros(3))
 
