@@ -35,7 +35,7 @@ from tests.sources.bag_messages import odom, quaternion, save, tf
 from tests.sources.test_drivers import START, Scanner, pose_at, times
 
 RIGHT_M = 0.02
-SAID = "contradict", "are bent", "not corrected", "have no times", "was lost", "while the odometry stands still"
+SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still"
 """Parts of the lines that say what is wrong."""
 COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
 COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}

@@ -10,11 +10,12 @@ import pytest
 
 import fcslam
 from fcslam.geometry import se2
-from fcslam.lidar.facing import Facing, contradicted_facing, wrong_laser
+from fcslam.lidar.facing import Facing, FacingWatch, contradicted_facing, excess_of
 from fcslam.lidar.frontend import LidarConfig
+from fcslam.lidar.leaning import wrong_laser
 from fcslam.live.records import Wiring
-from fcslam.records import LaserModel, LaserScan, frozen
-from fcslam.robot.calibrating import calibrate_bag, calibrated
+from fcslam.records import LaserModel, LaserScan, Sweep, frozen
+from fcslam.robot.calibrating import calibrate_bag, calibrated, contradictions_of
 from fcslam.sources import BagOptions, open_source, write_bag
 from fcslam.sources.logs.carmen_writer import write_carmen
 from tests.lidar import worlds
@@ -44,7 +45,7 @@ def stated(scans, turned_deg=0.0, upside_down=False, distance=1.0):
             first_rad = -(laser.angle_min_rad + laser.beams.span_rad)
             laser, ranges_m = replace(laser, angle_min_rad=first_rad), frozen(ranges_m[::-1], np.float32)
         odometry = frozen(scan.T_odom_base / (distance, distance, 1.0))
-        found.append(LaserScan(scan.stamp, ranges_m, laser, odometry))
+        found.append(LaserScan(scan.stamp, ranges_m, laser, odometry, scan.sweep))
     return found
 
 
@@ -97,6 +98,61 @@ def test_a_drive_of_three_metres_is_enough(turned_deg):
     scans = drive(WIDE)[:36]
     assert contradicted_facing(scans) is None
     assert contradicted_facing(stated(scans, turned_deg)).facing.turned_deg == pytest.approx(turned_deg, abs=3.0)
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_a_turn_of_one_second_fits_the_odometry(clockwise):
+    t = np.arange(0.0, 40.0, 0.02)
+    poses = np.stack((2.0 * np.cos(0.3 * t), 1.5 * np.sin(0.6 * t), np.sin(1.3 * t)), axis=1)
+
+    def pose(stamp):
+        return np.stack([np.interp(stamp, t, axis) for axis in poses.T], axis=-1)
+
+    beam_s = np.linspace(1.0, 0.0, WIDE.beam_count) if clockwise else np.linspace(0.0, 1.0, WIDE.beam_count)
+    scans = []
+    for stamp in np.arange(0.0, 38.0):
+        seen = worlds.ranges(pose(stamp + beam_s), worlds.room(), WIDE)
+        twist = se2.log(se2.between(pose(stamp), pose(stamp + 0.02))) / 0.02
+        later = se2.log(se2.between(pose(stamp + 0.98), pose(stamp + 1.0))) / 0.02
+        sweep = Sweep(beam_s[0], beam_s[-1], tuple(twist), tuple(later - twist))
+        ranges_m = frozen(np.diagonal(seen).copy(), np.float32)
+        scans.append(LaserScan(stamp, ranges_m, WIDE, frozen(pose(stamp)), sweep))
+    assert contradicted_facing(scans) is None
+    assert contradicted_facing(replace(scan, sweep=None) for scan in scans) is not None
+
+
+def longer(scans, by_m):
+    return [replace(scan, ranges_m=frozen(np.maximum(scan.ranges_m + by_m, 0.0), np.float32)) for scan in scans]
+
+
+@pytest.mark.parametrize("excess_m", [0.3, -0.2])
+def test_a_zero_that_is_off_is_measured(excess_m):
+    found = excess_of(longer(drive(WIDE), excess_m))
+    assert found.excess_m == pytest.approx(excess_m, abs=0.051)
+    assert f"the ranges are too {'long' if excess_m > 0 else 'short'} by about 0." in str(found)
+
+
+def test_right_ranges_are_right_whatever_walls_look_like():
+    rng = np.random.default_rng(2)
+    scans = drive(WIDE)
+    rough = [replace(scan, ranges_m=frozen(scan.ranges_m + rng.normal(0.0, 0.05, 180), np.float32)) for scan in scans]
+    angles = np.linspace(0.0, 2.0 * math.pi, 73)
+    walls = np.vstack([worlds.path(*np.stack((r * np.cos(angles), r * np.sin(angles)), axis=1)) for r in (1.2, 5.0)])
+    poses = worlds.drive(3.1 * np.stack((np.cos(angles), np.sin(angles)), axis=1))
+    for healthy in (scans, rough, worlds.recording(poses, poses, walls, WIDE), scans[:20], drive(NARROW)):
+        assert excess_of(healthy) is None
+
+
+def test_bags_logs_and_live_lasers_say_once_that_ranges_are_too_long(tmp_path):
+    scans = longer(drive(WIDE, rounds=1.0), 0.3)
+    write_bag(tmp_path / "run.mcap", scans)
+    write_carmen(tmp_path / "run.log", scans)
+    watch = FacingWatch()
+    live = [str(wrong_laser(watched)) for scan in scans if (watched := watch.add(scan))]
+    bag = calibrate_bag(open_source(tmp_path / "run.mcap"), LidarConfig())
+    assert bag.correction.mounting == (0.0, 0.0, 0.0)
+    for lines in (bag.lines, contradictions_of(open_source(tmp_path / "run.log")), live):
+        assert sum("the ranges are too long by about 0.3" in line for line in lines) == 1
 
 
 def test_scans_that_fit_in_no_way_are_said():

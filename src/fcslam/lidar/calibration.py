@@ -29,6 +29,8 @@ FEWEST_PAIRS: Final = 4
 """Fewer turns or motions say nothing about the scales: two numbers are estimated from them."""
 LARGEST_RESIDUAL_M: Final = 0.015
 """Motions of scans and odometry that differ by more, as a standard deviation, are not a measure of each other."""
+LARGEST_SIGMA: Final = 0.1
+"""The same if the scale of distances is less certain, as a share of it: scans that were lost in a corridor."""
 LARGEST_DELAY_S: Final = 0.4
 DELAY_STEP_S: Final = 0.01
 """Range and step of the search for the delay, before it is refined."""
@@ -111,14 +113,20 @@ def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibratio
     delay, turn_scale = Estimate(0.0, 0.0), None
     if turns >= FEWEST_PAIRS:
         delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
-    fit = None
-    if len(pairs) >= FEWEST_PAIRS:
-        fit = _mounting(motions, odometry, pairs, delay.value, 1.0 if turn_scale is None else turn_scale.value)
-    scales = MotionCalibration(turn_scale=turn_scale, distance_scale=fit[0] if fit else None)
-    if turns < FEWEST_TURNS or (fit is None and len(pairs) >= FEWEST_MOTIONS):
+    if len(pairs) < FEWEST_PAIRS:
+        return MotionCalibration(turn_scale=turn_scale)
+    begins, ends = motions.stamps[pairs.T] + delay.value
+    moved = se2.between(odometry.at(begins), odometry.at(ends))
+    seen = se2.between(*motions.T_local_base[pairs.T])
+    fit = _fit(moved, seen, moved[:, 2] * (1.0 if turn_scale is None else turn_scale.value))
+    distance_scale = _distance_scale(fit.scale, moved, seen)
+    scales = MotionCalibration(turn_scale=turn_scale, distance_scale=distance_scale)
+    is_known = distance_scale.sigma <= LARGEST_SIGMA * distance_scale.value
+    is_measure, is_long = is_known and fit.residual_m <= LARGEST_RESIDUAL_M, len(pairs) >= FEWEST_MOTIONS
+    if turns < FEWEST_TURNS or (is_long and not is_measure):
         return scales
     timed = replace(scales, delay=delay, sweep_share=_sweep_share(motions, odometry, delay.value))
-    return timed if fit is None or len(pairs) < FEWEST_MOTIONS else replace(timed, mounting=fit[1])
+    return replace(timed, mounting=fit.mounting) if is_long else timed
 
 
 def _pairs(motions: ScanMotions) -> Pairs:
@@ -173,24 +181,28 @@ def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) 
     return Estimate(float(share), float(np.sqrt(covariance[0, 0])))
 
 
-def _mounting(
-    motions: ScanMotions, odometry: OdometryTrack, pairs: Pairs, delay_s: float, turn_scale: float
-) -> tuple[Estimate, tuple[Estimate, Estimate, Estimate]] | None:
+class _Fit(NamedTuple):
+    """The scale and the mounting with which one kind of motion gives the other."""
+
+    scale: Estimate
+    mounting: tuple[Estimate, Estimate, Estimate]
+    residual_m: float
+    """Standard deviation of a coordinate."""
+
+
+def _fit(moved: FloatArray, seen: FloatArray, turned: FloatArray) -> _Fit:
     """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g).
 
-    Returns:
-        The scale s of distances and the correction C; None if the motions do not agree.
+    Args:
+        moved: motions m, shape (P, 3).
+        seen: motions b between the same scans, shape (P, 3).
+        turned: headings of R_m, shape (P,).
     """
-    first, last = pairs.T
-    moved = se2.between(odometry.at(motions.stamps[first] + delay_s), odometry.at(motions.stamps[last] + delay_s))
-    seen = se2.between(motions.T_local_base[first], motions.T_local_base[last])
-    cos, sin = np.cos(turn_scale * moved[:, 2]), np.sin(turn_scale * moved[:, 2])
+    cos, sin = np.cos(turned), np.sin(turned)
     rows_x = np.stack((1.0 - cos, sin, seen[:, 0], -seen[:, 1]), axis=1)
     rows_y = np.stack((-sin, 1.0 - cos, seen[:, 1], seen[:, 0]), axis=1)
     design, target = np.concatenate((rows_x, rows_y)), np.concatenate((moved[:, 0], moved[:, 1]))
     (x, y, a, b), covariance = _robust(design, target)
-    if 1.4826 * float(np.median(np.abs(target - design @ (x, y, a, b)))) > LARGEST_RESIDUAL_M:
-        return None
     scale = 1.0 / max(float(np.hypot(a, b)), 1e-9)
     sigma_x, sigma_y, sigma_a, sigma_b = np.sqrt(np.diag(covariance)).tolist()
     sigma = scale * float(np.hypot(sigma_a, sigma_b))
@@ -199,7 +211,19 @@ def _mounting(
         Estimate(float(scale * y), scale * sigma_y),
         Estimate(float(np.arctan2(b, a)), sigma),
     )
-    return Estimate(scale, scale * sigma), mounting
+    residual_m = 1.4826 * float(np.median(np.abs(target - design @ (x, y, a, b))))
+    return _Fit(Estimate(scale, scale * sigma), mounting, residual_m)
+
+
+def _distance_scale(forward: Estimate, moved: FloatArray, seen: FloatArray) -> Estimate:
+    """Scale of distances, from the fit in both directions.
+
+    Errors of ``seen`` make the scale of one fit too large, as where a corridor hides the motion along it, and that of
+    the other too small. The true one is anywhere between them.
+    """
+    backward = 1.0 / _fit(seen, moved, seen[:, 2]).scale.value
+    sigma = np.hypot(forward.sigma, (forward.value - backward) / np.sqrt(12.0))
+    return Estimate(float(np.sqrt(forward.value * backward)), float(sigma))
 
 
 def _robust(design: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,19 +6,17 @@ right, they have the ranges that were measured there.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import islice
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.lidar.leaning import floor_line
-from fcslam.lidar.scan import point_scan
-from fcslam.lidar.straightness import Excess, excess_of
-from fcslam.records import Beams, FloatArray, LaserScan
-from fcslam.sources.returns import FloorLine
+from fcslam.lidar.scan import beam_times, rays_of
+from fcslam.records import Beams, FloatArray, LaserScan, frozen
 
 LEAST_MOVE_M: Final = 0.3
 LEAST_TURN_RAD: Final = 0.3
@@ -41,6 +39,8 @@ NOISE_M: Final = 0.1
 """Standard deviation of the ranges with the odometry between two scans."""
 LARGEST_STEP_M: Final = 0.3
 """Beams side by side whose ranges differ by more see two things."""
+WIDEST_GAP: Final = 3.0
+"""Beams with a larger angle between them, as a multiple of the usual one, are not side by side."""
 STEPS_DEG: Final = (30, 3)
 """Between the mountings that are tried, first and around the best."""
 DISTANCES: Final = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
@@ -57,7 +57,7 @@ LEAST_TURNED: Final = 0.45
 LEAST_GAIN: Final = 0.1
 """Least gain in agreement over the stated mounting."""
 LEAST_LEAD: Final = 0.05
-"""Least gain in agreement over any other mounting."""
+"""Least gain in agreement over any other mounting, and of other ranges."""
 SIGMAS: Final = 5.0
 """Least ratio of the gain to its standard deviation."""
 CLEAR_LEAD, CLEAR_AGREEMENT = 0.15, 0.75
@@ -66,6 +66,11 @@ NO_AGREEMENT: Final = 0.4
 """Scans agree less with the stated mounting only if something is wrong."""
 ENOUGH_PAIRS: Final = 10
 """Pairs with which that is certain, although no other mounting is."""
+
+FAR_M, FAR_RAD = 1.0, 0.8
+"""Two scans that are so far apart see the same walls from elsewhere, which shows whether ranges are too long."""
+EXCESS_STEP_M: Final = 0.05
+LEAST_EXCESS_M, LARGEST_EXCESS_M = 0.1, 1.0
 
 WHEELS: Final = 1.5
 """Distances that differ by a larger factor may be due to the unit of the ranges."""
@@ -144,6 +149,26 @@ class Contradiction(NamedTuple):
         )
 
 
+class Excess(NamedTuple):
+    """Ranges that are all too long by the same length."""
+
+    excess_m: float
+    """Below 0: they are too short."""
+    agreement: float
+    """Mean agreement of the points with the odometry, 0 to 1, without the excess."""
+    stated_agreement: float
+    """The same with the ranges as stated."""
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        wrong = "long" if self.excess_m > 0.0 else "short"
+        return (
+            f"the ranges are too {wrong} by about {abs(self.excess_m):.2f} m: without it {100 * self.agreement:.0f} % "
+            f"of the points agree with the odometry, and {100 * self.stated_agreement:.0f} % as stated; correct the "
+            "zero of the laser in its driver"
+        )
+
+
 def distance_remedy(distance: float) -> str:
     """What to do about a robot whose distance by scans is ``distance`` of that by odometry."""
     wheels = "correct the radius of the wheels in its driver"
@@ -171,14 +196,6 @@ class ScanPair(NamedTuple):
 
     before: LaserScan
     after: LaserScan
-    points: FloatArray
-    """Of the later scan in the frame of an upright laser, shape (N, 2), metres."""
-
-    @classmethod
-    def of(cls, before: LaserScan, after: LaserScan) -> Self:
-        """A pair of scans."""
-        at_laser = replace(after.laser, T_base_laser=(0.0, 0.0, 0.0))
-        return cls(before, after, point_scan(after.ranges_m, at_laser).points)
 
 
 def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
@@ -240,13 +257,48 @@ def _best(trial: "_Trial") -> tuple[Facing, dict[Facing, FloatArray]]:
     return max(near, key=lambda facing: trial.mean(trial.agreements(facing))), scores
 
 
-def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Excess | Contradiction | None:
-    """What is wrong with how a laser is mounted or measures, by the scans of a ``FacingWatch``."""
-    return floor_line(scans) or excess_of(scans) or contradicted_facing(scans)
+def excess_of(scans: Iterable[LaserScan]) -> Excess | None:
+    """By how much all ranges are too long; None if they fit the odometry as well as stated, or say nothing.
+
+    Two views of one wall from different places agree only with the right ranges, whatever its shape.
+    """
+    trial = _Trial(*_pairs(islice(scans, MOST_COMPARED), FAR_M, FAR_RAD))
+    if len(trial.pairs) < ENOUGH_PAIRS:
+        return None
+
+    def agreements(excess_m: float) -> FloatArray:
+        shorter = [ScanPair(_shorter(before, excess_m), _shorter(after, excess_m)) for before, after in trial.pairs]
+        return np.array([_agreement(pair, Facing()) for pair in shorter])
+
+    as_stated = found = agreements(0.0)
+    excess_m = 0.0
+    for step_m in (EXCESS_STEP_M, -EXCESS_STEP_M):
+        while abs(excess_m) < LARGEST_EXCESS_M:
+            further = agreements(excess_m + step_m)
+            if trial.mean(further) <= trial.mean(found):
+                break
+            excess_m, found = excess_m + step_m, further
+    if abs(excess_m) < LEAST_EXCESS_M or not trial.leads(found, as_stated, LEAST_LEAD):
+        return None
+    return Excess(excess_m, trial.mean(found), trial.mean(as_stated))
+
+
+def _shorter(scan: LaserScan, by_m: float) -> LaserScan:
+    """The scan with shorter returns; those that are not long enough are invalid."""
+    is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
+    return replace(scan, ranges_m=frozen(np.where(is_return, scan.ranges_m - by_m, scan.ranges_m), np.float32))
+
+
+def part_agreement(scans: Iterable[LaserScan], part: Callable[[LaserScan], LaserScan]) -> float:
+    """Mean agreement, 0 to 1, of a part of each scan with the scan before a move; NaN if few scans have it."""
+    moves, _ = _pairs(islice(scans, MOST_COMPARED))
+    found = np.array([_agreement(ScanPair(before, part(after)), Facing()) for before, after in moves])
+    found = found[np.isfinite(found)]
+    return float(found.mean()) if len(found) >= FEWEST_PAIRS else math.nan
 
 
 class FacingWatch:
-    """Collects scans of a live laser that tell how it faces and whether it measures distances."""
+    """Collects scans of a live laser that tell how it faces."""
 
     def __init__(self) -> None:
         self._scans: list[LaserScan] = []
@@ -302,7 +354,9 @@ class _Trial:
         return Contradiction(Facing(), agreement, agreement, self.pairs[0].before.laser.beams)
 
 
-def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
+def _pairs(
+    scans: Iterable[LaserScan], least_m: float = LEAST_MOVE_M, least_rad: float = LEAST_TURN_RAD
+) -> tuple[list[ScanPair], list[ScanPair]]:
     """Pairs of scans one after the other with a move between them, and those with a turn."""
     moves: list[ScanPair] = []
     turns: list[ScanPair] = []
@@ -311,43 +365,68 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
         if first is None or not 0.0 <= scan.stamp - first.stamp <= LONGEST_S:
             first = scan
             continue
-        has_moved, has_turned = _moved(first, scan)
+        has_moved, has_turned = _moved(first, scan, least_m, least_rad)
         if has_moved or has_turned:
             pairs = turns if has_turned else moves
             if len(pairs) < MOST_PAIRS:
-                pairs.append(ScanPair.of(first, scan))
+                pairs.append(ScanPair(first, scan))
             first = scan
         if len(moves) == len(turns) == MOST_PAIRS:
             break
     return moves, turns
 
 
-def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
+def _moved(
+    first: LaserScan, scan: LaserScan, least_m: float = LEAST_MOVE_M, least_rad: float = LEAST_TURN_RAD
+) -> tuple[bool, bool]:
     """Whether the robot has moved and turned enough between two scans."""
     x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
-    return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
+    return math.hypot(x, y) > least_m, abs(theta) > least_rad
 
 
 def _agreement(pair: ScanPair, facing: Facing) -> float:
     """Mean agreement, 0 to 1, of the points of the later scan with the earlier one; NaN if too few are in its view."""
-    before, after, in_laser = pair
+    before, after = pair
     T_base_laser = se2.compose(before.laser.T_base_laser, (0.0, 0.0, math.radians(facing.turned_deg)))
-    moved = se2.between(before.T_odom_base, after.T_odom_base) * (facing.distance, facing.distance, facing.turn)
-    T_before_after = se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
-    sign = -1.0 if facing.upside_down else 1.0
-    points = se2.transform(T_before_after, in_laser * (1.0, sign))
-    beams = before.laser.beams
-    middle_rad = beams.angle_min_rad + 0.5 * beams.span_rad
-    angle = se2.wrap_angle(sign * np.arctan2(points[:, 1], points[:, 0]) - middle_rad)
-    beam = (angle + 0.5 * beams.span_rad) / beams.angle_increment_rad
-    index = np.floor(beam).astype(np.intp)
-    inside = (index >= 0) & (index < beams.beam_count - 1)
-    index, share, distance = index[inside], (beam - index)[inside], np.hypot(points[:, 0], points[:, 1])[inside]
-    left, right = before.ranges_m[index].astype(np.float64), before.ranges_m[index + 1].astype(np.float64)
-    is_surface = (np.minimum(left, right) > 0.0) & (np.maximum(left, right) < before.laser.max_range_m)
-    left, right, share, distance = left[is_surface], right[is_surface], share[is_surface], distance[is_surface]
-    is_flat = np.abs(left - right) < LARGEST_STEP_M
+    T_before_after = _in_laser(se2.between(before.T_odom_base, after.T_odom_base), T_base_laser, facing)
+    surface, is_surface = _points(before, T_base_laser, facing)
+    points, is_return = _points(after, T_base_laser, facing)
+    points = se2.transform(T_before_after, points[is_return])
+    directions, ranges_m = np.arctan2(surface[:, 1], surface[:, 0]), np.hypot(surface[:, 0], surface[:, 1])
+    order = np.argsort(directions)
+    directions, ranges_m, is_surface = directions[order], ranges_m[order], is_surface[order]
+    angle, distance_m = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    right = np.searchsorted(directions, angle)
+    inside = (right > 0) & (right < len(directions))
+    right, angle, distance_m = right[inside], angle[inside], distance_m[inside]
+    left = right - 1
+    gap_rad, step_m = directions[right] - directions[left], ranges_m[right] - ranges_m[left]
+    is_flat = is_surface[left] & is_surface[right] & (np.abs(step_m) < LARGEST_STEP_M)
+    is_flat &= gap_rad < WIDEST_GAP * abs(before.laser.angle_increment_rad)
     if np.count_nonzero(is_flat) < FEWEST_POINTS:
         return math.nan
-    error_m = (distance - (left + share * (right - left)))[is_flat]
+    share = (angle - directions[left]) / np.maximum(gap_rad, 1e-9)
+    error_m = (distance_m - (ranges_m[left] + share * step_m))[is_flat]
     return float(np.exp(-0.5 * (error_m / NOISE_M) ** 2).mean())
+
+
+def _in_laser(moved: FloatArray, T_base_laser: FloatArray, facing: Facing) -> FloatArray:
+    """Motions of the base by odometry, shape (..., 3), as those of the laser that faces so."""
+    moved = moved * (facing.distance, facing.distance, facing.turn)
+    return se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
+
+
+def _points(scan: LaserScan, T_base_laser: FloatArray, facing: Facing) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The ends of the beams in the frame of the upright laser at the stamp, and which of them are returns.
+
+    They are placed by the motion of the odometry during the scan. Shapes (beam_count, 2) and (beam_count,).
+    """
+    laser = scan.laser
+    is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < laser.max_range_m)
+    ranges_m = np.where(is_return, scan.ranges_m, laser.max_range_m).astype(np.float64)
+    directions = rays_of(replace(laser, T_base_laser=(0.0, 0.0, 0.0))).directions
+    points = ranges_m[:, None] * directions * (1.0, -1.0 if facing.upside_down else 1.0)
+    if scan.sweep is None:
+        return points, is_return
+    moved = scan.sweep.displacement(beam_times(laser, scan.sweep)[:, None])
+    return se2.transform(_in_laser(moved, T_base_laser, facing), points[:, None])[:, 0], is_return

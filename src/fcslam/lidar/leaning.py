@@ -1,27 +1,28 @@
 """The line in which a leaning laser sees the floor.
 
 A laser that leans by some degrees sees the floor some metres away, in a straight line that moves with the robot. A map
-takes it for a wall, and matches it to itself from scan to scan, as if the robot stood still. Nothing is seen beyond it,
-whichever way the robot looks; so it shows as a line at which the ranges of many beams end.
+takes it for a wall, and matches it to itself from scan to scan, as if the robot stood still. Nothing is seen beyond it;
+so it shows as a line at which the ranges of many beams end. The wall of a lane or of a round building shows as one,
+too, but it comes nearer when the robot drives towards it.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import Final
 
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.own_body import NOTHING_M, by_degree
-from fcslam.lidar.straightness import scans_apart
-from fcslam.records import FloatArray, LaserScan
+from fcslam.lidar.facing import Contradiction, Excess, contradicted_facing, excess_of, part_agreement
+from fcslam.lidar.own_body import NOTHING_M, by_degree, scans_apart
+from fcslam.lidar.scan import rays_of
+from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.sources.returns import FloorLine
 
 FEWEST_PLACES, MOST_PLACES = 60, 400
-HEADINGS, FEWEST_HEADINGS = 12, 8
-"""Parts of the turn, and how many of them the robot must have looked to: each counts the same, as along a corridor a
-wall stays where it is."""
 HALF_DEG: Final = 35
 """Half of the sector that must see the line; a circle differs from a line by a fifth there."""
 STEP_DEG: Final = 5
@@ -33,27 +34,43 @@ FARTHEST_SHARE: Final = 0.97
 SAME: Final = 0.06
 """Largest deviation from the line, as a share of its distance: robots nod."""
 LEAST_STRAIGHT, LEAST_AT, MOST_BEYOND = 0.9, 0.12, 0.02
-"""Shares: of the degrees that end at the line, of the returns there, and of those farther than ``BEYOND`` of it. No
-level laser of 26 recordings meets them, in any stretch of 60, 120 or 400 places."""
+"""Shares: of the degrees that end at the line, of the returns there, and of those farther than ``BEYOND`` of it."""
 BEYOND: Final = 1.1
 LEAST_M: Final = 1.0
 """What is nearer is the robot's body."""
+MOVING: Final = 0.3
+"""Largest agreement of a line that moves with the robot; a wall keeps its place, also in a lane or a round building."""
 
 
-def floor_line(scans: Iterable[LaserScan]) -> FloorLine | None:
+def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Contradiction | Excess | None:
+    """What is wrong with how a laser is mounted or measures, by the scans of a ``FacingWatch``."""
+    return floor_line(scans) or contradicted_facing(scans) or excess_of(scans)
+
+
+def floor_line(scans: Sequence[LaserScan]) -> FloorLine | None:
     """The line in which a laser sees the floor; None if it does not, or the drive does not tell."""
+    line = _line_ahead(scans)
+    return line if line is not None and part_agreement(scans, partial(_at_line, line)) < MOVING else None
+
+
+def _at_line(line: FloorLine, scan: LaserScan) -> LaserScan:
+    """The scan with the returns at the line alone."""
+    heading_rad = line.heading_rad + scan.laser.T_base_laser[2]
+    ahead = rays_of(scan.laser).directions @ (math.cos(heading_rad), math.sin(heading_rad))
+    away = scan.ranges_m * ahead / line.distance_m
+    return replace(scan, ranges_m=frozen(np.where(np.abs(away - 1.0) < SAME, scan.ranges_m, np.nan), np.float32))
+
+
+def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
+    """A line at which the ranges of many beams end."""
     places = list(islice(scans_apart(scans), MOST_PLACES))
-    headings = np.array([scan.T_odom_base[2] for scan in places])
-    if len(places) < FEWEST_PLACES or not np.isfinite(headings).all():
-        return None
-    parts = np.floor(np.remainder(headings, 2.0 * np.pi) * (HEADINGS / (2.0 * np.pi))).astype(np.intp) % HEADINGS
-    counts = np.bincount(parts, minlength=HEADINGS)
-    if np.count_nonzero(counts) < FEWEST_HEADINGS:
+    if len(places) < FEWEST_PLACES:
         return None
     ranges_m = np.stack([by_degree(scan) for scan in places])
-    weights = (1.0 / counts[parts])[:, None] * (ranges_m < NOTHING_M)
-    ends_m = _quantiles(ranges_m, weights, FARTHEST_SHARE)
-    is_seen = weights.sum(axis=0) > LEAST_RETURNS * np.count_nonzero(counts)
+    ranges_m[ranges_m == NOTHING_M] = np.nan
+    is_seen = np.isfinite(ranges_m).mean(axis=0) > LEAST_RETURNS
+    ends_m = np.full(360, np.nan)
+    ends_m[is_seen] = np.nanquantile(ranges_m[:, is_seen], FARTHEST_SHARE, axis=0)
     found = []
     for middle in range(0, 360, STEP_DEG):
         offsets = np.arange(-HALF_DEG, HALF_DEG)
@@ -65,9 +82,10 @@ def floor_line(scans: Iterable[LaserScan]) -> FloorLine | None:
         on_line = np.abs(ends_m[sector] * cosines - distance_m) < SAME * distance_m
         if distance_m < LEAST_M or on_line.mean() < LEAST_STRAIGHT:
             continue
-        away, weight = ranges_m[:, sector] * cosines / distance_m, weights[:, sector] / weights[:, sector].sum()
-        at = float(weight[np.abs(away - 1.0) < SAME].sum())
-        if at >= LEAST_AT and weight[away > BEYOND].sum() <= MOST_BEYOND:
+        away = ranges_m[:, sector] * cosines / distance_m
+        away = away[np.isfinite(away)]
+        at = float((np.abs(away - 1.0) < SAME).mean())
+        if at >= LEAST_AT and (away > BEYOND).mean() <= MOST_BEYOND:
             found.append((at, _line(ends_m[sector[on_line]], np.radians(sector[on_line] + 0.5))))
     if not found:
         return None
@@ -80,11 +98,3 @@ def _line(ranges_m: FloatArray, headings_rad: FloatArray) -> FloorLine:
     design = np.stack((np.cos(headings_rad), np.sin(headings_rad)), axis=1)
     x, y = np.linalg.lstsq(design, 1.0 / ranges_m, rcond=None)[0].tolist()
     return FloorLine(1.0 / math.hypot(x, y), math.atan2(y, x))
-
-
-def _quantiles(values: FloatArray, weights: FloatArray, share: float) -> FloatArray:
-    """Of each column, the least value up to which its weights add up to ``share``, shape (columns,)."""
-    order = np.argsort(values, axis=0)
-    sums = np.take_along_axis(weights, order, axis=0).cumsum(axis=0)
-    first = np.argmax(sums >= share * sums[-1], axis=0)
-    return np.asarray(np.take_along_axis(values, order, axis=0)[first, np.arange(values.shape[1])])

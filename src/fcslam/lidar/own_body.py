@@ -6,6 +6,7 @@ only the returns within it are left out.
 """
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import islice, pairwise
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from fcslam.lidar.straightness import scans_apart
+from fcslam.geometry import se2
 from fcslam.records import FloatArray, LaserModel, LaserScan
 
 Heading = Annotated[float, Field(ge=-360.0, le=360.0)]
@@ -51,6 +52,8 @@ Polygon = Annotated[
 ]
 """Corners in the order of the outline; empty: none."""
 
+LEAST_MOVE_M, LEAST_TURN_RAD = 0.3, 0.3
+"""The robot has moved or turned by so much between two places."""
 FEWEST_PLACES, MOST_PLACES = 20, 200
 NOTHING_M: Final = 1e3
 """Range of a degree without a return."""
@@ -83,6 +86,18 @@ def is_in_polygon(points: FloatArray, corners: Polygon) -> NDArray[np.bool_]:
         if y1 != y2:  # a ray to the right crosses the side
             found ^= ((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
     return found
+
+
+def scans_apart(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
+    """Scans between which the robot has moved or turned, by odometry."""
+    last: LaserScan | None = None
+    for scan in scans:
+        if last is not None:
+            x, y, theta = se2.between(last.T_odom_base, scan.T_odom_base).tolist()
+            if not (math.hypot(x, y) > LEAST_MOVE_M or abs(theta) > LEAST_TURN_RAD):  # also without odometry
+                continue
+        last = scan
+        yield scan
 
 
 def body_sectors(scans: Iterable[LaserScan]) -> Sectors:

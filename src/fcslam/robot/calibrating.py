@@ -1,7 +1,7 @@
 """Calibration of a bag before it is mapped: its first minutes are tracked without odometry, and compared with it."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Final, NamedTuple, TypeGuard
@@ -15,14 +15,15 @@ from fcslam.lidar.facing import (
     MOST_COMPARED,
     WHEELS,
     Contradiction,
+    Excess,
     contradicted_facing,
     distance_remedy,
+    excess_of,
     turn_remedy,
 )
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.leaning import floor_line
 from fcslam.lidar.own_body import body_sectors
-from fcslam.lidar.straightness import Excess, excess_of
 from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
@@ -42,7 +43,7 @@ LARGEST_SCALE: Final = 2.0
 """Odometry that turns more or less than the scans by a larger factor measures something else."""
 LONGEST_PERIOD_S: Final = 0.12
 """Odometry that comes more seldom says nothing about delays: it is interpolated."""
-LEAST_DELAY_S: Final = 0.004
+LEAST_DELAY_S: Final = 0.02
 LEAST_YAW_RAD: Final = 0.005
 LEAST_OFFSET_M: Final = 0.02
 LARGEST_OFFSET_M: Final = 1.0
@@ -51,8 +52,8 @@ corrected."""
 LEAST_SCALE: Final = 0.01
 GROSS_SCALE: Final = 0.25
 """Scales that differ by more are no matter of precision."""
-LEAST_SHARE: Final = 0.1
-"""Smaller differences from what the bag says are not corrected."""
+LEAST_SHARE: Final = 0.25
+"""Smaller differences from what the bag says are not corrected: matching holds back short turns by up to 20 %."""
 SHORT_SHARE: Final = 0.2
 """Beams that are said to take a smaller share of this time may take longer."""
 AT_ONCE_SHARE: Final = 0.15
@@ -94,24 +95,18 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
 def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Found]") -> Calibrated:
     if len(contradictions) > 1:
         named = zip(bag.stream.lasers, contradictions, strict=True)
-        lines = (f"{laser.name}: {line}; not corrected" for laser, found in named for line in found.lines(str))
-        return Calibrated(MotionCalibration(), BagCorrection(), tuple(lines))
-    facing, excess, _ = contradictions[0]
-    if excess is None:
-        return _calibrate_facing(bag, config, facing)
-    calibrated = _calibrate_facing(bag, config, facing, is_bent=True)
-    return replace(calibrated, lines=(f"{excess}; not corrected", *calibrated.lines))
-
-
-def _calibrate_facing(
-    bag: RosBag, config: LidarConfig, found: Contradiction | None, is_bent: bool = False
-) -> Calibrated:
-    """Calibrate a bag with one laser; ``is_bent``: its ranges are no distances, so they do not tell where it sits."""
+        said = ((laser.name, found.facing or found.excess) for laser, found in named)
+        lines = tuple(f"{laser}: {line}; not corrected" for laser, line in said if line is not None)
+        return Calibrated(MotionCalibration(), BagCorrection(), lines)
+    found, excess, _ = contradictions[0]
     if found is None:
-        return _calibrate_finely(bag, config, is_bent)
+        fine = _calibrate_finely(bag, config)
+        if excess is None or _is_wrong(fine.calibration.distance_scale):
+            return fine
+        return Calibrated(fine.calibration, BagCorrection(), (f"{excess}; not corrected",))
     turned_deg, upside_down, distance, _ = found.facing
     if not found.is_correctable:
-        fine = _calibrate_finely(bag, config, is_bent)
+        fine = _calibrate_finely(bag, config)
         scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
         is_explained = _is_wrong(scale) or fine.correction.odometry_delay_s != 0.0  # by its scale, or another clock
         lines_before = () if is_explained else (f"{found}; not corrected",)
@@ -120,7 +115,7 @@ def _calibrate_facing(
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
     x, y, theta = se2.compose(turned, se2.inverse(T_base_laser)).tolist()
     coarse = BagCorrection(mounting=(x, y, theta), upside_down=upside_down)
-    fine = _calibrate_finely(bag.corrected(coarse, ()), config, is_bent)
+    fine = _calibrate_finely(bag.corrected(coarse, ()), config)
     x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
     done = "--sensors laser-pose is kept" if bag.has_given_pose else "corrected"
     correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
@@ -136,7 +131,10 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     say = str if isinstance(source, RosBag) else _without_tf
     lines = []
     for laser, found in zip(source.survey().lasers, _contradictions(source), strict=True):
-        lines += found.lines(say)
+        if found.facing is not None:
+            lines.append(say(found.facing))
+        if found.excess is not None:
+            lines.append(str(found.excess))
         if found.floor is not None:
             middle_deg = round(math.degrees(se2.wrap_angle(found.floor.heading_rad + laser.T_base_laser[2])))
             ignored = [middle_deg - FLOOR_HALF_DEG, middle_deg + FLOOR_HALF_DEG]
@@ -182,12 +180,8 @@ class _Found(NamedTuple):
 
     facing: Contradiction | None
     excess: Excess | None
+    """Unless the laser faces another way."""
     floor: FloorLine | None
-
-    def lines(self, say: Callable[[Contradiction], str]) -> list[str]:
-        """What speaks against the mounting, as ``say`` says it, and against the ranges."""
-        facing = () if self.facing is None else (say(self.facing),)
-        return [*facing, *(() if self.excess is None else (str(self.excess),))]
 
 
 def _contradictions(source: Source) -> list[_Found]:
@@ -195,11 +189,12 @@ def _contradictions(source: Source) -> list[_Found]:
     found = []
     for laser in source.survey().lasers:
         first = list(islice(_scans_of(laser, source), MOST_COMPARED))
-        found.append(_Found(contradicted_facing(first), excess_of(first), floor_line(first)))
+        facing = contradicted_facing(first)
+        found.append(_Found(facing, excess_of(first) if facing is None else None, floor_line(first)))
     return found
 
 
-def _calibrate_finely(bag: RosBag, config: LidarConfig, is_bent: bool) -> Calibrated:
+def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
     survey = bag.survey()
     assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
     if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:
@@ -220,8 +215,6 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig, is_bent: bool) -> Calibr
         return Calibrated(calibration, BagCorrection(), lines)
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
-    if is_bent:
-        calibration = replace(calibration, mounting=None)
     if _is_wrong(distance := calibration.distance_scale) and not 1.0 / WHEELS < distance.value < WHEELS:
         calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
