@@ -209,21 +209,25 @@ def states(castings, config=CONFIG):
     return at
 
 
-@pytest.mark.parametrize("usable_m", [2.0, 30.0])
-def test_a_hall_is_free_as_far_as_its_scan_has_a_return(usable_m):
+@pytest.mark.parametrize("longest_m", [2.0, 30.0])
+def test_a_hall_is_free_as_far_as_its_scan_has_a_return(longest_m):
     """Half of the turn has no return: the opposite wall of the hall is beyond the maximum range."""
     scans = [short_scan(0.0, 0.0), short_scan(0.01, 0.0)]
-    at = states(scans, OccupancyConfig(resolution_m=CELL_M, usable_range_m=usable_m))
+    at = states(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=longest_m))
     farthest = max(r for r in scans[0].ranges_m.tolist() if r < SHORT.max_range_m)
     assert farthest > 0.97 * SHORT.max_range_m
-    reach = min(usable_m, farthest)
+    reach = min(longest_m, farthest)
     for heading in np.radians(np.arange(181, 359, 3)):
         for share, expected in ((0.92, Occupancy.FREE), (1.05, Occupancy.UNKNOWN)):
             assert at(share * reach * np.cos(heading), share * reach * np.sin(heading)) == expected
 
 
-def test_beams_without_return_clear_nothing_if_no_other_beam_has_one():
+def test_beams_without_return_clear_nothing_if_no_other_beam_has_one_or_the_limit_is_0():
     assert cast([short_scan(0.0, -4.0)], CONFIG).passes.sum() == 0
+    wall = short_scan(0.0, 0.0)
+    alone = wall._replace(ranges_m=np.where(np.isinf(wall.ranges_m), 0.0, wall.ranges_m).astype(np.float32))
+    none = cast([wall], CONFIG.model_copy(update={"no_return_range_m": 0.0}))
+    assert none.passes.sum() == cast([alone], CONFIG).passes.sum()
 
 
 @settings(max_examples=100)

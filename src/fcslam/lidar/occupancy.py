@@ -41,6 +41,13 @@ class OccupancyConfig(Settings):
     usable_range_m: float = Field(
         default=30.0, gt=0, le=1000.0, description="longer beams clear cells up to this range and hit nothing [m]"
     )
+    no_return_range_m: float = Field(
+        default=30.0,
+        ge=0,
+        le=1000.0,
+        description="beams that report no return (inf) clear cells up to the returns beside them, at most up to this "
+        "range [m]; 0: they clear none",
+    )
     minimum_passes: int = Field(default=2, ge=1, description="least number of beams through a known cell")
     occupied_ratio: float = Field(
         default=0.15, gt=0, lt=1, description="ratio of hits to passes above which a cell is occupied"
@@ -245,7 +252,7 @@ def _by_laser(keyscans: Sequence[Casting], config: OccupancyConfig) -> list[_Bea
     for scan in keyscans:
         times = _AT_ONCE if scan.sweep is None else Sweep(scan.sweep.first_s, scan.sweep.last_s)
         by_beams.setdefault((scan.laser, times), []).append(scan)
-    return [_stacked(scans, laser, times, config.usable_range_m) for (laser, times), scans in by_beams.items()]
+    return [_stacked(scans, laser, times, config.no_return_range_m) for (laser, times), scans in by_beams.items()]
 
 
 def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
@@ -272,7 +279,7 @@ def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
     return cells
 
 
-def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep, usable_m: float) -> _Beams:
+def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep, longest_m: float) -> _Beams:
     for ranges_m, _, T_map_base, _ in keyscans:
         if np.shape(ranges_m) != (laser.beam_count,):
             raise ValueError(f"ranges of shape {np.shape(ranges_m)} from a laser of {laser.beam_count} beams")
@@ -286,7 +293,7 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep, usable_m:
     step_rad = abs(laser.beams.angle_increment_rad)
     return _Beams(
         ranges_m,
-        _open_ranges(ranges_m, laser.max_range_m, step_rad, is_full_turn(laser.beams), usable_m),
+        _open_ranges(ranges_m, laser.max_range_m, step_rad, is_full_turn(laser.beams), longest_m),
         *rays_of(laser),
         beam_times(laser, times),
         poses,
@@ -321,7 +328,7 @@ def _counts(layout: _Layout, by_scan: bool = False) -> _Counts:
 
 
 @njit
-def _open_ranges(ranges_m, max_range_m, step_rad, is_turn, usable_m):  # type: ignore[no-untyped-def]
+def _open_ranges(ranges_m, max_range_m, step_rad, is_turn, longest_m):  # type: ignore[no-untyped-def]
     """How far beams without return (inf) clear, shape (N, beam_count), metres; 0 for the others."""
     count = ranges_m.shape[1]
     found = np.zeros(ranges_m.shape, np.float32)
@@ -342,7 +349,7 @@ def _open_ranges(ranges_m, max_range_m, step_rad, is_turn, usable_m):  # type: i
                     part = i * step_rad
                     line = a * b * np.sin(angle) / (a * np.sin(part) + b * np.sin(angle - part))
                     reach = min(a, b, line)
-                found[k, beam] = min(reach, usable_m)
+                found[k, beam] = min(reach, longest_m)
     return found
 
 
