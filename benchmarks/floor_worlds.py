@@ -110,12 +110,12 @@ def drive(world: str, folder: Path, *options: object, floors: Path | None = None
 
 def joint_errors(folder: Path, run: Path, sessions: Sequence[str]) -> PositionErrors:
     """Position errors of all scans of several sessions in one map, after one rigid alignment."""
-    pairs = [_true_and_found(folder, run, session) for session in sessions]
+    pairs = [true_and_found(folder, run, session) for session in sessions]
     true, found = (np.concatenate(poses) for poses in zip(*pairs, strict=True))
     return PositionErrors.of(position_errors(align(true, found), true, found))
 
 
-def _true_and_found(folder: Path, run: Path, session: str) -> tuple[FloatArray, FloatArray]:
+def true_and_found(folder: Path, run: Path, session: str) -> tuple[FloatArray, FloatArray]:
     """Poses of a session at the same stamps, shape (N, 3)."""
     stamps, poses = read_tum(run / "trajectories" / f"{session}.tum")
     truth = interpolate(*read_tum(folder / f"{session.partition('+')[0]}.truth.tum"), stamps, gap_s=0.5)

@@ -131,7 +131,7 @@ def test_a_bag_is_mapped_without_the_floor(tmp_path, upside_down):
     assert len(said) == 1
     assert "a line 2." in said[0]
     assert said[0].endswith("mount it level; its returns are left out")
-    assert largest_error_m(source) < 0.1
+    assert largest_error_m(source) < (0.2 if upside_down else 0.05)
     assert upside_down or largest_error_m(bag) > 0.3
 
 

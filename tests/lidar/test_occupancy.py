@@ -209,26 +209,71 @@ def states(castings, config=CONFIG):
     return at
 
 
-@pytest.mark.parametrize("y", [-4.0, 0.0])
-def test_beams_without_return_clear_the_floor_up_to_the_maximum_range(y):
-    at = states([short_scan(0.0, y), short_scan(0.01, y)])
+@pytest.mark.parametrize("longest_m", [2.0, 30.0])
+def test_a_hall_is_free_as_far_as_its_scan_has_a_return(longest_m):
+    """Half of the turn has no return: the opposite wall of the hall is beyond the maximum range."""
+    scans = [short_scan(0.0, 0.0), short_scan(0.01, 0.0)]
+    at = states(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=longest_m))
+    farthest = max(r for r in scans[0].ranges_m.tolist() if r < SHORT.max_range_m)
+    assert farthest > 0.97 * SHORT.max_range_m
+    reach = min(longest_m, farthest)
     for heading in np.radians(np.arange(181, 359, 3)):
-        assert at(3.8 * np.cos(heading), y + 3.8 * np.sin(heading)) == Occupancy.FREE
-        assert at(4.2 * np.cos(heading), y + 4.2 * np.sin(heading)) == Occupancy.UNKNOWN
+        for share, expected in ((0.92, Occupancy.FREE), (1.05, Occupancy.UNKNOWN)):
+            assert at(share * reach * np.cos(heading), share * reach * np.sin(heading)) == expected
 
 
-def test_the_length_of_beams_without_return_can_be_set():
-    scans = [short_scan(0.0, -4.0), short_scan(0.01, -4.0)]
-    at = states(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=2.0))
-    assert (at(0.0, -5.8), at(0.0, -6.2)) == (Occupancy.FREE, Occupancy.UNKNOWN)
-    none = cast(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=0.0))
-    assert none.passes.sum() == 0
+def test_beams_without_return_clear_nothing_if_no_other_beam_has_one_or_the_limit_is_0():
+    assert cast([short_scan(0.0, -4.0)], CONFIG).passes.sum() == 0
+    wall = short_scan(0.0, 0.0)
+    alone = wall._replace(ranges_m=np.where(np.isinf(wall.ranges_m), 0.0, wall.ranges_m).astype(np.float32))
+    none = cast([wall], CONFIG.model_copy(update={"no_return_range_m": 0.0}))
+    assert none.passes.sum() == cast([alone], CONFIG).passes.sum()
+
+
+@settings(max_examples=100)
+@given(
+    st.floats(0.5, 6.0),
+    st.floats(0.5, 6.0),
+    st.integers(0, 719),
+    st.integers(2, 359),
+    st.lists(st.sampled_from([np.inf, 0.0, 50.0]), min_size=358, max_size=358),
+)
+def test_beams_without_return_clear_no_more_than_the_returns_beside_them_enclose(a, b, first, width, gap):
+    """Whatever lies in a gap, in any part of a full turn: only the triangle of the laser and both returns is cleared,
+    and nothing in it farther than the nearer return."""
+    ranges = np.zeros(720, np.float32)
+    ranges[(first + np.arange(1, width)) % 720] = gap[: width - 1]
+    ranges[[first, (first + width) % 720]] = a, b
+    angles, laser = ALL_ROUND.angles_rad(), np.array(ALL_ROUND.T_base_laser)
+    grid = cast([Casting(ranges, ALL_ROUND, np.zeros(3))], CONFIG)
+    rows, columns = np.nonzero(grid.passes)
+    centres = np.array(grid.origin_xy) + CELL_M * (np.stack((columns, rows), axis=-1) + 0.5)
+    seen = se2.transform(np.asarray(se2.inverse(laser)), centres)
+    ends = [ranges[k] * np.array((np.cos(angles[k]), np.sin(angles[k]))) for k in (first, (first + width) % 720)]
+    along = ends[1] - ends[0]
+    beyond = (along[1] * (seen - ends[0])[:, 0] - along[0] * (seen - ends[0])[:, 1]) / np.linalg.norm(along)
+    assert (beyond <= CELL_M).all()
+    on_return = [np.abs(seen @ (-end[1], end[0])) / np.linalg.norm(end) <= CELL_M for end in ends]
+    far = np.linalg.norm(seen, axis=1) > min(a, b) + CELL_M
+    assert (on_return[0] | on_return[1])[far].all()
+
+
+def test_the_first_and_the_last_beam_of_a_part_of_a_turn_are_not_neighbours():
+    ranges = np.full(FRONT.beam_count, np.inf, np.float32)
+    ranges[[30, 60]] = 2.0
+    grid = cast([Casting(ranges, FRONT, np.zeros(3))], CONFIG)
+    rows, columns = np.nonzero(grid.passes)
+    x, y = np.array(grid.origin_xy)[:, None] + CELL_M * (np.stack((columns, rows)) + 0.5)
+    headings = np.degrees(np.arctan2(y, x))[np.hypot(x, y) > 0.5]
+    assert headings.min() >= -36.0
+    assert headings.max() <= 36.0
 
 
 @pytest.mark.parametrize("later", [False, True])
 def test_a_person_who_left_is_cleared_by_beams_without_return(later):
-    there = [short_scan(-2.0 + 0.05 * k, -2.0, person=True) for k in range(10)]
-    gone = [short_scan(-1.5 + 0.05 * k, -2.0) for k in range(70)]
+    """The wall is in range, so that the scans have returns; the beams past the person have none."""
+    there = [short_scan(-2.0 + 0.05 * k, -0.8, person=True) for k in range(10)]
+    gone = [short_scan(-1.5 + 0.05 * k, -0.8, seen_from_m=3.9) for k in range(70)]
     assert states(there)(0.0, -0.15) == Occupancy.OCCUPIED
     periods = [there, gone] if later else [there + gone]
     *_, grid = cast_periods(periods, CONFIG)
@@ -247,6 +292,23 @@ def test_a_wall_stays_whose_returns_are_missing_at_times(seen_from_m, lost):
         cells = classify(grid, CONFIG)
         row, left, right = (
             int(np.floor(v / CELL_M)) for v in (3.0 - grid.origin_xy[1], -2 - grid.origin_xy[0], 2 - grid.origin_xy[0])
+        )
+        assert (cells[row, left:right] == Occupancy.OCCUPIED).all()
+        assert not (cells[row + 1 :, left:right] == Occupancy.FREE).any()
+
+
+def test_a_black_panel_in_a_wall_stays_although_later_scans_see_only_the_wall_beside_it():
+    near = [short_scan(-2.0 + 0.16 * k, 2.0) for k in range(25)]
+    far = []
+    for k in range(100):
+        scan = short_scan(-2.0 + 0.04 * k, 0.5)
+        x = scan.T_map_base[0] + 2.5 / np.tan(np.clip(SHORT.angles_rad(), 0.1, np.pi - 0.1))
+        far.append(scan._replace(ranges_m=np.where(np.abs(x) < 0.5, np.inf, scan.ranges_m).astype(np.float32)))
+    for periods in ([near + far], [near, far]):
+        *_, grid = cast_periods(periods, CONFIG)
+        cells = classify(grid, CONFIG)
+        (left, row), (right, _) = (
+            np.floor(np.subtract((x, 3.0), grid.origin_xy) / CELL_M).astype(int) for x in (-1.5, 1.5)
         )
         assert (cells[row, left:right] == Occupancy.OCCUPIED).all()
         assert not (cells[row + 1 :, left:right] == Occupancy.FREE).any()

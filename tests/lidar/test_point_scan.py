@@ -92,9 +92,27 @@ def test_a_normal_does_not_bridge_a_gap():
 def test_thinned_keeps_distance_and_limit():
     scan = scan_at((0, 0, 0), room())
     thinned = scan.thinned(0.2, 1000)
-    assert np.all(np.hypot(*np.diff(thinned.points, axis=0).T) >= 0.2)
+    apart_m = np.hypot(*np.diff(thinned.points, axis=0).T)
+    assert np.mean(apart_m >= 0.2) > 0.9
+    assert apart_m.min() > 0.1
     assert len(scan.thinned(0.0, 50)) == 50
     assert len(bare_scan([]).thinned(0.1, 5)) == 0
+
+
+@pytest.mark.parametrize("spacing_m", [0.03, 0.05, 0.1])
+def test_noise_does_not_decide_which_returns_are_kept(spacing_m):
+    """On a wall, an error of a range moves a return along the wall as well. Were returns kept by their own distance,
+    those on one side of the foot of the perpendicular would be too far, those on the other side too near: the wall
+    would seem turned.
+    """
+    rng = np.random.default_rng(1)
+    walls = path((2, -6), (2, 6))
+    turns = []
+    for _ in range(300):
+        points = scan_at((0, 0, 0), walls, noise_m=0.015, rng=rng).thinned(spacing_m).points
+        x, y = points[np.abs(points[:, 1]) < 3.0].T
+        turns.append(np.polyfit(y, x, 1)[0])
+    assert abs(np.mean(turns)) < 4.0 * np.std(turns) / np.sqrt(len(turns))
 
 
 def test_ranges_of_another_laser_are_refused():

@@ -70,11 +70,16 @@ def spread(count: int, declared: Beams) -> Beams:
         count: their number, 2 or more.
         declared: the beams that the laser was declared with.
     """
-    increment_rad = declared.angle_increment_rad
-    tolerance_rad = max(SAME_VIEW_RAD, SAME_VIEW_BEAMS * abs(increment_rad))
-    if abs(declared.span_rad + increment_rad) > FULL_TURN_RAD - tolerance_rad:
-        return Beams(count, declared.angle_min_rad, copysign(FULL_TURN_RAD, increment_rad) / count)
+    if is_full_turn(declared):
+        increment_rad = copysign(FULL_TURN_RAD, declared.angle_increment_rad) / count
+        return Beams(count, declared.angle_min_rad, increment_rad)
     return Beams(count, declared.angle_min_rad, declared.span_rad / (count - 1))
+
+
+def is_full_turn(beams: Beams) -> bool:
+    """Whether the beams look all around, so that the last one is beside the first."""
+    tolerance_rad = max(SAME_VIEW_RAD, SAME_VIEW_BEAMS * abs(beams.angle_increment_rad))
+    return abs(beams.span_rad + beams.angle_increment_rad) > FULL_TURN_RAD - tolerance_rad
 
 
 def beam_step(beams: Beams) -> int:

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from fcslam.compiled import njit
 from fcslam.config import Settings
+from fcslam.geometry.beams import is_full_turn
 from fcslam.lidar.scan import beam_times, ray_at, rays_of
 from fcslam.records import FloatArray, LaserModel, Ranges, Sweep
 from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
@@ -25,9 +26,8 @@ Counts = NDArray[np.uint32]
 CLEAR_RATIO = 0.05
 """Ratio of hits to passes up to which a period calls a cell free that was occupied. It is far below ``occupied_ratio``:
 beams that graze a wall hit its cells seldom, too."""
-SEEN_FARTHER = 1.25
-"""A beam without return says nothing about a surface that is farther than this many times the largest range at which
-others measured it."""
+CLEARANCE_CELLS = 2.0
+"""A beam without return ends this far before the line between the returns beside it, which may be one surface."""
 SETTLED_PASSES = 1_000_000
 """Beams that each known cell of a finished map counts for: newer scans change it only if they contradict it."""
 FARTHEST_M = 1e7
@@ -45,8 +45,8 @@ class OccupancyConfig(Settings):
         default=30.0,
         ge=0,
         le=1000.0,
-        description="beams that report no return (inf) clear cells up to this range, at most to the laser's maximum "
-        "[m]; 0: they clear none",
+        description="beams that report no return (inf) clear cells up to the returns beside them, at most up to this "
+        "range [m]; 0: they clear none",
     )
     minimum_passes: int = Field(default=2, ge=1, description="least number of beams through a known cell")
     occupied_ratio: float = Field(
@@ -103,6 +103,7 @@ class _Beams(NamedTuple):
     """Scans of one laser with the same beams at the same times, stacked."""
 
     ranges_m: Ranges  # (N, beam_count)
+    open_m: Ranges  # (N, beam_count): how far beams without return clear; 0 for others
     origins: FloatArray  # (beam_count, 2) in base, as if all were measured at the stamp
     directions: FloatArray  # (beam_count, 2)
     times_s: FloatArray  # (beam_count,)
@@ -137,17 +138,16 @@ class _Counts(NamedTuple):
     """Scans with a beam through the cell; empty if they are not counted."""
     newest: Counts
     """The last of these scans, counted from 1; empty if scans are not counted."""
-    seen_from: NDArray[np.float32]
-    """Largest range, in cells, of a return in the cell or beside it, in all periods so far; empty if every beam has a
-    return."""
 
 
 def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
     """Count hits and passes of all beams. Invalid ranges (0, NaN, at the maximum) add nothing.
 
     The grid spans all hits, all lasers and what beams without return clear; longer beams clear cells inside of it only.
-    A beam without return (inf) ends at cells that remain occupied, and at those that others saw only from nearer, as
-    black surfaces and windows.
+    A beam without return (inf) may have met a surface that is black, glass or grazed. So it clears no farther than the
+    nearer of the two returns beside it, and no farther than the line between them. Where they are half a turn or more
+    apart, as in a hall, no line is between them: the beam clears as far as the scan has a return. It ends at cells
+    that remain occupied.
 
     Args:
         keyscans: the scans.
@@ -180,21 +180,15 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
     Raises:
         ValueError: as ``cast``.
     """
-    groups = [_by_laser(keyscans) for keyscans in periods]
-    everything = [beams for period in groups for beams in period]
-    layout = _layout(everything, config)
-    is_open = config.no_return_range_m > 0.0 and any(np.isposinf(beams.ranges_m).any() for beams in everything)
-    if is_open:  # where the beams without return end is known only when they are cast
-        counts = _counts(layout, is_open)
-        _cast_all(everything, layout, config, counts)
-        layout = _trimmed(layout, counts.passes)
-    side, first = layout.resolution_m, _counts(layout, is_open)
+    groups = [_by_laser(keyscans, config) for keyscans in periods]
+    layout = _layout([beams for period in groups for beams in period], config)
+    side, first = layout.resolution_m, _counts(layout)
     hits, passes = first.hits, first.passes
     for number, period in enumerate(groups):
         if number == 0:
             _cast_all(period, layout, config, first)
         else:
-            counts = _counts(layout, is_open, by_scan=True)._replace(seen_from=first.seen_from)
+            counts = _counts(layout, by_scan=True)
             _cast_all(period, layout, config, counts)
             _supersede(
                 hits,
@@ -230,7 +224,7 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
     # Cell edges of other programs' maps need not lie on multiples of the resolution.
     off_x, off_y = base.origin_xy[0] - column * side, base.origin_xy[1] - row * side
     shift = np.array((off_x, off_y, 0.0))
-    groups = _by_laser([scan._replace(T_map_base=scan.T_map_base - shift) for scan in scans])
+    groups = _by_laser([scan._replace(T_map_base=scan.T_map_base - shift) for scan in scans], config)
     if not groups:
         return base
     drawn = _layout(groups, config.model_copy(update={"resolution_m": side}))
@@ -240,8 +234,7 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
     left, bottom = min(column, drawn.column), min(row, drawn.row)
     right, top = max(column + width, drawn.column + drawn.width), max(row + height, drawn.row + drawn.height)
     layout = _Layout(side, left, bottom, right - left, top - bottom)
-    is_open = config.no_return_range_m > 0.0 and any(np.isposinf(beams.ranges_m).any() for beams in groups)
-    counts = _counts(layout, is_open, by_scan=True)
+    counts = _counts(layout, by_scan=True)
     hits, passes = np.zeros((2, layout.height, layout.width), np.uint32)
     inside = slice(row - bottom, row - bottom + height), slice(column - left, column - left + width)
     passes[inside] = np.where(base.cells != Occupancy.UNKNOWN, SETTLED_PASSES, 0)
@@ -254,12 +247,12 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
     return OccupancyMap(cells, side, (left * side + off_x, bottom * side + off_y), base.floor)
 
 
-def _by_laser(keyscans: Sequence[Casting]) -> list[_Beams]:
+def _by_laser(keyscans: Sequence[Casting], config: OccupancyConfig) -> list[_Beams]:
     by_beams: dict[tuple[LaserModel, Sweep], list[Casting]] = {}
     for scan in keyscans:
         times = _AT_ONCE if scan.sweep is None else Sweep(scan.sweep.first_s, scan.sweep.last_s)
         by_beams.setdefault((scan.laser, times), []).append(scan)
-    return [_stacked(scans, laser, times) for (laser, times), scans in by_beams.items()]
+    return [_stacked(scans, laser, times, config.no_return_range_m) for (laser, times), scans in by_beams.items()]
 
 
 def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
@@ -267,16 +260,16 @@ def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, co
     numbered = list(zip(groups, accumulate((len(beams.ranges_m) for beams in groups), initial=1), strict=False))
     for beams, first in numbered:
         _cast(beams, layout, config.usable_range_m, counts, first)
-    if not counts.seen_from.size:
+    if not any(beams.open_m.any() for beams in groups):
         return
     # All beams without return together decide which cells stay occupied although such beams pass.
     trial = counts._replace(passes=counts.passes.copy(), scans=_UNCOUNTED, newest=_UNCOUNTED)
     occupied = np.zeros(counts.hits.shape, np.bool_)
     for beams, first in numbered:
-        _clear(beams, layout, config.no_return_range_m, trial, first, occupied)
+        _clear(beams, layout, trial, first, occupied)
     occupied = counts.hits > config.occupied_ratio * trial.passes
     for beams, first in numbered:
-        _clear(beams, layout, config.no_return_range_m, counts, first, occupied)
+        _clear(beams, layout, counts, first, occupied)
 
 
 def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
@@ -286,7 +279,7 @@ def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
     return cells
 
 
-def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams:
+def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep, longest_m: float) -> _Beams:
     for ranges_m, _, T_map_base, _ in keyscans:
         if np.shape(ranges_m) != (laser.beam_count,):
             raise ValueError(f"ranges of shape {np.shape(ranges_m)} from a laser of {laser.beam_count} beams")
@@ -297,8 +290,10 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams
     if not (np.abs(poses) < FARTHEST_M).all():  # false for NaN
         raise ValueError(f"poses must be finite and within {FARTHEST_M:g} m of the origin")
     sweeps = [scan.sweep or _AT_ONCE for scan in keyscans]
+    step_rad = abs(laser.beams.angle_increment_rad)
     return _Beams(
         ranges_m,
+        _open_ranges(ranges_m, laser.max_range_m, step_rad, is_full_turn(laser.beams), longest_m),
         *rays_of(laser),
         beam_times(laser, times),
         poses,
@@ -311,7 +306,7 @@ def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep) -> _Beams
 def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
     if not groups:
         return _Layout(config.resolution_m, 0, 0, 1, 1)
-    boxes = [_bounds(beams, config.usable_range_m, config.no_return_range_m) for beams in groups]
+    boxes = [_bounds(beams, config.usable_range_m) for beams in groups]
     low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
     resolution_m = config.resolution_m
     while True:
@@ -324,24 +319,42 @@ def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
         resolution_m *= 2.0
 
 
-def _counts(layout: _Layout, is_open: bool, by_scan: bool = False) -> _Counts:
-    """Zeros; ``is_open``: some beams have no return."""
-    shape, none = (layout.height, layout.width), (0, 0)
+def _counts(layout: _Layout, by_scan: bool = False) -> _Counts:
+    """Zeros."""
+    shape = layout.height, layout.width
     hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
-    scans, newest = (np.zeros(shape if by_scan else none, np.uint32) for _ in range(2))
-    return _Counts(hits, passes, scans, newest, np.zeros(shape if is_open else none, np.float32))
-
-
-def _trimmed(layout: _Layout, passes: Counts) -> _Layout:
-    """The part of the grid that beams pass, with a cell to spare on each side, as at the margins of ``_layout``."""
-    rows, columns = (np.flatnonzero(passes.any(axis=axis)) for axis in (1, 0))
-    top, left = rows[0] - 1, columns[0] - 1
-    height, width = rows[-1] + 2 - top, columns[-1] + 2 - left
-    return _Layout(layout.resolution_m, layout.column + int(left), layout.row + int(top), int(width), int(height))
+    scans, newest = (np.zeros(shape if by_scan else (0, 0), np.uint32) for _ in range(2))
+    return _Counts(hits, passes, scans, newest)
 
 
 @njit
-def _bounds(beams, usable, open_range):  # type: ignore[no-untyped-def]
+def _open_ranges(ranges_m, max_range_m, step_rad, is_turn, longest_m):  # type: ignore[no-untyped-def]
+    """How far beams without return (inf) clear, shape (N, beam_count), metres; 0 for the others."""
+    count = ranges_m.shape[1]
+    found = np.zeros(ranges_m.shape, np.float32)
+    for k in range(len(ranges_m)):
+        returns = np.flatnonzero((ranges_m[k] > 0.0) & (ranges_m[k] < max_range_m))
+        farthest = ranges_m[k][returns].max() if len(returns) else 0.0
+        # The first beams and the last are neighbours if the laser looks all around.
+        for n in range(len(returns) if is_turn else len(returns) - 1):
+            first, last = returns[n], returns[(n + 1) % len(returns)]
+            between = (last - first - 1) % count + 1
+            a, b, angle = ranges_m[k, first], ranges_m[k, last], between * step_rad
+            for i in range(1, between):
+                beam = (first + i) % count
+                if ranges_m[k, beam] != np.inf:
+                    continue
+                reach = farthest
+                if angle < np.pi:
+                    part = i * step_rad
+                    line = a * b * np.sin(angle) / (a * np.sin(part) + b * np.sin(angle - part))
+                    reach = min(a, b, line)
+                found[k, beam] = min(reach, longest_m)
+    return found
+
+
+@njit
+def _bounds(beams, usable):  # type: ignore[no-untyped-def]
     """Lowest and highest (x, y) of the lasers, of all returns in usable range and of the beams without return."""
     reach = min(usable, beams.max_range_m)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -350,8 +363,7 @@ def _bounds(beams, usable, open_range):  # type: ignore[no-untyped-def]
             x, y, dx, dy = _ray(beams, k, i)
             r = beams.ranges_m[k, i]
             reached = r if r > 0.0 and r < reach else 0.0  # 0 for NaN
-            if r == np.inf:
-                reached = min(open_range, beams.max_range_m)
+            reached = max(reached, beams.open_m[k, i])
             low[0], high[0] = min(low[0], x, x + reached * dx), max(high[0], x, x + reached * dx)
             low[1], high[1] = min(low[1], y, y + reached * dy), max(high[1], y, y + reached * dy)
     return low, high
@@ -382,19 +394,15 @@ def _cast(beams, layout, usable, counts, first):  # type: ignore[no-untyped-def]
             if _traverse(x0, y0, x1, y1, counts, np.uint32(first + k), _NOTHING) and r < usable:
                 column, row = int(np.floor(x1)), int(np.floor(y1))
                 counts.hits[row, column] += np.uint32(1)
-                if counts.seen_from.size > 0:
-                    around = counts.seen_from[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
-                    for cell in np.ndindex(around.shape):
-                        around[cell] = max(around[cell], np.float32(length))
 
 
 @njit(allocates=False)
-def _clear(beams, layout, open_range, counts, first, occupied):  # type: ignore[no-untyped-def]
+def _clear(beams, layout, counts, first, occupied):  # type: ignore[no-untyped-def]
     """Count the passes of the beams without return."""
-    length = min(open_range, beams.max_range_m) / layout.resolution_m
     for k in range(len(beams.ranges_m)):
         for i in range(len(beams.times_s)):
-            if beams.ranges_m[k, i] == np.inf:
+            length = beams.open_m[k, i] / layout.resolution_m - CLEARANCE_CELLS
+            if length > 0.0:
                 x, y, dx, dy = _ray(beams, k, i)
                 x0, y0 = x / layout.resolution_m - layout.column, y / layout.resolution_m - layout.row
                 _traverse(x0, y0, x0 + length * dx, y0 + length * dy, counts, np.uint32(first + k), occupied)
@@ -404,9 +412,8 @@ def _clear(beams, layout, open_range, counts, first, occupied):  # type: ignore[
 def _traverse(x0, y0, x1, y1, counts, scan, occupied):  # type: ignore[no-untyped-def]
     """Count a pass for each cell of a beam, including the first and the last; returns whether the last is in the grid.
 
-    A beam without return stops before cells that are ``occupied`` or were seen only from nearer; that of a return has
-    an empty ``occupied``. Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray
-    tracing", 1987.
+    A beam without return stops before cells that are ``occupied``; that of a return has an empty ``occupied``.
+    Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987.
     """
     height, width = counts.passes.shape
     counts_scans = counts.scans.size > 0
@@ -418,11 +425,8 @@ def _traverse(x0, y0, x1, y1, counts, scan, occupied):  # type: ignore[no-untype
     per_y = 1.0 / (y1 - y0) if y1 != y0 else 0.0
     edge_x, edge_y = column + int(right) - x0, row + int(up) - y0
     while 0 <= column < width and 0 <= row < height:
-        if occupied.size > 0:
-            seen_from = counts.seen_from[row, column]
-            nearest = np.hypot(column + 0.5 - x0, row + 0.5 - y0) - 1.0
-            if occupied[row, column] or 0.0 < SEEN_FARTHER * seen_from < nearest:
-                return False
+        if occupied.size > 0 and occupied[row, column]:
+            return False
         counts.passes[row, column] += np.uint32(1)
         if counts_scans and counts.newest[row, column] != scan:
             counts.newest[row, column] = scan

@@ -45,9 +45,12 @@ class PointScan:
         return len(self.points)
 
     def thinned(self, spacing_m: float, limit: int | None = None, radius_m: float = np.inf) -> "PointScan":
-        """Every return at least ``spacing_m`` from the one kept before, at most ``limit`` of them.
+        """Returns about ``spacing_m`` apart, at most ``limit`` of them.
 
-        Returns farther than ``radius_m`` from the origin of ``base`` are left out.
+        A return is kept if the one before it, and one more step as the returns before, are that far from the last one
+        kept. Its own noise does not count: the noise of a range moves a return along an oblique wall, too. Returns kept
+        by their own distance would be too far on one side of a wall and too near on the other, and would turn the robot
+        with each match. Returns farther than ``radius_m`` from the origin of ``base`` are left out.
         """
         most = len(self) if limit is None else limit
         points, normals, solitary, times_s = _thin(
@@ -261,13 +264,16 @@ def _thin(points, normals, solitary, times, spacing, limit, radius):  # type: ig
     """The arrays of ``PointScan.thinned``."""
     keep = np.empty(len(points), np.int64)
     n = 0
+    step = before = 0.0  # the last two distances of consecutive returns; the lesser leaves out gaps
     for i in range(len(points)):
+        if i > 1:
+            step, before = np.hypot(points[i - 1, 0] - points[i - 2, 0], points[i - 1, 1] - points[i - 2, 1]), step
         if points[i, 0] ** 2 + points[i, 1] ** 2 >= radius * radius:
             continue
         if n > 0:
-            dx = points[i, 0] - points[keep[n - 1], 0]
-            dy = points[i, 1] - points[keep[n - 1], 1]
-            if dx * dx + dy * dy < spacing * spacing:
+            dx = points[i - 1, 0] - points[keep[n - 1], 0]
+            dy = points[i - 1, 1] - points[keep[n - 1], 1]
+            if np.hypot(dx, dy) + min(step, before) < spacing:
                 continue
         keep[n] = i
         n += 1
