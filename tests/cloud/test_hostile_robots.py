@@ -64,7 +64,7 @@ def alone(honest):
 @pytest.fixture(scope="module")
 def packets(honest):
     copied = [packet for packet in honest if packet.robot == "robot_2"]
-    return in_order([*honest, *scaled(copied, "evil", 1.03)])
+    return in_order([*honest, *scaled(copied, "evil", 1.02)])
 
 
 @pytest.fixture(scope="module")
