@@ -15,6 +15,7 @@ from fcslam.graph.consistency import (
     loop_chi2,
     pairwise_consistency,
 )
+from fcslam.graph.evidence import MapFit
 from fcslam.graph.pose_graph import CHI2_LIMIT
 from fcslam.graph.trajectory import DRIFT, Trajectory, build_trajectory
 from fcslam.records import Reason, ReasonCode
@@ -111,6 +112,26 @@ def test_a_small_alias_group_is_outvoted() -> None:
     verdict = verdict_of(1, true=20, false=10, aliases=4)
     assert verdict.dominant
     assert set(verdict.members) <= set(range(30))
+
+
+GOOD, BAD = MapFit(500.0, 400.0, -np.inf, 300.0), MapFit(-100.0, 400.0, 500.0, 300.0)
+
+
+def test_where_the_maps_refute_the_largest_cluster_they_may_confirm_the_one_that_contradicts_it() -> None:
+    """Most closures of a building that repeats itself are aliases: here 16 of 28."""
+    a, b, closures = two_robots(0, true=12, false=0, aliases=16)
+    consistent, places = pairwise_consistency(a, b, closures), a.poses[closures.i, :2]
+
+    def decide(examine):
+        return dominant_cluster(consistent, places, np.ones(len(closures.i), dtype=bool), SETTINGS, examine)
+
+    found = decide(lambda rows: GOOD if rows.max() < 12 else BAD)
+    assert found.dominant
+    assert set(found.members) <= set(range(12))
+    assert found.evidence.fit.support == GOOD.support
+    refuted = decide(lambda _: BAD)
+    assert not refuted.dominant
+    assert refuted.contested
 
 
 def test_noise_alone_gives_no_verdict() -> None:

@@ -334,7 +334,18 @@ class ClosureDecisions:
     def _optimize(self) -> None:
         self._graph.optimize()
         self._contested |= self._graph.is_strained(self._config.contradiction)
+        self._contested |= any(map(self._is_refuted, self.joins))
         self.version += 1
+
+    def _is_refuted(self, pair: frozenset[str]) -> bool:
+        """Whether the maps of two joined sessions have grown since they were compared, and now contradict."""
+        a, b = sorted(pair, key=self._sessions.robots.index)
+        if not self._comparison.is_outdated(pair, sum(len(self._graph.path(session)) for session in pair)):
+            return False
+        entries = self.closures.evidence(a, b)
+        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
+        self.joins[pair] = decision.evidence
+        return decision.contested
 
 
 def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:

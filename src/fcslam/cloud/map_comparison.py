@@ -29,7 +29,7 @@ MOST_KEYSCANS = 300
 GROWTH = 1.5
 """The maps of two sessions are compared again when their cluster, or their paths together, have grown by this factor:
 at each place, it would take longer than all else."""
-MOST_TRANSFORMS = 3
+MOST_TRANSFORMS = 5
 """Comparisons of two sessions that are kept, at different transforms."""
 
 LOCAL_M = 8.0
@@ -125,6 +125,11 @@ class MapComparison:
             others = [each for each in self._compared.get(pair, ()) if each not in earlier]
             self._compared[pair] = [found, *others[: MOST_TRANSFORMS - 1]]
         return None if found is None else found.fit
+
+    def is_outdated(self, sessions: frozenset[str], size: int) -> bool:
+        """Whether the paths of two sessions, ``size`` keyscans together, have grown since their maps were compared."""
+        compared = self._compared.get(sessions, [])
+        return bool(compared) and size >= GROWTH * max(each.size for each in compared)
 
     @staticmethod
     def _is_at(

@@ -21,7 +21,9 @@ _NO_LEAD = ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES
 _MAPS_DECIDE = ReasonCode.FEW_PLACES, *_NO_LEAD
 """Reasons that a comparison of the maps may refute."""
 _MAPS_REFUTE = ReasonCode.MAPS_CONTRADICT, ReasonCode.WALLS_DIFFER, ReasonCode.LOOK_ALIKE
-"""Reasons of that comparison against a cluster; the one that contradicts it may be right."""
+"""Reasons of that comparison against a cluster; a smaller one that contradicts it may be right."""
+MOST_CLUSTERS = 4
+"""Most clusters that are compared with the maps: a building that repeats itself has more."""
 
 DIRECTION_M = 1.0
 """Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
@@ -36,7 +38,7 @@ class ClusterDecision:
     """Whether one cluster of closures is dominant."""
 
     members: tuple[int, ...]
-    """Largest cluster of pairwise consistent closures, or the runner-up if only there the maps agree."""
+    """Largest cluster of pairwise consistent closures, or a smaller one if only there the maps agree."""
     runner_up: tuple[int, ...]
     """Largest cluster that contradicts it: its closures are inconsistent with at least half of the members."""
     evidence: ClusterEvidence
@@ -162,7 +164,7 @@ def dominant_cluster(
 
     - an informative member;
     - maps that agree at its transform, and there clearly better than at any other (``fcslam.graph.evidence``). If they
-      do not, the largest cluster that contradicts it is tried;
+      do not, the next largest clusters that contradict it are tried;
     - without a comparison of the maps, a clear lead over the cluster that contradicts it: ``lead`` times as many
       closures, and no fewer places;
     - enough evidence: members from separate places, or a unique alignment of the maps.
@@ -198,27 +200,32 @@ def dominant_cluster(
         evidence = replace(evidence, fit=fit)
         return evidence, shortfall(evidence, settings)
 
-    largest = maximum_clique(consistent)
-    members = np.array(largest.members, dtype=np.int64)
-    others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
-    others = np.setdiff1d(others, members)
-    second = maximum_clique(consistent[np.ix_(others, others)])
-    runner_up = others[list(second.members)]
-    evidence, reason = decide(members, runner_up)
-    if reason is not None and reason.code in _MAPS_REFUTE:
-        rival_evidence, rival_reason = decide(runner_up, members)
-        if rival_reason is None:
-            members, runner_up, evidence, reason = runner_up, members, rival_evidence, None
-    has_no_lead = reason is not None and reason.code in _NO_LEAD
-    return ClusterDecision(
-        members=tuple(members.tolist()),
-        runner_up=tuple(runner_up.tolist()),
-        evidence=evidence,
-        exact=largest.exact and second.exact,
-        contested=(has_no_lead and evidence.rival_places >= settings.minimum_evidence)
-        or (reason is not None and reason.code in _MAPS_REFUTE),
-        shortfall=reason,
-    )
+    remaining, refuted = np.arange(len(consistent)), list[ClusterDecision]()
+    for _ in range(MOST_CLUSTERS):
+        largest = maximum_clique(consistent[np.ix_(remaining, remaining)])
+        members = remaining[list(largest.members)]
+        others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
+        others = np.setdiff1d(others, members)
+        second = maximum_clique(consistent[np.ix_(others, others)])
+        runner_up = others[list(second.members)]
+        evidence, reason = decide(members, runner_up)
+        is_refuted = reason is not None and reason.code in _MAPS_REFUTE
+        has_no_lead = reason is not None and reason.code in _NO_LEAD
+        decision = ClusterDecision(
+            members=tuple(members.tolist()),
+            runner_up=tuple(runner_up.tolist()),
+            evidence=evidence,
+            exact=largest.exact and second.exact,
+            contested=is_refuted or (has_no_lead and evidence.rival_places >= settings.minimum_evidence),
+            shortfall=reason,
+        )
+        remaining = np.intersect1d(remaining, others)
+        if not is_refuted:
+            return refuted[0] if refuted and reason is not None else decision
+        refuted.append(decision)
+        if not len(remaining):
+            break
+    return refuted[0]
 
 
 def evidence_of(places: FloatArray, informative: NDArray[np.bool_], tags: int, separation_m: float) -> ClusterEvidence:

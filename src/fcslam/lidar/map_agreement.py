@@ -27,7 +27,7 @@ from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.field import EMPTY, label_at
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, VIOLATION_M, Submap, build_submap
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, VIOLATION_M, Submap, build_submap, seen_through
 from fcslam.records import FloatArray
 
 STRETCH_M: Final = 0.5
@@ -79,6 +79,8 @@ class LocalSubmap:
     submap: Submap
     noise_m: float
     """Standard deviation of the offsets of stretches between two halves of its scans."""
+    is_solid: NDArray[np.bool_]
+    """Points of the surface that few beams passed, shape (N,): things that the robot saw through contradict nothing."""
     in_free: float
     """Share of the stretches of one half in the free space of the other."""
 
@@ -92,7 +94,7 @@ def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) ->
     enough = len(offsets) >= FEWEST_STRETCHES
     noise_m = min(WIDEST_NOISE_M, float(np.quantile(offsets, 0.68))) if enough else NOISE_M
     in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
-    return LocalSubmap(whole, noise_m, in_free)
+    return LocalSubmap(whole, noise_m, ~seen_through(whole, scans), in_free)
 
 
 def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray) -> PlaceAgreement:
@@ -109,7 +111,14 @@ def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray) -> PlaceAgreement
         count = len(stretches.offsets_m) + stretches.in_free
         ratios = _log_ratio(stretches.offsets_m, noise_m) + on_wall
         support = float(ratios.sum() + stretches.in_free * inside)
-        found.append(PlaceAgreement(support, count * mean, STRETCH_M * count, stretches.contradicting_m))
+        found.append(
+            PlaceAgreement(
+                support,
+                count * mean,
+                STRETCH_M * count,
+                _length_m(query.submap.surface.points[stretches.deep & query.is_solid]),
+            )
+        )
     return total(found)
 
 
@@ -138,7 +147,8 @@ class _Stretches(NamedTuple):
     """Of those on a wall, along its normal, shape (K,)."""
     in_free: int
     """How many lie in free space."""
-    contradicting_m: float
+    deep: NDArray[np.bool_]
+    """Points of the map in free space, farther than the reach of the other's walls, shape (N,)."""
 
 
 def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _Stretches:
@@ -147,7 +157,7 @@ def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _St
     offsets_m, states = _offsets(points, normals, T_target_query, field, free.cells, free.corner)
     known = states != _UNKNOWN
     if not known.any():
-        return _Stretches(np.empty(0), 0, 0.0)
+        return _Stretches(np.empty(0), 0, known)
     cells = np.floor(points[known] / STRETCH_M).astype(np.int64)
     facing = np.round(np.arctan2(normals[known, 1], normals[known, 0]) / (0.5 * np.pi)).astype(np.int64) % 4
     _, number = np.unique(np.column_stack((cells, facing)), axis=0, return_inverse=True)
@@ -156,14 +166,8 @@ def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _St
     walls, counts = (np.bincount(number, weights=each) for each in (on_wall, np.ones(len(number))))
     sums_m = np.bincount(number, weights=np.where(on_wall, offsets_m[known], 0.0))
     is_wall, is_free = walls >= FEWEST_POINTS, (counts >= FEWEST_POINTS) & (2.0 * walls < counts)
-    contradicting_m = _length_m(points[(states == _DEEP_IN_FREE) & ~_seen_through(query)])
-    return _Stretches(sums_m[is_wall] / walls[is_wall], int(np.count_nonzero(is_free & ~is_wall)), contradicting_m)
-
-
-def _seen_through(submap: Submap) -> NDArray[np.bool_]:
-    """Which points of a submap its own robot saw through, as of a railing, shape (N,)."""
-    column, row = np.floor((submap.surface.points - submap.free.corner) / FREE_CELL_M).astype(np.int64).T
-    return np.asarray(submap.free.cells[row, column])
+    in_free = int(np.count_nonzero(is_free & ~is_wall))
+    return _Stretches(sums_m[is_wall] / walls[is_wall], in_free, states == _DEEP_IN_FREE)
 
 
 def _length_m(points: FloatArray) -> float:

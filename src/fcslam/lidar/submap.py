@@ -101,6 +101,13 @@ def _beam_counts(
     return passes, hits, corner
 
 
+def seen_through(submap: Submap, scans: Sequence[tuple[PointScan, FloatArray]]) -> NDArray[np.bool_]:
+    """Points of ``submap.surface`` that more of its scans passed than saw, as at a railing, shape (N,)."""
+    passes, hits, corner = _beam_counts(scans, submap.surface.points)
+    column, row = np.floor((submap.surface.points - corner) / FREE_CELL_M).astype(np.int64).T
+    return np.asarray(passes[row, column] > hits[row, column])
+
+
 @njit(allocates=False)
 def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # type: ignore[no-untyped-def]
     """Count a scan once in each cell between the laser and a return, short of the return, and in the return's."""
