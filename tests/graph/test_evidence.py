@@ -27,7 +27,7 @@ def fit(ratio: float = 8.0, likeness: float = 1.8, contradiction: float = 0.0) -
 
 @pytest.mark.parametrize(
     ("places", "ratio", "enough"),
-    [(1, 2.9, False), (1, 3.1, True), (2, 1.9, False), (2, 2.1, True), (3, 1.25, True), (3, 1.15, False)],
+    [(1, 1.9, False), (1, 2.1, True), (2, 1.4, False), (2, 1.6, True), (3, 1.25, True), (3, 1.15, False)],
 )
 def test_a_unique_alignment_replaces_places(places, ratio, enough):
     evidence = replace(SPOT, separate_places=places, fit=fit(ratio))
@@ -43,7 +43,7 @@ def test_each_lack_has_its_reason_numbers_and_setting():
         replace(SPOT, rival_closures=100): Reason(ReasonCode.NO_LEAD, 1.46, 2.0, "lead"),
         replace(SPOT, rival_places=2): Reason(ReasonCode.RIVAL_PLACES, 1, 2),
         SPOT: Reason(ReasonCode.FEW_PLACES, 1, 3.0, "minimum_evidence"),
-        replace(SPOT, fit=fit(1.25)): Reason(ReasonCode.NOT_UNIQUE, 1.25, 3.0, "minimum_evidence"),
+        replace(SPOT, fit=fit(1.25)): Reason(ReasonCode.NOT_UNIQUE, 1.25, 2.0, "minimum_evidence"),
         replace(SPOT, fit=fit(1.0)): Reason(ReasonCode.LOOK_ALIKE, 1.0, LEAST_RATIO),
         replace(SPOT, fit=fit(contradiction=0.06)): Reason(ReasonCode.MAPS_CONTRADICT, 0.06, LARGEST_CONTRADICTION),
         replace(SPOT, fit=fit(likeness=0.5)): Reason(ReasonCode.WALLS_DIFFER, 0.5, LEAST_LIKENESS),

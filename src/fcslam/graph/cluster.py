@@ -10,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
-from fcslam.graph.evidence import ClusterEvidence, MapFit, shortfall
+from fcslam.graph.evidence import ClusterEvidence, MapFit, refutation, shortfall
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
 
@@ -18,7 +18,7 @@ Examine = Callable[[NDArray[np.int64]], MapFit | None]
 """Compares the maps at the transform of some closures, given by their rows, shape (M,), and elsewhere."""
 
 _NO_LEAD = ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES
-_MAPS_DECIDE = ReasonCode.FEW_PLACES, *_NO_LEAD
+_MAPS_DECIDE = ReasonCode.NOT_INFORMATIVE, ReasonCode.FEW_PLACES, *_NO_LEAD
 """Reasons that a comparison of the maps may refute."""
 _MAPS_REFUTE = ReasonCode.MAPS_CONTRADICT, ReasonCode.WALLS_DIFFER, ReasonCode.LOOK_ALIKE
 """Reasons of that comparison against a cluster; a smaller one that contradicts it may be right."""
@@ -196,7 +196,10 @@ def dominant_cluster(
         fit = examine(rows)
         if fit is not None and by_count is not None and by_count.code in _NO_LEAD:
             rival = examine(rivals)
-            fit = replace(fit, rival_support=max(fit.rival_support, rival.support if rival else np.inf))
+            if rival is None:
+                return evidence, by_count
+            if refutation(rival) is None:
+                fit = replace(fit, rival_support=max(fit.rival_support, rival.support))
         evidence = replace(evidence, fit=fit)
         return evidence, shortfall(evidence, settings)
 

@@ -4,10 +4,10 @@ Each separate place whose closures agree is one independent test of the transfor
 the maps have the last word. At the transform, the walls of one place lie on each other, no long wall of one map stands
 in free space of the other, and the maps fit nowhere else as well.
 
-Where closures come from few places, the ratio of the support of the maps there to that elsewhere, less one, counts as
-further places. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing. A tag that
-both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and then the maps
-contradict each other.
+Where closures come from few places, twice the ratio of the support of the maps there to that elsewhere, less one,
+counts as further places. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing.
+A tag that both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and then the maps
+contradict each other. In a lane that winds, no closure fixes the pose in every direction, but the maps may.
 """
 
 import math
@@ -29,6 +29,10 @@ LEAST_RIVAL = 20.0
 """The support elsewhere is taken to be at least this, nats: maps with little wall in common are never unique."""
 LEAST_RATIO = 1.2
 """Least ``MapFit.ratio``, however many places agree."""
+FIXES_RATIO = 2.0
+"""Least ``MapFit.ratio`` of maps that fix the pose where no closure does."""
+RATIO_PLACES = 2.0
+"""Further places that maps replace which fit twice as well as elsewhere."""
 TAG_PLACES = 2.0
 """Further places that a tag replaces, which both robots saw, if their maps do not contradict each other."""
 
@@ -42,8 +46,8 @@ class EvidenceSettings(Settings):
     minimum_evidence: float = Field(
         default=3.0,
         ge=0.0,
-        description="evidence that a cluster needs to join two maps: its separate places, plus the ratio by which the "
-        "alignment of the maps scores better than the best one elsewhere, less one",
+        description="evidence that a cluster needs to join two maps: its separate places, plus twice the ratio by which "
+        "the maps fit better than elsewhere, less one",
     )
     lead: float = Field(
         default=2.0,
@@ -113,7 +117,7 @@ def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason |
     """
     if evidence.closures < settings.minimum_closures:
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
-    if not evidence.informative:
+    if not evidence.informative and (evidence.fit is None or evidence.fit.ratio < FIXES_RATIO):
         return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
     if evidence.fit is not None and evidence.fit.compared_m >= LEAST_COMPARED_M:
         refuted = refutation(evidence.fit)
@@ -143,6 +147,6 @@ def _amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> 
         return None
     if fit is None:
         return Reason(ReasonCode.FEW_PLACES, places, least, "minimum_evidence")
-    if places + max(0.0, fit.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0) >= least:
+    if places + RATIO_PLACES * max(0.0, fit.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0) >= least:
         return None
-    return Reason(ReasonCode.NOT_UNIQUE, fit.ratio, 1.0 + least - places, "minimum_evidence")
+    return Reason(ReasonCode.NOT_UNIQUE, fit.ratio, 1.0 + (least - places) / RATIO_PLACES, "minimum_evidence")
