@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import (
     ClosureRow,
+    Join,
     LocalMap,
     Metric,
     RobotTrajectory,
@@ -23,6 +24,8 @@ from fcslam.runs import (
 )
 from fcslam.runs.map_files import OccupancyMap, map_yaml, parse_map, pgm_bytes
 from fcslam.storage import files
+
+JOIN_COLUMNS = "robot_i,robot_j,closures,places,seen_m,contradicting_m,likeness,elsewhere"
 
 
 def trajectory(robot="robot_1", map_index=0, count=40, seed=0):
@@ -41,6 +44,7 @@ def run():
     return Run(
         trajectories={t.robot: t for t in trajectories},
         closures=(closure,),
+        joins=(Join("robot_1", "b-2", 7, 3, 141.5, 0.25, 0.9, 0.0), Join("robot_1", "étage.0", 3, 1, *[np.nan] * 4)),
         metrics={"uplink": Metric("uplink", 4.5, "kB/s"), "error": Metric("error", float("nan"), "m")},
         config_yaml="seed: 1\n",
         pose_graph_g2o="VERTEX_SE2 0 0 0 0\n",
@@ -69,6 +73,8 @@ def test_what_is_written_is_read_back(tmp_path, run):
     np.testing.assert_allclose(closure.T_i_j, given.T_i_j, atol=1e-6)
     for name in ("robot_i", "stamp_i", "robot_j", "stamp_j", "channel", "similarity", "status", "reason"):
         assert getattr(closure, name) == getattr(given, name)
+    assert back.joins[0] == run.joins[0]
+    np.testing.assert_equal(astuple(back.joins[1]), astuple(run.joins[1]))
     assert back.metrics["uplink"] == run.metrics["uplink"]
     assert np.isnan(back.metrics["error"].value)
     assert (back.config_yaml, back.pose_graph_g2o) == (run.config_yaml, run.pose_graph_g2o)
@@ -77,6 +83,12 @@ def test_what_is_written_is_read_back(tmp_path, run):
         assert (given.robot, given.pgm, given.yaml) == (read.robot, read.pgm, read.yaml)
         np.testing.assert_allclose(read.stamps, given.stamps, atol=1e-6, rtol=0)
         np.testing.assert_allclose(se2.between(given.T_local_base, read.T_local_base), 0.0, atol=1e-7)
+
+
+def test_a_run_folder_without_joins_csv_is_read(tmp_path, run):
+    run.save(tmp_path / "run")
+    (tmp_path / "run" / "joins.csv").unlink()
+    assert open_run(tmp_path / "run").joins == ()
 
 
 def test_local_maps_may_be_left_out_as_a_whole(tmp_path, run):
@@ -94,6 +106,9 @@ def test_tables_have_the_columns_promised(tmp_path, run):
     assert (
         closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"
     )
+    joins = (tmp_path / "run" / "joins.csv").read_text().splitlines()
+    assert joins[0] == JOIN_COLUMNS
+    assert joins[2] == "robot_1,étage.0,3,1,,,,"
     line = (tmp_path / "run" / "trajectories" / "robot_1.tum").read_text().splitlines()[0].split()
     assert line[3:6] == ["0", "0", "0"]
     assert [len(line[i].split(".")[1]) for i in (0, 1, 2, 6, 7)] == [9] * 5
@@ -219,6 +234,8 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
         ("robots.csv", "robot,map,path_length_m,scans,floor\nrobot_1,0,1,1,<b>\n", "'<b>' is not a floor"),
         ("closures.csv", "robot_i\nrobot_1\n", "closures.csv, line 2"),
         ("closures.csv", None, "closures.csv"),
+        ("joins.csv", "robot_i,robot_j\na,b\n", "joins.csv, line 2"),
+        ("joins.csv", f"{JOIN_COLUMNS}\na,b,x,1,,,,\n", "'x'"),
         ("local/robot_1.tum", None, "robot_1.tum"),
         ("local/b-2.pgm", None, "b-2.pgm"),
         ("local/b-2.yaml", "image: \xff\n", "broken"),

@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from fcslam.robot.outbox import WaitingPackets
     from fcslam.runs import (
         ClosureRow,
+        Join,
         LocalizedPoses,
         LocalMap,
         Metric,
@@ -101,6 +102,7 @@ __all__ = [
     "FeatureError",
     "GnssFix",
     "InputError",
+    "Join",
     "LaserModel",
     "LaserScan",
     "LocalMap",
@@ -164,7 +166,8 @@ _LAZY: Final = {
         "fcslam.records": "Beams CameraImage CameraModel Channel ClosureStatus GnssFix LaserModel LaserScan "
         "Odometry Reason ReasonCode Sweep Transform Veto",
         "fcslam.robot.outbox": "WaitingPackets",
-        "fcslam.runs": "ClosureRow LocalMap LocalizedPoses Metric Occupancy OccupancyMap RobotTrajectory Run open_run",
+        "fcslam.runs": "ClosureRow Join LocalMap LocalizedPoses Metric Occupancy OccupancyMap RobotTrajectory Run "
+        "open_run",
         "fcslam.sources": "BagOptions Fault FaultCount Faults ScanRange Source Survey",
         "fcslam.sources.point_clouds": "CloudBand",
         "fcslam.wire.http_transport": "Server",

@@ -27,7 +27,7 @@ from fcslam.page.report import MOST_TILES, report_html
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
-from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run
+from fcslam.runs import ClosureRow, Join, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.service.http.app import PREFIX
 from fcslam.wire.packets import decode, measure
@@ -36,7 +36,8 @@ from tests.service.http.desk import A
 pytestmark = pytest.mark.slow
 
 ASKED = (
-    *("fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "quality.json", "config.yaml"),
+    *("fleet", "maps", "separations", "joins", "robots", "edits", "learning"),
+    *("metrics.json", "quality.json", "config.yaml"),
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
 )
 """Paths that the page requests, besides events, trajectories and tiles."""
@@ -64,6 +65,7 @@ def run():
     return Run(
         trajectories={t.robot: t for t in (trajectory("a", 0), trajectory("a+1", 0), trajectory("b", 1))},
         closures=(closure,),
+        joins=(Join("a", "a+1", 3, 1, *[float("nan")] * 3, float("inf")), Join("a", "b", 3, 1, 9.0, 0.0, 1.0, 0.0)),
         metrics={"error": Metric("error", float("nan"), "m")},
         map_files=files("map", 160) | files("map_1", 40),
         quality={"quality.json": b'{"0":{"bar":0.05,"cell":1.0,"cells":[],"drives":[]}}'},
@@ -108,6 +110,11 @@ def test_a_finished_run_answers_as_the_service_does(shown):
     assert metrics == [{"name": "error", "value": None, "unit": "m"}]
     assert one["sessions"] == robots[:2]
     assert [(edit["kind"], edit["author"]) for edit in told["edits"]] == [("veto", "anna")]
+    assert told["joins"] == [  # not of robots in two maps
+        {"robots": ["a", "a+1"], "map": 0, "closures": 3, "places": 1}
+        | dict.fromkeys(("seen_m", "contradicting_m", "likeness", "elsewhere"))
+        | {"explanation": "a and a+1: 3 closures from 1 place; their maps could not be compared"}
+    ]
     (apart,) = told["separations"]
     assert (apart["maps"], apart["explanation"]) == (
         [0, 1], "map 0 (a, a+1) and map 1 (b): no two of their places look alike; drive b through a part of map 0"

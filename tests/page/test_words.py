@@ -41,6 +41,17 @@ def test_the_state_of_a_robot_is_true(told):
     assert told["evidence"] == ["Nobody else has seen its places yet", "Saw the same places as b, 2 times"]
 
 
+def test_a_robot_names_the_evidence_of_its_weakest_joins(told):
+    join = "Joined with b: 7 places, 141 m of wall seen by both, 0 % contradict."
+    assert told["joins"] == [
+        "",
+        join,
+        "Joined with b: 1 place, 141 m of wall seen by both, 0 % contradict. Look-alike places are possible. "
+        "Joined with b: 9 places, their maps could not be compared.",
+        f"{join} {join} {join} 1 more join, from more places.",
+    ]
+
+
 def test_the_evidence_names_what_it_rests_on(told):
     assert told["sensors"] == ["laser scanner", "camera", "tag"]
 

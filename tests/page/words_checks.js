@@ -6,6 +6,7 @@ const counts = { packets: 5, applied: 5, map_age_s: 1, free_bytes: 9e10 };
 const need = (more) => attention({ robots: [a], maps: [{ map: 0, robots: ["a"] }], separations: [], quality: {}, counts, contradicted: [], readOnly: false, ...more });
 const apart = { maps: [0, 1], candidates: 2, verified: 0, explanation: "few points" };
 const closure = { robot_i: "a", stamp_i: 5, robot_j: "b", stamp_j: 8, reason: "found_by_robot" };
+const join = { robots: ["b", "a"], places: 7, seen_m: 141.2, contradicting_m: 0.3, elsewhere: 0 };
 console.log(JSON.stringify({
   states: [
     state(a, [a]), state(a, [a, b]), state(alone, [a, alone]), state(robot({ map: null }), [a, b]), state(robot({ last_heard_s: 90 }), [a]),
@@ -13,6 +14,7 @@ console.log(JSON.stringify({
     state(a, [a, robot({ session: "a+1", epoch: 1 })]), state(a, [a, b], true), state(alone, [a, alone], true),
   ].map(({ kind, text }) => [kind, text]),
   evidence: [evidence([a, b], []).get("a"), evidence([a, b], [closure, { ...closure, stamp_i: 6 }]).get("a")],
+  joins: [[], [join], [{ ...join, seen_m: null, places: 9 }, { ...join, elsewhere: 0.5, places: 1 }, { ...join, robots: ["a", "a+1"] }], [join, join, join, join]].map((joins) => joinsOf(a, [a, b, robot({ session: "a+1", epoch: 1 })], joins)),
   well: need({}),
   silent: need({ robots: [robot({ last_heard_s: 90 }), robot({ robot: "c", session: "c", last_heard_s: 60 })] }).map((n) => [n.text, n.action]),
   apart: need({ robots: [a, alone], maps: [{ map: 0, robots: ["a"] }, { map: 1, robots: ["b"] }], separations: [apart] }).map((n) => [n.text, n.help, n.why, n.do]),

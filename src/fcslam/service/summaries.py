@@ -25,6 +25,7 @@ from fcslam.service.http.responses import (
     ClosureSummary,
     EditSummary,
     FleetSummary,
+    MapJoin,
     MapSeparation,
     MapSummary,
     SessionSummary,
@@ -51,8 +52,7 @@ def fleet_summary(mission: ViewedMission, read_only: bool, may_edit: bool) -> Fl
         worker_ready=counts.worker_ready,
         robots=list(run.trajectories),
         maps=len({robot.map_index for robot in run.trajectories.values()}),
-        # JSON has no NaN
-        metrics={name: metric.value if math.isfinite(metric.value) else None for name, metric in run.metrics.items()},
+        metrics={name: _finite(metric.value) for name, metric in run.metrics.items()},
     )
 
 
@@ -191,6 +191,32 @@ def map_separations(mission: ViewedMission) -> list[MapSeparation]:
         )
         for s in separations(run_of(mission))
     ]
+
+
+def map_joins(mission: ViewedMission) -> list[MapJoin]:
+    """On what evidence robots share a map, for every two with closures between them that agree."""
+    run = run_of(mission)
+    maps = {robot.robot: robot.map_index for robot in run.trajectories.values()}
+    return [
+        MapJoin(
+            robots=(join.robot_i, join.robot_j),
+            map=maps[join.robot_i],
+            closures=join.closures,
+            places=join.places,
+            seen_m=_finite(join.seen_m),
+            contradicting_m=_finite(join.contradicting_m),
+            likeness=_finite(join.likeness),
+            elsewhere=_finite(join.elsewhere),
+            explanation=str(join),
+        )
+        for join in run.joins
+        if maps.get(join.robot_i, -1) == maps.get(join.robot_j)
+    ]
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None
 
 
 def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.closures import ClosureScope
 from fcslam.lab.evaluation.fleet.ground_truth import read_grid
-from fcslam.lab.evaluation.fleet.report import Join, evaluate_fleet, fleet_metrics
+from fcslam.lab.evaluation.fleet.report import EvaluatedJoin, evaluate_fleet, fleet_metrics
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 
@@ -147,8 +147,8 @@ def test_a_truth_in_utm_coordinates_gives_the_figures_of_a_truth_at_the_origin(f
 
 
 def test_a_join_whose_error_cannot_be_measured_is_not_counted_as_right():
-    assert Join("r0", "r1", np.nan, np.nan).is_false
-    assert not Join("r0", "r1", 0.5, 10.0).is_false
+    assert EvaluatedJoin("r0", "r1", np.nan, np.nan).is_false
+    assert not EvaluatedJoin("r0", "r1", 0.5, 10.0).is_false
 
 
 def test_robots_in_another_map_have_an_alignment_of_their_own(folder):

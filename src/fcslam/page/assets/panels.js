@@ -5,7 +5,7 @@ import { between, distance, middle, turned } from "./geometry.js";
 import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
-import { accuracy, attention, count, dayOf, decisionOf, duration, editOf, evidence, history, listed, metres, moment, sensorOf, stateOf } from "./words.js";
+import { accuracy, attention, count, dayOf, decisionOf, duration, editOf, evidence, history, joinsOf, listed, metres, moment, sensorOf, stateOf } from "./words.js";
 
 const LISTED = 200; // rows of the table of evidence
 const NEAR_M = 5; // pairs with both ends so near each other show the same place
@@ -97,11 +97,11 @@ export function showAge() {
 
 const cards = new Map();
 function cardOf(name) {
-  const card = element("li"), state = element("p", "", { className: "state" }), seen = element("p"), more = element("details"), facts = element("p"), earlier = element("ul");
+  const card = element("li"), state = element("p", "", { className: "state" }), seen = element("p"), joined = element("p"), more = element("details"), facts = element("p"), earlier = element("ul");
   const choice = button("", () => { const isNew = fleet.selected !== name; if (isNew) showRobot(name); else select(name); }, { className: "name" });
   more.append(element("summary", "Details"), facts, earlier);
-  card.append(choice, state, seen, more);
-  cards.set(name, { card, choice, state, seen, facts, earlier });
+  card.append(choice, state, seen, joined, more);
+  cards.set(name, { card, choice, state, seen, joined, facts, earlier });
   return cards.get(name);
 }
 export function forgetCards() { cards.clear(); }
@@ -111,12 +111,13 @@ export function showFleet() {
   const newest = fleet.robots.filter((r) => !fleet.robots.some((o) => o.robot === r.robot && o.epoch > r.epoch)), list = at("robots");
   if (evidenceNow.accepted !== fleet.accepted) evidenceNow = { accepted: fleet.accepted, words: evidence(fleet.robots, fleet.accepted) };
   const shown = newest.map((robot) => {
-    const { card, choice, state, seen, facts, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
+    const { card, choice, state, seen, joined, facts, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
     fill(choice, [robot.robot, robot.color], () => [swatch(robot.color), robot.robot]);
     choice.ariaPressed = String(robot.session === fleet.selected);
     card.dataset.kind = kind;
     state.textContent = text;
     seen.textContent = newest.length > 1 && robot.map !== null ? evidenceNow.words.get(robot.session) : "";
+    joined.textContent = joinsOf(robot, fleet.robots, fleet.joins);
     const heard = fleet.readOnly || robot.last_heard_s === null ? [] : [`heard ${duration(robot.last_heard_s)} ago`], sent = fleet.counts.metrics[`uplink_bytes_${robot.robot}`];
     const parts = [`drove ${metres(robot.path_length_m)}`, `${count(robot.keyscans, "scan")} on the map`, ...(robot.floor ? [`floor ${robot.floor}`] : []), ...(sent ? [`${(sent / 1000).toLocaleString("en", { maximumFractionDigits: 0 })} kB sent`] : []), ...heard];
     facts.textContent = `${parts.join("; ")}. ${Object.entries(robot.detectors).map(([channel, made]) => `Detector (${channel}): ${made}.`).join(" ")}`;

@@ -4,6 +4,8 @@ export const HEARD_S = 15; // a robot that was heard so recently is connected
 const GONE_S = 3600; // a robot that is silent for longer has ended its work
 const CLOCK_S = 1e9; // later stamps count from 1970, smaller ones from an arbitrary start
 const LOW_DISK_BYTES = 2e9;
+const LOOK_ALIKE = 0.5; // maps that fit so well elsewhere, as a share, may show places that only look alike
+const MOST_JOINS = 3; // that the card of a robot names
 const LATE_S = 30; // a map that is older while news wait is late
 const CONTRADICTIONS = ["robot_contradicted", "paths_contradict", "joins_contradicting_maps", "maps_contradict"];
 
@@ -58,6 +60,18 @@ export function evidence(robots, accepted) {
   }
   const say = (others) => `Saw the same places as ${listed([...others.keys()].sort())}, ${count([...others.values()].reduce((a, b) => a + b), "time")}`;
   return new Map([...shared].map(([session, others]) => [session, others.size ? say(others) : "Nobody else has seen its places yet"]));
+}
+
+// On what evidence a robot shares a map with others, those from fewest places first.
+export function joinsOf(robot, robots, joins) {
+  const others = robots.filter((r) => r.robot !== robot.robot).map((r) => r.session);
+  const found = joins.filter((j) => j.robots.includes(robot.session)).map((j) => ({ ...j, other: j.robots.find((name) => others.includes(name)) })).filter((j) => j.other).sort((a, b) => a.places - b.places);
+  const say = ({ other, places, seen_m, contradicting_m, elsewhere }) => {
+    const walls = seen_m === null ? "their maps could not be compared" : `${seen_m.toFixed(0)} m of wall seen by both, ${Math.round((100 * contradicting_m) / (seen_m || 1))} % contradict`;
+    return `Joined with ${other}: ${count(places, "place")}, ${walls}.${elsewhere >= LOOK_ALIKE ? " Look-alike places are possible." : ""}`;
+  };
+  const more = found.length > MOST_JOINS ? [`${count(found.length - MOST_JOINS, "more join")}, from more places.`] : [];
+  return [...found.slice(0, MOST_JOINS).map(say), ...more].join(" ");
 }
 
 // How accurate the maps are, by their certificates.

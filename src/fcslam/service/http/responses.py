@@ -201,6 +201,25 @@ class MapSeparation(StrictModel):
     explanation: str = Field(description="the binding reason, with its numbers")
 
 
+class MapJoin(StrictModel):
+    """On what evidence two robots share a map; null where the maps were not compared."""
+
+    robots: tuple[str, str] = Field(description="sessions of both robots")
+    map: int = Field(description="number of their map")
+    closures: int = Field(description="number of closures between them that agree")
+    places: int = Field(description="number of separate places of these closures")
+    seen_m: float | None = Field(description="wall that both robots saw, metres")
+    contradicting_m: float | None = Field(description="wall of one robot in the free space of the other, metres")
+    likeness: float | None = Field(
+        description="how well the walls lie on each other, without a unit: about 1 in one place, 0 or less in places "
+        "that only look alike"
+    )
+    elsewhere: float | None = Field(
+        description="how well the maps fit at the best other transform, as a share, without a unit; 0: nowhere else"
+    )
+    explanation: str = Field(description="all of this in one line")
+
+
 class DetectorVersion(StrictModel):
     """A detector that robots may download."""
 

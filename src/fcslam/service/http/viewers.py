@@ -25,6 +25,7 @@ from fcslam.service.http.responses import (
     EditSummary,
     FleetSummary,
     LearningRound,
+    MapJoin,
     MapLayer,
     MapSeparation,
     MapShape,
@@ -45,6 +46,7 @@ from fcslam.service.summaries import (
     all_sessions,
     closure_summary,
     fleet_summary,
+    map_joins,
     map_separations,
     map_summaries,
     newest_closures,
@@ -126,6 +128,11 @@ def fleet_router(state: ViewerState) -> APIRouter:
     def get_closure(channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp) -> ClosureSummary:
         """One closure as it is now."""
         return closure_summary(_closure_of(run_of(state.mission), channel, robot_i, stamp_i, robot_j, stamp_j))
+
+    @router.get("/joins")
+    def get_joins() -> list[MapJoin]:
+        """On what evidence robots share a map, for every two with closures between them that agree."""
+        return map_joins(state.mission)
 
     @router.get("/robots/{robot}/scans/{epoch}", responses=refusals(400, 404))
     def get_scan(robot: Name, epoch: Annotated[int, PathParameter(ge=0, le=MAXIMUM_EPOCH)]) -> list[Point]:

@@ -49,7 +49,7 @@ class RobotScore:
 
 
 @dataclass(frozen=True, slots=True)
-class Join:
+class EvaluatedJoin:
     """Two robots in one map."""
 
     robot_a: str
@@ -81,7 +81,7 @@ class FleetReport:
     """Folder of the ground truth."""
     robots: tuple[RobotScore, ...]
     maps: int
-    joins: tuple[Join, ...]
+    joins: tuple[EvaluatedJoin, ...]
     """All pairs of robots in one map."""
     within: RelationErrors
     """Errors of relative poses of one robot."""
@@ -95,7 +95,7 @@ class FleetReport:
     places: Mapping[Channel, PlaceTraffic]
 
     @property
-    def false_joins(self) -> tuple[Join, ...]:
+    def false_joins(self) -> tuple[EvaluatedJoin, ...]:
         """Joins with a relative error above the thresholds, or without one."""
         return tuple(join for join in self.joins if join.is_false)
 
@@ -153,11 +153,11 @@ def _robot_scores(
     return tuple(scores)
 
 
-def _joins(run: Run, known: KnownPoses) -> tuple[Join, ...]:
+def _joins(run: Run, known: KnownPoses) -> tuple[EvaluatedJoin, ...]:
     tracks = [TrajectoryPair(*_poses(known, known.truth.robots == number)) for number in range(len(run.trajectories))]
     robots = list(zip(run.trajectories.values(), tracks, strict=True))
     return tuple(
-        Join(a.robot, b.robot, *placement_error(track_a, track_b))
+        EvaluatedJoin(a.robot, b.robot, *placement_error(track_a, track_b))
         for (a, track_a), (b, track_b) in combinations(robots, 2)
         if a.map_index == b.map_index
     )
