@@ -39,7 +39,8 @@ def test_each_lack_has_its_reason_numbers_and_setting():
     assert shortfall(unique, SETTINGS) is None
     lacks = {
         replace(unique, closures=2): Reason(ReasonCode.FEW_CLOSURES, 2, 3, "minimum_closures"),
-        replace(unique, informative=0): Reason(ReasonCode.NOT_INFORMATIVE, 146),
+        replace(SPOT, informative=0): Reason(ReasonCode.NOT_INFORMATIVE, 146),
+        replace(SPOT, informative=0, fit=fit(1.5)): Reason(ReasonCode.NOT_INFORMATIVE, 146),
         replace(SPOT, rival_closures=100): Reason(ReasonCode.NO_LEAD, 1.46, 2.0, "lead"),
         replace(SPOT, rival_places=2): Reason(ReasonCode.RIVAL_PLACES, 1, 2),
         SPOT: Reason(ReasonCode.FEW_PLACES, 1, 3.0, "minimum_evidence"),
@@ -69,3 +70,9 @@ def test_the_maps_decide_between_clusters_and_not_the_number_of_closures():
 
 def test_three_places_need_no_comparison_where_none_is_possible():
     assert shortfall(replace(SPOT, separate_places=3, closures=3), SETTINGS) is None
+
+
+def test_maps_that_fit_in_one_way_only_fix_the_pose_of_a_lane_in_which_no_closure_does():
+    lane = replace(SPOT, informative=0, separate_places=4)
+    assert shortfall(replace(lane, fit=fit(2.1)), SETTINGS) is None
+    assert shortfall(replace(lane, fit=fit(1.9)), SETTINGS).code is ReasonCode.NOT_INFORMATIVE

@@ -23,7 +23,7 @@ from fcslam.storage.state_file import State
 REACH_M = 45.0
 """Keyscans up to this far from the middle of the matching places make a map: of both wings of a building that repeats
 itself."""
-MOST_KEYSCANS = 300
+MOST_KEYSCANS = 150
 """Most keyscans of such a map; of more, evenly spaced ones."""
 
 GROWTH = 1.5
@@ -59,14 +59,18 @@ LEAST_KNOWN_M = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Near:
-    """The map of one session around a point."""
+    """The scans of one session around a point."""
 
-    submap: Submap
-    """In the frame of its anchor."""
+    scans: Sequence[tuple[PointScan, FloatArray]]
+    """With their poses in the frame of the anchor."""
     anchor: KeyscanId
-    keyscans: int
     is_complete: bool
     """Whether no keyscan around the point was released."""
+    radius_m: float
+
+    def submap(self) -> Submap:
+        """Their map, in the frame of the anchor."""
+        return build_submap(self.scans, self.radius_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +159,7 @@ class MapComparison:
 
         near_a = self._map_around(sessions[0], a.poses, a.poses[members.i, :2].mean(axis=0))
         near_b = self._map_around(sessions[1], b.poses, b.poses[members.j, :2].mean(axis=0))
-        keyscans = min(near_a.keyscans if near_a else 0, near_b.keyscans if near_b else 0)
+        keyscans = min(len(near.scans) if near else 0 for near in (near_a, near_b))
         is_complete = near_a is not None and near_b is not None and near_a.is_complete and near_b.is_complete
         if earlier and not is_complete and earlier[0].keyscans > keyscans:
             return earlier[0]
@@ -164,18 +168,17 @@ class MapComparison:
         i, j = near_a.anchor, near_b.anchor
         T_a_i, T_b_j = a.poses[i.number], b.poses[j.number]
         T_i_j = _between(T_a_i, T_a_b, T_b_j)
-        best = align_map(near_a.submap, near_b.submap, T_i_j)
-        rivals = rivals_of(near_a.submap, near_b.submap, best.T_a_b)
         local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (a.poses, b.poses))
-        fit = replace(
-            _fit(local_maps.agreement(_transforms(a, b, members))),
-            seen_m=best.known_m,
-        )
-        for rival in rivals[:RIVALS]:
-            T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
-            found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
-            if found.support > fit.rival_support and refutation(_fit(found)) is None:
-                fit = replace(fit, rival_support=found.support)
+        fit = _fit(local_maps.agreement(_transforms(a, b, members)))
+        if refutation(fit) is None:  # else no transform elsewhere matters
+            whole_a, whole_b = near_a.submap(), near_b.submap()
+            best = align_map(whole_a, whole_b, T_i_j)
+            fit = replace(fit, seen_m=best.known_m)
+            for rival in rivals_of(whole_a, whole_b, best.T_a_b)[:RIVALS]:
+                T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
+                found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
+                if found.support > fit.rival_support and refutation(_fit(found)) is None:
+                    fit = replace(fit, rival_support=found.support)
         return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit)
 
     def overlap(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> Overlap:
@@ -200,7 +203,7 @@ class MapComparison:
             if near_a is None or near_b is None:
                 continue
             T_i_j = se2.between(poses_a[near_a.anchor.number], poses_b[near_b.anchor.number])
-            found = align_map(near_a.submap, near_b.submap, T_i_j)
+            found = align_map(near_a.submap(), near_b.submap(), T_i_j)
             if found.known_m < LEAST_KNOWN_M:
                 continue
             agreeing += found.violation <= self._verification.loose.violation
@@ -232,8 +235,7 @@ class MapComparison:
         distance_m = np.hypot(*(poses[:, :2] - middle).T)
         is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= reach_m)))
         anchor = min((keyscan.id for keyscan in keyscans), key=lambda id_: float(distance_m[id_.number]))
-        submap = build_submap(self._scans(session, keyscans, poses, anchor), max(reach_m, RADIUS_M))
-        return _Near(submap, anchor, len(keyscans), is_complete)
+        return _Near(self._scans(session, keyscans, poses, anchor), anchor, is_complete, max(reach_m, RADIUS_M))
 
     def _keyscans_around(
         self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float, most: int

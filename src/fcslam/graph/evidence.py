@@ -6,8 +6,10 @@ in free space of the other, and the maps fit nowhere else as well.
 
 Where closures come from few places, twice the ratio of the support of the maps there to that elsewhere, less one,
 counts as further places. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing.
-A tag that both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and then the maps
-contradict each other. In a lane that winds, no closure fixes the pose in every direction, but the maps may.
+A tag that both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and
+then the maps contradict each other.
+
+In a lane that winds, no closure fixes the pose in every direction, but the maps may.
 """
 
 import math
@@ -46,8 +48,8 @@ class EvidenceSettings(Settings):
     minimum_evidence: float = Field(
         default=3.0,
         ge=0.0,
-        description="evidence that a cluster needs to join two maps: its separate places, plus twice the ratio by which "
-        "the maps fit better than elsewhere, less one",
+        description="evidence that a cluster needs to join two maps: its separate places, plus twice the ratio by "
+        "which the maps fit better than elsewhere, less one",
     )
     lead: float = Field(
         default=2.0,
