@@ -1,6 +1,6 @@
 """How much of the free area of a map is not free, and how much of what a robot saw is free in its map.
 
-    FCSLAM_DATA=/path/to/data python benchmarks/free_area.py --work /tmp/free-area
+    FCSLAM_DATA=/path/to/data python benchmarks/free_area.py --work build/free
 
 Robots drive for three minutes through published floors (floor_worlds.py), with three scanners: ``rplidar`` 12 m and
 ``short`` 8 m all around, ``sick`` 25 m over 270 degrees. Beams get lost on grazed walls, 1 % of all are lost, and

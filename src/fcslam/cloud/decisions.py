@@ -20,6 +20,7 @@ from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
+from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.evidence import ClusterEvidence, MapFit
 from fcslam.lidar.scan import keyscan_points
 from fcslam.places.matcher import PlaceMatch
@@ -286,7 +287,7 @@ class ClosureDecisions:
             return
         decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
         joined = b in self.map_of(a)
-        self._contested |= joined and decision.contested
+        self._contested |= joined and self._is_contested(decision, entries)
         if decision.shortfall is not None:
             self._short[pair] = len(entries)
             _explain(entries, decision.shortfall.under(CONSISTENCY))
@@ -344,8 +345,17 @@ class ClosureDecisions:
             return False
         entries = self.closures.evidence(a, b)
         decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
-        self.joins[pair] = decision.evidence
-        return decision.contested
+        if decision.dominant:
+            self.joins[pair] = decision.evidence
+        return self._is_contested(decision, entries)
+
+    def _is_contested(self, decision: ClusterDecision, entries: Sequence[ClosureEntry]) -> bool:
+        """Whether a decision speaks against a join: it has no dominant cluster, or most of that lies elsewhere."""
+        if not decision.contested or decision.shortfall is not None:
+            return decision.contested
+        members = [entries[k].closure for k in decision.members]
+        off = np.array([self._graph.innovation(closure.i, closure.j, closure.T_i_j) for closure in members])
+        return bool(2 * np.count_nonzero(np.hypot(off[:, 0], off[:, 1]) > SURPRISE_M) > len(off))
 
 
 def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:

@@ -13,7 +13,7 @@ from fcslam.graph.cluster import relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
-from fcslam.lidar.map_agreement import LocalSubmap, PlaceAgreement, compare, local_map, total
+from fcslam.lidar.map_agreement import LocalSubmap, PlaceAgreement, compare, local_map, noise_of, total
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import RADIUS_M, Submap, build_submap
 from fcslam.lidar.verification import PARTIAL, VerificationConfig
@@ -126,14 +126,14 @@ class MapComparison:
             return earlier[0].fit
         found = self._compare(sessions, a, b, members, T_a_b, earlier)
         if found is not None:
-            others = [each for each in self._compared.get(pair, ()) if each not in earlier]
+            others = [c for c in self._compared.get(pair, ()) if c not in earlier and size < GROWTH * c.size]
             self._compared[pair] = [found, *others[: MOST_TRANSFORMS - 1]]
         return None if found is None else found.fit
 
     def is_outdated(self, sessions: frozenset[str], size: int) -> bool:
         """Whether the paths of two sessions, ``size`` keyscans together, have grown since their maps were compared."""
         compared = self._compared.get(sessions, [])
-        return bool(compared) and size >= GROWTH * max(each.size for each in compared)
+        return bool(compared) and size >= GROWTH * min(each.size for each in compared)
 
     @staticmethod
     def _is_at(
@@ -162,7 +162,7 @@ class MapComparison:
         keyscans = min(len(near.scans) if near else 0 for near in (near_a, near_b))
         is_complete = near_a is not None and near_b is not None and near_a.is_complete and near_b.is_complete
         if earlier and not is_complete and earlier[0].keyscans > keyscans:
-            return earlier[0]
+            return replace(earlier[0], closures=len(members), size=len(a) + len(b))
         if near_a is None or near_b is None:
             return None
         i, j = near_a.anchor, near_b.anchor
@@ -288,16 +288,18 @@ class _LocalMaps:
         found_m, found_rows = cKDTree(poses_a[:, :2]).query(in_a[:, :2], distance_upper_bound=LOCAL_M)
         nearest = np.asarray(found_rows)
         near = _at_most(np.flatnonzero(np.isfinite(found_m)), MOST_LOCAL_MAPS)
+        rows = [(int(nearest[k]), int(places[k])) for k in near]
+        maps = [(self._at(0, i), self._at(1, j)) for i, j in rows]
+        noise_m = max(noise_of(filter(None, side)) for side in zip(*maps, strict=True)) if maps else 0.0
         agreements = []
-        for i, j in ((int(nearest[k]), int(places[k])) for k in near):
-            map_a, map_b = self._at(0, i), self._at(1, j)
+        for (i, j), (map_a, map_b) in zip(rows, maps, strict=True):
             if map_a is None or map_b is None:
                 continue
             T_i_j = _between(poses_a[i], T_a_b[j], poses_b[j])
             aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
             off = se2.between(T_i_j, aligned)
             is_near = np.hypot(off[0], off[1]) < DRIFT_M and abs(off[2]) < DRIFT_RAD
-            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j))
+            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise_m))
         return total(agreements)
 
     def _at(self, side: int, row: int) -> LocalSubmap | None:
@@ -326,10 +328,15 @@ def _at_most(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def _transforms(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
-    """T_a_b (M, 3) at each keyscan of b by the closure that is nearest along b's path, so that drift does not count.
+    """T_a_b (N, 3) at each of the N keyscans of b by the closure that is nearest along b's path, without drift.
 
-    NaN farther than ``FARTHEST_M`` of path from any closure.
+    NaN farther than ``FARTHEST_M`` of path from any closure. Tags fix the heading worse than walls, so they count only
+    without other closures, and then all together.
     """
+    walls = np.flatnonzero(members.tags == 0) if len(members.tags) else np.arange(len(members))
+    if not len(walls):
+        return np.broadcast_to(relative_frame(a, b, members), b.poses.shape)
+    members = members.select(walls)
     distance_m = np.abs(b.travel_m[:, None] - b.travel_m[members.j][None])
     nearest = np.argmin(distance_m, axis=1)
     T_a_b = se2.compose(se2.compose(a.poses[members.i], members.T_i_j), se2.inverse(b.poses[members.j]))

@@ -67,11 +67,7 @@ def reevaluate(
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
     T_local_base = dict(zip(robots, solution.own, strict=True))
-    joins = {
-        frozenset((robots[link.a], robots[link.b])): link.decision.evidence
-        for link in solution.links
-        if link.decision.dominant and solution.maps[link.a] == solution.maps[link.b]
-    }
+    joins = {frozenset((robots[link.a], robots[link.b])): link.decision.evidence for link in solution.joining}
     apart = _named(solution.apart, robots)
     return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures), joins, apart)
 

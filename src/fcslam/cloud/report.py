@@ -96,7 +96,7 @@ def run_of(
 def _join(pair: frozenset[str], evidence: ClusterEvidence) -> Join:
     robot_i, robot_j = sorted(pair)
     counts, fit = (evidence.closures, evidence.separate_places), evidence.fit
-    if fit is None:
+    if fit is None or not fit.is_compared:
         return Join(robot_i, robot_j, *counts, math.nan, math.nan, math.nan, math.nan)
     elsewhere = max(0.0, fit.rival_support / fit.support) if fit.support > 0.0 else 0.0
     return Join(robot_i, robot_j, *counts, fit.seen_m, fit.contradiction * fit.seen_m, fit.likeness, elsewhere)

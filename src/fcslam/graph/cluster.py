@@ -46,9 +46,9 @@ class ClusterDecision:
     """Whether both clusters are proven to be the largest."""
     contested: bool
     """Whether the runner-up would be enough to join two maps as well and the cluster is not clearly larger, or the maps
-    do not agree."""
+    refute the largest cluster."""
     shortfall: Reason | None
-    """Why the cluster is not dominant; its setting is one of ``ConsistencySettings``."""
+    """Why the cluster is not dominant; a setting is one of ``ConsistencySettings``."""
 
     @property
     def dominant(self) -> bool:
@@ -162,7 +162,7 @@ def dominant_cluster(
 
     False closures from repeated structure are consistent with one another, too. So the cluster must have:
 
-    - an informative member;
+    - an informative member, or maps that fit in one way only;
     - maps that agree at its transform, and there clearly better than at any other (``fcslam.graph.evidence``). If they
       do not, the next largest clusters that contradict it are tried;
     - without a comparison of the maps, a clear lead over the cluster that contradicts it: ``lead`` times as many
@@ -194,11 +194,12 @@ def dominant_cluster(
         if by_count is not None and by_count.code not in _MAPS_DECIDE:
             return evidence, by_count
         fit = examine(rows)
-        if fit is not None and by_count is not None and by_count.code in _NO_LEAD:
+        lead = evidence.closures - settings.lead * evidence.rival_closures
+        if fit is not None and (lead < 0.0 or evidence.separate_places < evidence.rival_places):
             rival = examine(rivals)
             if rival is None:
                 return evidence, by_count
-            if refutation(rival) is None:
+            if not rival.is_compared or refutation(rival) is None:
                 fit = replace(fit, rival_support=max(fit.rival_support, rival.support))
         evidence = replace(evidence, fit=fit)
         return evidence, shortfall(evidence, settings)
@@ -224,7 +225,9 @@ def dominant_cluster(
         )
         remaining = np.intersect1d(remaining, others)
         if not is_refuted:
-            return refuted[0] if refuted and reason is not None else decision
+            if not refuted:
+                return decision
+            return replace(decision, contested=True) if reason is None else refuted[0]
         refuted.append(decision)
         if not len(remaining):
             break

@@ -25,12 +25,12 @@ LEAST_COMPARED_M = 5.0
 LARGEST_CONTRADICTION = 0.02
 """Largest share of walls in the other map's free space. One floor in three years had up to 0.010, robots of one day up
 to 0.006, and refurnished or partly equal floors from 0.037 on."""
-LEAST_LIKENESS = 0.65
-"""Least ``MapFit.likeness``. In one place it was 0.69 to 1.9, in places that look alike 0.62 or less."""
+LEAST_LIKENESS = 0.6
+"""Least ``MapFit.likeness``. In one place it was 0.65 to 2, in places that look alike mostly less."""
 LEAST_RIVAL = 20.0
 """The support elsewhere is taken to be at least this, nats: maps with little wall in common are never unique."""
 LEAST_RATIO = 1.2
-"""Least ``MapFit.ratio``, however many places agree."""
+"""Least ratio of the support to that of a transform elsewhere, however many places agree."""
 FIXES_RATIO = 2.0
 """Least ``MapFit.ratio`` of maps that fix the pose where no closure does."""
 RATIO_PLACES = 2.0
@@ -79,13 +79,18 @@ class MapFit:
     """Wall of one map in known area of the other, metres: of both maps, the one with less."""
 
     @property
+    def is_compared(self) -> bool:
+        """Whether there was enough wall to compare."""
+        return self.compared_m >= LEAST_COMPARED_M
+
+    @property
     def ratio(self) -> float:
         """Support at the transform, divided by the largest elsewhere."""
         return max(0.0, self.support) / max(LEAST_RIVAL, self.rival_support)
 
     @property
     def likeness(self) -> float:
-        """The support as a share of its expectation: about 1 in the same place, negative in another."""
+        """The support as a share of its expectation: about 1 in the same place, less in another."""
         return self.support / self.expected if self.expected > 0.0 else 0.0
 
     @property
@@ -112,24 +117,31 @@ class ClusterEvidence:
 
 
 def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    """Why the evidence is not enough to join two maps; None if it is. The reason names one of the settings.
+    """Why the evidence is not enough to join two maps; None if it is.
 
     Where the maps were compared, they decide between clusters that contradict each other, and not the number of
     closures: in a building that repeats itself, most closures may be false.
     """
     if evidence.closures < settings.minimum_closures:
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
-    if not evidence.informative and (evidence.fit is None or evidence.fit.ratio < FIXES_RATIO):
-        return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
-    if evidence.fit is not None and evidence.fit.compared_m >= LEAST_COMPARED_M:
-        refuted = refutation(evidence.fit)
-        if refuted is not None:
-            return refuted
-    elif evidence.closures < settings.lead * evidence.rival_closures:
+    fit = evidence.fit
+    if fit is not None and fit.is_compared:
+        return refutation(fit) or _pose_shortfall(evidence) or _amount_shortfall(evidence, settings)
+    return _pose_shortfall(evidence) or _lead_shortfall(evidence, settings) or _amount_shortfall(evidence, settings)
+
+
+def _pose_shortfall(evidence: ClusterEvidence) -> Reason | None:
+    if evidence.informative or (evidence.fit is not None and evidence.fit.ratio >= FIXES_RATIO):
+        return None
+    return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
+
+
+def _lead_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+    if evidence.closures < settings.lead * evidence.rival_closures:
         return Reason(ReasonCode.NO_LEAD, evidence.closures / evidence.rival_closures, settings.lead, "lead")
-    elif evidence.separate_places < evidence.rival_places:
+    if evidence.separate_places < evidence.rival_places:
         return Reason(ReasonCode.RIVAL_PLACES, evidence.separate_places, evidence.rival_places)
-    return _amount_shortfall(evidence, settings)
+    return None
 
 
 def refutation(fit: MapFit) -> Reason | None:
@@ -138,8 +150,8 @@ def refutation(fit: MapFit) -> Reason | None:
         return Reason(ReasonCode.MAPS_CONTRADICT, fit.contradiction, LARGEST_CONTRADICTION)
     if fit.likeness < LEAST_LIKENESS:
         return Reason(ReasonCode.WALLS_DIFFER, fit.likeness, LEAST_LIKENESS)
-    if fit.ratio < LEAST_RATIO:
-        return Reason(ReasonCode.LOOK_ALIKE, fit.ratio, LEAST_RATIO)
+    if fit.support < LEAST_RATIO * fit.rival_support:
+        return Reason(ReasonCode.LOOK_ALIKE, fit.support / fit.rival_support, LEAST_RATIO)
     return None
 
 

@@ -104,6 +104,8 @@ class JointSolution:
     """Number of each robot's map, counted in the order of their first robots."""
     links: tuple[Link, ...]
     """One for every two robots with independent closures between them."""
+    joining: tuple[Link, ...]
+    """Those that join maps."""
     own: tuple[FloatArray, ...]
     """Poses of each robot from its own measurements alone, shape (N_k, 3); the first stays where the graph has it."""
     apart: Mapping[tuple[int, int], Reason]
@@ -138,7 +140,7 @@ def solve_jointly(
     Args:
         evidence: graph of N variables and E edges, with the role of every edge.
         consistency: when closures are consistent, and what a cluster needs.
-        examine: called for two robots where only the amount of evidence is open.
+        examine: compares the maps of two robots at the transform of a cluster with enough closures.
         contradiction: strain above which one of the robots of a map contradicts the others.
         compare: called for robots of one map that only one other sender connects.
 
@@ -188,7 +190,9 @@ def solve_jointly(
             confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
             own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
-            return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links), own_poses, apart)
+            return JointSolution(
+                solution.poses, solution.weights, tuple(maps), tuple(links), tuple(joining), own_poses, apart
+            )
         joining = confirmed
 
 

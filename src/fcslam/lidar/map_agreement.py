@@ -16,7 +16,7 @@ stretches in maps of the same place and of another. The halves of a robot's scan
 of its path there, so that the noise includes the drift in between.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -41,7 +41,7 @@ MOVED, UNLIKE = 0.1, 0.4
 """Shares of stretches whose offset is arbitrary: furniture that moved, and walls of another place."""
 IN_FREE, IN_FREE_ELSEWHERE = 0.02, 0.11
 """Shares of stretches in free space, in the same place and in another, for maps that do not contradict themselves."""
-LONGEST_SELF: Final = 0.15
+MOST_SELF_IN_FREE: Final = 0.15
 """The share by which a map contradicts itself raises both by no more than this."""
 WALL_M: Final = 0.8
 """Walls of at least this length contradict; shorter things are people, furniture and doors."""
@@ -74,11 +74,11 @@ def total(agreements: Sequence[PlaceAgreement]) -> PlaceAgreement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalSubmap:
-    """A submap and its own noise."""
+    """A submap, and how its two halves agree."""
 
     submap: Submap
-    noise_m: float
-    """Standard deviation of the offsets of stretches between two halves of its scans."""
+    offsets_m: FloatArray
+    """Offsets of stretches between two halves of its scans, shape (K,)."""
     is_solid: NDArray[np.bool_]
     """Points of the surface that few beams passed, shape (N,): things that the robot saw through contradict nothing."""
     in_free: float
@@ -90,17 +90,28 @@ def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) ->
     middle = len(scans) // 2
     whole, first, second = (build_submap(part, radius_m) for part in (scans, scans[:middle], scans[middle:]))
     compared = [_stretches(first, second, np.zeros(3)), _stretches(second, first, np.zeros(3))]
-    offsets = np.abs(np.concatenate([each.offsets_m for each in compared]))
-    enough = len(offsets) >= FEWEST_STRETCHES
-    noise_m = min(WIDEST_NOISE_M, float(np.quantile(offsets, 0.68))) if enough else NOISE_M
+    offsets_m: FloatArray = np.concatenate([each.offsets_m for each in compared])
     in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
-    return LocalSubmap(whole, noise_m, ~seen_through(whole, scans), in_free)
+    return LocalSubmap(whole, offsets_m, ~seen_through(whole, scans), in_free)
 
 
-def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray) -> PlaceAgreement:
-    """Compare two local maps at a transform (3,), metres and radians, each map's walls with the other map."""
-    noise_m = max(a.noise_m, b.noise_m)
-    in_free = IN_FREE + min(LONGEST_SELF, max(a.in_free, b.in_free))
+def noise_of(maps: Iterable[LocalSubmap]) -> float:
+    """Standard deviation of an offset in the local maps of one robot, metres."""
+    offsets_m = np.concatenate([np.empty(0), *(each.offsets_m for each in maps)])
+    if len(offsets_m) < FEWEST_STRETCHES:
+        return NOISE_M
+    return min(WIDEST_NOISE_M, float(np.quantile(np.abs(offsets_m), 0.68)))
+
+
+def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray, noise_m: float) -> PlaceAgreement:
+    """Compare two local maps at a transform, each map's walls with the other map.
+
+    Args:
+        a, b: local maps.
+        T_a_b: the transform, shape (3,), metres and radians.
+        noise_m: standard deviation of an offset in the maps of the noisier robot.
+    """
+    in_free = IN_FREE + min(MOST_SELF_IN_FREE, max(a.in_free, b.in_free))
     in_free_elsewhere = in_free + IN_FREE_ELSEWHERE - IN_FREE
     on_wall = np.log((1.0 - in_free) / (1.0 - in_free_elsewhere))
     inside = np.log(in_free / in_free_elsewhere)

@@ -13,6 +13,8 @@ from fcslam.records import FloatArray, Keyscan, LaserModel, Ranges, Sweep
 
 NORMAL_REACH = 3
 """Neighbours on each side that a normal is fitted to."""
+GAP_SPACINGS = 2.0
+"""A solitary return farther than this many spacings from the one kept before is kept in any case."""
 MINIMUM_GAP_M = 0.15
 """Neighbouring returns closer than this lie on one surface, whatever the angle between their beams."""
 GAP_PER_SPACING = 3.0
@@ -271,9 +273,10 @@ def _thin(points, normals, solitary, times, spacing, limit, radius):  # type: ig
         if points[i, 0] ** 2 + points[i, 1] ** 2 >= radius * radius:
             continue
         if n > 0:
-            dx = points[i - 1, 0] - points[keep[n - 1], 0]
-            dy = points[i - 1, 1] - points[keep[n - 1], 1]
-            if np.hypot(dx, dy) + min(step, before) < spacing:
+            last = points[keep[n - 1]]
+            expected = np.hypot(points[i - 1, 0] - last[0], points[i - 1, 1] - last[1]) + min(step, before)
+            is_post = solitary[i] and np.hypot(points[i, 0] - last[0], points[i, 1] - last[1]) >= GAP_SPACINGS * spacing
+            if expected < spacing and not is_post:
                 continue
         keep[n] = i
         n += 1

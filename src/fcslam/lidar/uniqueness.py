@@ -91,7 +91,7 @@ def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | No
 
 
 def rivals_of(a: Submap, b: Submap, T_a_b: FloatArray) -> list[MapAlignment]:
-    """The alignments of two maps elsewhere than ``T_a_b``, the best ones first; as ``best_elsewhere``."""
+    """The alignments of two maps elsewhere than ``T_a_b``, from all headings and positions, the best ones first."""
     if not len(a.surface) or not len(b.surface):
         return []
     middle = b.surface.points.mean(axis=0, keepdims=True)

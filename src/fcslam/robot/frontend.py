@@ -30,6 +30,7 @@ from fcslam.lidar.lost import (
     GAP_TRAVEL_M,
     MOST_SCANS,
     SEEN_S,
+    SETTLED_M,
     LostConfig,
     can_decide,
     drove_on,
@@ -355,7 +356,10 @@ class RobotFrontend:
             self._gap_s = scan.stamp - before.stamp
         # 1. Localize the scan; unless it is doubtful, process it.
         predicted = scan
-        self._cabin.add(scan)
+        if self._lidar.settled_m < SETTLED_M:
+            self._cabin.leave()  # nothing is known from before its door closed
+        else:
+            self._cabin.add(scan)
         scan, tracking = self._matched(scan, self._lidar, self._in_odom(scan))
         may_be_frozen = self.prediction is None and self._wheels.may_be_frozen
         is_leaving = self._cabin.is_leaving

@@ -113,9 +113,9 @@ class Join:
     seen_m: float
     """Wall that both robots saw, metres; NaN if the maps were not compared."""
     contradicting_m: float
-    """Wall of one robot in the free space of the other, metres."""
+    """Share of the compared walls in the other's free space, times ``seen_m``, metres."""
     likeness: float
-    """How well the walls lie on each other: about 1 in one place, 0 or less in places that only look alike."""
+    """How well the walls lie on each other: about 1 in one place, 0.6 or less in places that only look alike."""
     elsewhere: float
     """How well the maps fit at the best other transform, as a share; 0 if they fit nowhere else."""
 
