@@ -23,7 +23,7 @@ app = typer.Typer(
     help="Correct a mission by hand. An edit counts when you map again: fcslam map --onto RUN -o NEW",
     epilog=examples(
         "fcslam edit list runs/building",
-        "fcslam edit veto runs/building anna 1010.0 ben 1000.001",
+        "fcslam edit veto runs/building anna 1000.0 ben 1000.001",
         'fcslam edit erase runs/building "1,2 3,2 3,4 1,4"',
         "fcslam edit undo runs/building 2",
         "fcslam map --onto runs/building -o runs/building-corrected",
@@ -75,7 +75,7 @@ def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of
 
 @app.command(
     epilog=examples(
-        "fcslam edit veto runs/building anna 1010.0 ben 1000.001", "fcslam edit veto runs/building anna ben"
+        "fcslam edit veto runs/building anna 1000.0 ben 1000.001", "fcslam edit veto runs/building anna ben"
     )
 )
 def veto(
@@ -97,10 +97,10 @@ def veto(
         case [session_i, stamp_i, session_j, stamp_j]:
             _decide(mission, Veto(session_i, session_j, (_number(stamp_i), _number(stamp_j))))
         case _:
-            raise InputError("give two sessions, or two sessions each with a stamp: anna 1010.0 ben 1000.001")
+            raise InputError("give two sessions, or two sessions each with a stamp: anna 1000.0 ben 1000.001")
 
 
-@app.command(epilog=examples("fcslam edit pin runs/building anna 1010.0 ben 1000.001"))
+@app.command(epilog=examples("fcslam edit pin runs/building anna 1000.0 ben 1000.001"))
 def pin(mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ) -> None:
     """Accept a closure of closures.csv, whatever the other evidence says. It joins maps."""
     from fcslam.records import Pin
@@ -108,7 +108,7 @@ def pin(mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: Sessi
     _decide(mission, Pin(session_i, session_j, (stamp_i, stamp_j)))
 
 
-@app.command(epilog=examples("fcslam edit close runs/building anna 1010.0 ben 1000.001 --pose 0.5,0,3.1"))
+@app.command(epilog=examples("fcslam edit close runs/building anna 1000.0 ben 1000.001 --pose 0.5,0,3.1"))
 def close(
     mission: Mission,
     session_i: SessionI,
