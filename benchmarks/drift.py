@@ -2,10 +2,10 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/drift.py --work build/drift
 
-One robot drives for three and a half minutes through each of 14 floors (`benchmarks/floor_worlds.py`), with each of three
-scanners. Its scans are tracked one after the other, without loop closures. The error of a stretch of 25, 50 or 100 m of
-path is the motion over it by the tracker, against the true one: of its heading, and of its position. Stretches begin
-every 2 m. A drive that is shorter gives none.
+One robot drives for three and a half minutes through each of 14 floors (`benchmarks/floor_worlds.py`), with each of
+three scanners. Its scans are tracked one after the other, without loop closures. The error of a stretch of 25, 50 or
+100 m of path is the motion over it by the tracker, against the true one: of its heading, and of its position. Stretches
+begin every 2 m. A drive that is shorter gives none.
 """
 
 from collections.abc import Iterator

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.map_agreement import NOISE_M, WALL_M, compare, local_map, noise_of, total
+from fcslam.lidar.map_agreement import NOISE_M, WALL_M, Noise, compare, local_map, noise_of, total
 from tests.flats import BACK, ROUND, flat, lookalike
 from tests.lidar.worlds import box, drive, path, scan_at
 
@@ -19,7 +19,7 @@ def seen(segments, waypoints, seed, noise_m=0.012):
 
 
 def compared(one, other, T):
-    return compare(one, other, T, max(noise_of([one]), noise_of([other])))
+    return compare(one, other, T, Noise(*map(max, zip(noise_of([one]), noise_of([other]), strict=True))))
 
 
 @pytest.mark.parametrize("noise_m", [0.005, 0.015, 0.03])
@@ -67,7 +67,7 @@ def test_maps_that_have_nothing_in_common_say_nothing():
 
 
 def test_a_map_knows_its_noise():
-    quiet, loud = (noise_of([seen(flat(), ROUND, 0, noise_m)]) for noise_m in (0.002, 0.04))
+    quiet, loud = (noise_of([seen(flat(), ROUND, 0, noise_m)]).offset_m for noise_m in (0.002, 0.04))
     assert quiet < NOISE_M < loud
 
 

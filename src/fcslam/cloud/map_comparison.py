@@ -13,7 +13,7 @@ from fcslam.graph.cluster import relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
-from fcslam.lidar.map_agreement import LocalSubmap, PlaceAgreement, compare, local_map, noise_of, total
+from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import RADIUS_M, Submap, build_submap
 from fcslam.lidar.verification import PARTIAL, VerificationConfig
@@ -290,7 +290,8 @@ class _LocalMaps:
         near = _at_most(np.flatnonzero(np.isfinite(found_m)), MOST_LOCAL_MAPS)
         rows = [(int(nearest[k]), int(places[k])) for k in near]
         maps = [(self._at(0, i), self._at(1, j)) for i, j in rows]
-        noise_m = max(noise_of(filter(None, side)) for side in zip(*maps, strict=True)) if maps else 0.0
+        noises = [noise_of(filter(None, side)) for side in zip(*maps, strict=True)]
+        noise = Noise(*map(max, zip(*noises, strict=True))) if noises else Noise()
         agreements = []
         for (i, j), (map_a, map_b) in zip(rows, maps, strict=True):
             if map_a is None or map_b is None:
@@ -299,7 +300,7 @@ class _LocalMaps:
             aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
             off = se2.between(T_i_j, aligned)
             is_near = np.hypot(off[0], off[1]) < DRIFT_M and abs(off[2]) < DRIFT_RAD
-            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise_m))
+            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise))
         return total(agreements)
 
     def _at(self, side: int, row: int) -> LocalSubmap | None:

@@ -46,11 +46,11 @@ class FleetConfig(Settings):
         description="number of submaps in the cache, 0.05 MB each; those beyond it are rebuilt from their keyscans",
     )
     contradiction: float = Field(
-        default=0.06,
+        default=0.15,
         gt=0,
         description="strain above which one of the robots of a map contradicts the others: the chi-square that "
         "closures between two robots, or the measurements of one, share with their neighbours along the path. It is "
-        "below 0.03 for robots that measure correctly, also with noisy scanners",
+        "mostly below 0.03, and up to 0.08 for a noisy scanner of short range",
     )
     starts: dict[str, tuple[float, float, float]] = Field(
         default={},

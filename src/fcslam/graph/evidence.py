@@ -96,7 +96,7 @@ class MapFit:
     @property
     def contradiction(self) -> float:
         """Share of the walls in the other's free space."""
-        return self.contradicting_m / self.compared_m if self.compared_m > 0.0 else 0.0
+        return max(0.0, self.contradicting_m) / self.compared_m if self.compared_m > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,9 @@ FEWEST_POINTS: Final = 3
 SAME_M, OTHER_M = 0.004, 0.03
 """Standard deviations of an offset, beyond the noise, in the same place and in another that looks alike, by comparisons
 of recorded logs and of drives in published floors."""
-MOVED, UNLIKE = 0.1, 0.4
-"""Shares of stretches whose offset is arbitrary: furniture that moved, and walls of another place."""
+MOVED, MOST_MOVED, UNLIKE = 0.1, 0.3, 0.4
+"""Shares of stretches whose offset is arbitrary: furniture that moved, at least and at most, and walls of another
+place."""
 IN_FREE, IN_FREE_ELSEWHERE = 0.02, 0.11
 """Shares of stretches in free space, in the same place and in another, for maps that do not contradict themselves."""
 MOST_SELF_IN_FREE: Final = 0.15
@@ -83,6 +84,19 @@ class LocalSubmap:
     """Points of the surface that few beams passed, shape (N,): things that the robot saw through contradict nothing."""
     in_free: float
     """Share of the stretches of one half in the free space of the other."""
+    contradicting_m: float
+    """Walls of one half in the free space of the other, as ``PlaceAgreement.contradicting_m``."""
+
+
+class Noise(NamedTuple):
+    """How well the local maps of one robot agree with themselves."""
+
+    offset_m: float = NOISE_M
+    """Standard deviation of an offset."""
+    moved: float = MOVED
+    """Share of stretches whose offset is arbitrary."""
+    contradiction: float = 0.0
+    """Share of walls that contradict."""
 
 
 def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) -> LocalSubmap:
@@ -92,51 +106,56 @@ def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) ->
     compared = [_stretches(first, second, np.zeros(3)), _stretches(second, first, np.zeros(3))]
     offsets_m: FloatArray = np.concatenate([each.offsets_m for each in compared])
     in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
-    return LocalSubmap(whole, offsets_m, ~seen_through(whole, scans), in_free)
+    halves = ((first, scans[:middle]), (second, scans[middle:]))
+    contradicting_m = sum(
+        _length_m(half.surface.points[each.deep & ~seen_through(half, part)])
+        for each, (half, part) in zip(compared, halves, strict=True)
+        if each.deep.any()
+    )
+    return LocalSubmap(whole, offsets_m, ~seen_through(whole, scans), in_free, contradicting_m)
 
 
-def noise_of(maps: Iterable[LocalSubmap]) -> float:
-    """Standard deviation of an offset in the local maps of one robot, metres."""
-    offsets_m = np.concatenate([np.empty(0), *(each.offsets_m for each in maps)])
+def noise_of(maps: Iterable[LocalSubmap]) -> Noise:
+    """The noise of one robot, from all of its local maps together."""
+    known = list(maps)
+    offsets_m = np.abs(np.concatenate([np.empty(0), *(each.offsets_m for each in known)]))
     if len(offsets_m) < FEWEST_STRETCHES:
-        return NOISE_M
-    return min(WIDEST_NOISE_M, float(np.quantile(np.abs(offsets_m), 0.68)))
+        return Noise()
+    offset_m = min(WIDEST_NOISE_M, float(np.quantile(offsets_m, 0.68)))
+    moved = min(MOST_MOVED, max(MOVED, float(np.mean(offsets_m > 3.0 * offset_m))))
+    contradicting_m = sum(each.contradicting_m for each in known)
+    return Noise(offset_m, moved, contradicting_m / (contradicting_m + STRETCH_M * len(offsets_m)))
 
 
-def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray, noise_m: float) -> PlaceAgreement:
+def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray, noise: Noise) -> PlaceAgreement:
     """Compare two local maps at a transform, each map's walls with the other map.
 
     Args:
         a, b: local maps.
         T_a_b: the transform, shape (3,), metres and radians.
-        noise_m: standard deviation of an offset in the maps of the noisier robot.
+        noise: of the noisier robot; the share by which it contradicts itself is not counted.
     """
     in_free = IN_FREE + min(MOST_SELF_IN_FREE, max(a.in_free, b.in_free))
     in_free_elsewhere = in_free + IN_FREE_ELSEWHERE - IN_FREE
     on_wall = np.log((1.0 - in_free) / (1.0 - in_free_elsewhere))
     inside = np.log(in_free / in_free_elsewhere)
-    mean = (1.0 - in_free) * (_expected_ratio(noise_m) + on_wall) + in_free * inside
+    mean = (1.0 - in_free) * (_expected_ratio(noise) + on_wall) + in_free * inside
     found = []
     for query, target, T in ((b, a, T_a_b), (a, b, se2.inverse(T_a_b))):
         stretches = _stretches(query.submap, target.submap, T)
         count = len(stretches.offsets_m) + stretches.in_free
-        ratios = _log_ratio(stretches.offsets_m, noise_m) + on_wall
+        ratios = _log_ratio(stretches.offsets_m, noise) + on_wall
         support = float(ratios.sum() + stretches.in_free * inside)
-        found.append(
-            PlaceAgreement(
-                support,
-                count * mean,
-                STRETCH_M * count,
-                _length_m(query.submap.surface.points[stretches.deep & query.is_solid]),
-            )
-        )
+        against_m = _length_m(query.submap.surface.points[stretches.deep & query.is_solid])
+        excess_m = against_m - noise.contradiction * STRETCH_M * count
+        found.append(PlaceAgreement(support, count * mean, STRETCH_M * count, excess_m))
     return total(found)
 
 
-def _log_ratio(offsets_m: FloatArray, noise_m: float) -> FloatArray:
+def _log_ratio(offsets_m: FloatArray, noise: Noise) -> FloatArray:
     """Log-likelihood ratios of offsets, the same place to another."""
-    same = _density(offsets_m, np.hypot(noise_m, SAME_M), MOVED)
-    return np.asarray(np.log(same / _density(offsets_m, np.hypot(noise_m, OTHER_M), UNLIKE)))
+    same = _density(offsets_m, np.hypot(noise.offset_m, SAME_M), noise.moved)
+    return np.asarray(np.log(same / _density(offsets_m, np.hypot(noise.offset_m, OTHER_M), UNLIKE)))
 
 
 def _density(offsets_m: FloatArray, sigma_m: float, uniform: float) -> FloatArray:
@@ -144,11 +163,11 @@ def _density(offsets_m: FloatArray, sigma_m: float, uniform: float) -> FloatArra
     return np.asarray((1.0 - uniform) * normal + uniform / (2.0 * VIOLATION_M))
 
 
-def _expected_ratio(noise_m: float) -> float:
+def _expected_ratio(noise: Noise) -> float:
     """Mean log-likelihood ratio of an offset in the same place."""
     offsets_m = np.linspace(-VIOLATION_M, VIOLATION_M, 601)
-    weights = _density(offsets_m, float(np.hypot(noise_m, SAME_M)), MOVED)
-    return float((weights * _log_ratio(offsets_m, noise_m)).sum() / weights.sum())
+    weights = _density(offsets_m, float(np.hypot(noise.offset_m, SAME_M)), noise.moved)
+    return float((weights * _log_ratio(offsets_m, noise)).sum() / weights.sum())
 
 
 class _Stretches(NamedTuple):
