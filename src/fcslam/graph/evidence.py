@@ -27,6 +27,8 @@ LARGEST_CONTRADICTION = 0.02
 to 0.006, and refurnished or partly equal floors from 0.037 on."""
 LEAST_LIKENESS = 0.6
 """Least ``MapFit.likeness``. In one place it was 0.65 to 2, in places that look alike mostly less."""
+CLEAR_LIKENESS = 1.0
+"""Least ``MapFit.likeness`` of a cluster that others outnumber."""
 LEAST_RIVAL = 20.0
 """The support elsewhere is taken to be at least this, nats: maps with little wall in common are never unique."""
 LEAST_RATIO = 1.2
@@ -119,14 +121,15 @@ class ClusterEvidence:
 def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
     """Why the evidence is not enough to join two maps; None if it is.
 
-    Where the maps were compared, they decide between clusters that contradict each other, and not the number of
+    Where the maps agree clearly, they decide between clusters that contradict each other, and not the number of
     closures: in a building that repeats itself, most closures may be false.
     """
     if evidence.closures < settings.minimum_closures:
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
     fit = evidence.fit
     if fit is not None and fit.is_compared:
-        return refutation(fit) or _pose_shortfall(evidence) or _amount_shortfall(evidence, settings)
+        outnumbered = None if fit.likeness >= CLEAR_LIKENESS else _lead_shortfall(evidence, settings)
+        return refutation(fit) or _pose_shortfall(evidence) or outnumbered or _amount_shortfall(evidence, settings)
     return _pose_shortfall(evidence) or _lead_shortfall(evidence, settings) or _amount_shortfall(evidence, settings)
 
 
