@@ -47,7 +47,7 @@ def test_each_lack_has_its_reason_numbers_and_setting():
         replace(SPOT, fit=fit(1.25)): Reason(ReasonCode.NOT_UNIQUE, 1.25, 2.0, "minimum_evidence"),
         replace(SPOT, fit=fit(1.0)): Reason(ReasonCode.LOOK_ALIKE, 1.0, LEAST_RATIO),
         replace(SPOT, fit=fit(contradiction=0.06)): Reason(ReasonCode.MAPS_CONTRADICT, 0.06, LARGEST_CONTRADICTION),
-        replace(SPOT, fit=fit(likeness=0.5)): Reason(ReasonCode.WALLS_DIFFER, 0.5, LEAST_LIKENESS),
+        replace(SPOT, fit=fit(likeness=0.4)): Reason(ReasonCode.WALLS_DIFFER, 0.4, LEAST_LIKENESS),
     }
     for evidence, reason in lacks.items():
         assert shortfall(evidence, SETTINGS) == reason

@@ -25,8 +25,8 @@ LEAST_COMPARED_M = 5.0
 LARGEST_CONTRADICTION = 0.02
 """Largest share of walls in the other map's free space. One floor in three years had up to 0.010, robots of one day up
 to 0.006, and refurnished or partly equal floors from 0.037 on."""
-LEAST_LIKENESS = 0.6
-"""Least ``MapFit.likeness``. In one place it was 0.65 to 2, in places that look alike mostly less."""
+LEAST_LIKENESS = 0.5
+"""Least ``MapFit.likeness``. In one place it was 0.55 to 2, in places that look alike mostly less."""
 CLEAR_LIKENESS = 1.0
 """Least ``MapFit.likeness`` of a cluster that others outnumber."""
 LEAST_RIVAL = 20.0
