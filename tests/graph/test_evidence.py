@@ -63,10 +63,11 @@ def test_no_number_of_closures_joins_maps_that_contradict_each_other(places):
 
 
 def test_the_maps_decide_between_clusters_and_not_the_number_of_closures():
-    outnumbered = replace(SPOT, closures=10, rival_closures=100, rival_places=9)
+    outnumbered = replace(SPOT, closures=10, rival_closures=100, separate_places=3, rival_places=9)
     assert shortfall(outnumbered, SETTINGS).code is ReasonCode.NO_LEAD
     assert shortfall(replace(outnumbered, fit=fit()), SETTINGS) is None
-    assert shortfall(replace(outnumbered, fit=fit(likeness=0.8)), SETTINGS).code is ReasonCode.NO_LEAD
+    assert shortfall(replace(outnumbered, fit=fit(likeness=0.7)), SETTINGS).code is ReasonCode.NO_LEAD
+    assert shortfall(replace(outnumbered, separate_places=2, fit=fit()), SETTINGS).code is ReasonCode.NO_LEAD
 
 
 def test_three_places_need_no_comparison_where_none_is_possible():

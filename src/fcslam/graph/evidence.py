@@ -27,8 +27,8 @@ LARGEST_CONTRADICTION = 0.02
 to 0.006, and refurnished or partly equal floors from 0.037 on."""
 LEAST_LIKENESS = 0.5
 """Least ``MapFit.likeness``. In one place it was 0.55 to 2, in places that look alike mostly less."""
-CLEAR_LIKENESS = 1.0
-"""Least ``MapFit.likeness`` of a cluster that others outnumber."""
+CLEAR_LIKENESS = 0.8
+"""Least ``MapFit.likeness`` of a cluster that others outnumber; it must come from enough places, too."""
 LEAST_RIVAL = 20.0
 """The support elsewhere is taken to be at least this, nats: maps with little wall in common are never unique."""
 LEAST_RATIO = 1.2
@@ -128,7 +128,8 @@ def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason |
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
     fit = evidence.fit
     if fit is not None and fit.is_compared:
-        outnumbered = None if fit.likeness >= CLEAR_LIKENESS else _lead_shortfall(evidence, settings)
+        is_clear = fit.likeness >= CLEAR_LIKENESS and evidence.separate_places >= settings.minimum_evidence
+        outnumbered = None if is_clear else _lead_shortfall(evidence, settings)
         return refutation(fit) or _pose_shortfall(evidence) or outnumbered or _amount_shortfall(evidence, settings)
     return _pose_shortfall(evidence) or _lead_shortfall(evidence, settings) or _amount_shortfall(evidence, settings)
 
