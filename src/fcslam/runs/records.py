@@ -115,7 +115,7 @@ class Join:
     contradicting_m: float
     """Share of the compared walls in the other's free space, times ``seen_m``, metres."""
     likeness: float
-    """How well the walls lie on each other: about 1 in one place, 0.6 or less in places that only look alike."""
+    """How well the walls lie on each other: about 1 in one place, mostly below 0.5 in places that only look alike."""
     elsewhere: float
     """How well the maps fit at the best other transform, as a share; 0 if they fit nowhere else."""
 
