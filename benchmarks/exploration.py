@@ -31,7 +31,7 @@ from fcslam.maps.frontiers import (
     search_grid,
     start_cells,
 )
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 FREE, OCCUPIED = int(Occupancy.FREE), int(Occupancy.OCCUPIED)
 RADIUS_M = OccupancyConfig().robot_radius_m

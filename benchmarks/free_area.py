@@ -31,10 +31,10 @@ from scipy import ndimage
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.metrics.trajectory import align
 from fcslam.mission.localization import read_map
 from fcslam.records import FloatArray
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.tables import read_tum
 
 SCANNERS = {"rplidar": (12.0, 360.0), "sick": (25.0, 270.0), "short": (8.0, 360.0)}

@@ -31,7 +31,7 @@ from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 RADIUS_M = 0.25
 FRESH_S = 5.0

@@ -268,7 +268,7 @@ def building_as_seen(drivers: list[Any]) -> Any:
 
     from fcslam.lab.simulation.recording import true_map
     from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
-    from fcslam.runs.map_files import Occupancy
+    from fcslam.maps.occupancy_map import Occupancy
 
     maps = [true_map(SimulatedFleet(driver.plan, (driver,))) for driver in drivers]
     cells = maps[0].cells
@@ -296,8 +296,8 @@ def within(points: Any, others: Any, reach_m: float) -> Any:
 def labelled(seen: Any) -> Any:
     import numpy as np
 
+    from fcslam.maps.occupancy_map import Occupancy
     from fcslam.metrics.grid import LabelledGrid
-    from fcslam.runs.map_files import Occupancy
 
     corner = np.array([*seen.origin_xy, 0.0])
     return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)

@@ -40,11 +40,11 @@ from fcslam.geometry import se2
 from fcslam.lab.evaluation.fleet.relations import evaluate_relations
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.metrics.trajectory import align
 from fcslam.mission.localization import read_map
 from fcslam.records import FloatArray, LaserScan, SensorRecord
 from fcslam.runs import LocalizedPoses, Run
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.sources.faults import Faults
 
 WRONG_M = 0.5

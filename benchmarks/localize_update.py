@@ -17,11 +17,11 @@ from lifelong import building_now, labelled, segment_points, within
 from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.maps.occupancy_map import parse_map
 from fcslam.metrics.grid import grid_agreement
 from fcslam.metrics.trajectory import align
 from fcslam.mission.localization import run_localization
 from fcslam.mission.mission import MissionConfig, run_mission
-from fcslam.runs.map_files import parse_map
 
 MOVED_M = 0.15
 

@@ -254,8 +254,8 @@ def shown(run: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def square_kilometre(browser: Any, place: Path, seconds: float) -> list[tuple[str, float, str]]:
+    from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
     from fcslam.runs import RobotTrajectory, Run
-    from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
     rng = np.random.default_rng(0)
     blocks = rng.choice(

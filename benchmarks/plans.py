@@ -31,11 +31,11 @@ from fcslam.geometry import se2
 from fcslam.lab.simulation.floorplan import Piece, PieceKind
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings, simulate_fleet
 from fcslam.lidar.scan import point_scan
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.mission.mission import Beginning, MissionConfig, run_mission
 from fcslam.mission.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.runs import Run
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 SEEDS = tuple(range(1, 11))
 CELL_M, MARGIN_M = 0.02, 0.5

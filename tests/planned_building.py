@@ -8,8 +8,8 @@ import numpy as np
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Keyscan, KeyscanId, LaserModel, frozen
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 WALLS = np.array(
     [

@@ -24,6 +24,8 @@ ROOMS = [
     "geometry",
     "metrics",
     "storage",
+    "maps.occupancy_map",
+    "maps.ros_map",
     "runs",
     "sources",
     "graph",

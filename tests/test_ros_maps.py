@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fcslam.errors import SourceError
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.mission.localization import read_map
-from fcslam.runs.map_files import Occupancy
 
 F, O, U = Occupancy.FREE, Occupancy.OCCUPIED, Occupancy.UNKNOWN  # noqa: E741
 CELLS = np.array([[O, O, O, O], [O, F, F, U], [O, F, U, U]])

@@ -10,6 +10,7 @@ import pytest
 
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import OccupancyMap, map_yaml, parse_map, pgm_bytes
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import (
     ClosureRow,
@@ -22,7 +23,6 @@ from fcslam.runs import (
     open_run,
     prepare_output,
 )
-from fcslam.runs.map_files import OccupancyMap, map_yaml, parse_map, pgm_bytes
 from fcslam.storage import files
 
 JOIN_COLUMNS = "robot_i,robot_j,closures,places,seen_m,contradicting_m,likeness,elsewhere"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserModel, LaserScan, frozen
-from fcslam.runs.map_files import Occupancy, parse_map
 from fcslam.sources.faults import Faults
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode

@@ -17,11 +17,12 @@ import fcslam
 from fcslam.features.birdseye import SIDE_M, describe, likelihood_picture
 from fcslam.geometry import se2
 from fcslam.maps import palette
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.mission_file import read_mission
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import ClosureStatus, FloatArray, Place
-from fcslam.runs import OccupancyMap, Run
+from fcslam.runs import Run
 from fcslam.runs.folder import MISSION
 from fcslam.sources import open_source
 

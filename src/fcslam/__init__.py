@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from fcslam.live.records import EventKind, LocalizationState, RobotEvent, RobotPose, RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.maps.changes import ChangedRegion, Changes
+    from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
     from fcslam.mission.localization import LocalizationProgress
     from fcslam.mission.mission import MissionConfig, Progress
     from fcslam.records import (
@@ -66,8 +67,6 @@ if TYPE_CHECKING:
         LocalizedPoses,
         LocalMap,
         Metric,
-        Occupancy,
-        OccupancyMap,
         RobotTrajectory,
         Run,
         open_run,
@@ -161,13 +160,13 @@ _LAZY: Final = {
         "fcslam.live.records": "EventKind LocalizationState RobotEvent RobotPose RobotStatus",
         "fcslam.live.robot": "Robot",
         "fcslam.maps.changes": "ChangedRegion Changes",
+        "fcslam.maps.occupancy_map": "Occupancy OccupancyMap",
         "fcslam.mission.localization": "LocalizationProgress",
         "fcslam.mission.mission": "MissionConfig Progress",
         "fcslam.records": "Beams CameraImage CameraModel Channel ClosureStatus GnssFix LaserModel LaserScan "
         "Odometry Reason ReasonCode Sweep Transform Veto",
         "fcslam.robot.outbox": "WaitingPackets",
-        "fcslam.runs": "ClosureRow Join LocalMap LocalizedPoses Metric Occupancy OccupancyMap RobotTrajectory Run "
-        "open_run",
+        "fcslam.runs": "ClosureRow Join LocalMap LocalizedPoses Metric RobotTrajectory Run open_run",
         "fcslam.sources": "BagOptions Fault FaultCount Faults ScanRange Source Survey",
         "fcslam.sources.point_clouds": "CloudBand",
         "fcslam.wire.http_transport": "Server",

@@ -13,6 +13,7 @@ from fcslam.anchoring.anchors import Anchors
 from fcslam.config import load, parse
 from fcslam.errors import SourceError
 from fcslam.lidar.frontend import LidarConfig
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.driving import side_by_side
 from fcslam.mission.mission import (
     Beginning,
@@ -26,7 +27,7 @@ from fcslam.mission.mission import (
 from fcslam.mission.mission_file import EMPTY, read_mission
 from fcslam.records import StrPath, Veto
 from fcslam.robot.calibrating import calibrated
-from fcslam.runs import OccupancyMap, Run, prepare_output
+from fcslam.runs import Run, prepare_output
 from fcslam.sources import BagOptions, Source
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
+from fcslam.maps.occupancy_map import Occupancy, map_yaml, pgm_bytes
 from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 
 pytestmark = pytest.mark.slow

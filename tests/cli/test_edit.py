@@ -9,10 +9,10 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.mission_file import edit_mission, read_mission
 from fcslam.records import ClosureStatus, MapRegion, ReasonCode, RegionUse
 from fcslam.runs import open_run
-from fcslam.runs.map_files import Occupancy, parse_map
 
 pytestmark = pytest.mark.slow
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main, show
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import mission_path
 from fcslam.runs import RobotTrajectory, Run
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
 API = "/api/v1"
 

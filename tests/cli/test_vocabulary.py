@@ -8,10 +8,10 @@ import pytest
 import yaml
 
 from fcslam.cli import main
+from fcslam.maps.occupancy_map import OccupancyMap, parse_map
 from fcslam.mission.mission_file import read_mission
 from fcslam.places.words import read_vocabularies
 from fcslam.records import Channel, Constraint, Keyscan, MapTile, WordPlace
-from fcslam.runs.map_files import OccupancyMap, parse_map
 from fcslam.wire.messages import Hello
 
 SIMILARITY = {"fusion": "two_point", "matcher": {"decision": "similarity", "delta": 0.4}}

@@ -15,12 +15,12 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.submap_bytes import submap_bytes
 from fcslam.maps.fusion import fuse
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
 from fcslam.places.matcher import MatcherConfig
 from fcslam.records import Channel, KeyscanId, Place, Veto
 from fcslam.runs import open_run
-from fcslam.runs.map_files import Occupancy
 from fcslam.storage.state_file import parse_state, state_bytes
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode

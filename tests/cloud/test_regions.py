@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.placement import PlacedRegion, region_files, with_regions
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, parse_map
 from fcslam.records import RegionUse
-from fcslam.runs import OccupancyMap
-from fcslam.runs.map_files import Occupancy, parse_map
 
 SIDE_M = 0.1
 CELLS = np.tile(np.array([Occupancy.FREE, Occupancy.OCCUPIED], np.uint8), (40, 30))

@@ -7,7 +7,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.submap import agreement
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 CORNER = (-3.0, 5.0)
 

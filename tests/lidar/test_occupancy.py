@@ -6,8 +6,8 @@ from scipy import ndimage
 
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, cast_periods, classify
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import LaserModel
-from fcslam.runs.map_files import Occupancy
 
 pytestmark = pytest.mark.slow
 

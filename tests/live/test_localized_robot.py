@@ -9,8 +9,8 @@ import fcslam
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.live.records import Wiring
+from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
-from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.sources import write_carmen
 from tests import small_fleet
 from tests.live.same_thread import SameThread

@@ -13,10 +13,10 @@ from fcslam.geometry import se2
 from fcslam.live.playback import PlaybackPace, play
 from fcslam.live.records import EventKind, LocalizationState, Playback, Wiring
 from fcslam.live.robot import Robot
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import Channel, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
-from fcslam.runs import Occupancy
 from fcslam.wire.http_transport import Server
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode

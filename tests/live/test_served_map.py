@@ -13,11 +13,11 @@ import uvicorn
 from fcslam.cli import main
 from fcslam.errors import CloudError, OutputError, SourceError
 from fcslam.live.served_map import fetch_maps
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.runs import RobotTrajectory, Run
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.http_transport import Server
 

@@ -13,9 +13,9 @@ from fcslam.live.fleet_view import Mates
 from fcslam.live.joint_map import JointMap
 from fcslam.live.records import Wiring
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Correction, Keyscan, KeyscanId, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.wire.messages import Hello, Packet
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread

@@ -21,7 +21,7 @@ from fcslam.maps.certificate import (
     covariances,
     relative_error,
 )
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 COUNT = 40
 BAR_M = 0.25 * SCALE + FLOOR_M

@@ -5,8 +5,8 @@ import pytest
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.changes import compare
 from fcslam.maps.fusion import Period, fuse, fuse_periods, periods_of
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Keyscan, KeyscanId, LaserModel
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 LASER = LaserModel(720, -np.pi, np.pi / 360, 30.0)
 HALF_M = 3.02

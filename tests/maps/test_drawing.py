@@ -18,7 +18,7 @@ from fcslam.maps.drawing import (
     map_png,
     round_length,
 )
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 pytestmark = pytest.mark.slow
 

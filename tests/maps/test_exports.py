@@ -11,7 +11,7 @@ from PIL import Image
 from pyproj import CRS, Transformer
 
 from fcslam.maps.exports import EarthFrame, earth_frame, export_map, geotiff, map_svg
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes, pixels_of
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes, pixels_of
 
 MAP = OccupancyMap(np.random.default_rng(0).integers(0, 3, (40, 70)).astype(np.uint8), 0.05, (-1.2, 3.4))
 FRAME = EarthFrame(latitude_deg=48.1, longitude_deg=11.5, x_axis_from_east_deg=30.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fcslam.maps.frontiers import Explorer, Frontier, frontiers
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 SIDE_M = 0.1
 

@@ -4,8 +4,8 @@ import yaml
 
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
+from fcslam.maps.occupancy_map import Occupancy, map_yaml, pgm_bytes
 from fcslam.records import Keyscan, KeyscanId, LaserModel
-from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
 
 CONFIG = OccupancyConfig()
 LASERS = {

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.maps.joint_tiles import TILE, TileBatch, TiledMap, TileHistory, decode_batch, frame_of, padded
-from fcslam.runs.map_files import OccupancyMap
+from fcslam.maps.occupancy_map import OccupancyMap
 
 
 def occupancy(seed, height, width, column, row):

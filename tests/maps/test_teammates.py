@@ -7,8 +7,8 @@ import pytest
 
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import Keyscan, KeyscanId, LaserModel
-from fcslam.runs.map_files import Occupancy
 
 BEAMS, SIDE_M, RADIUS_M = 360, 8.0, 0.25
 LASER = LaserModel(BEAMS, -np.pi, 2 * np.pi / BEAMS, 20.0)

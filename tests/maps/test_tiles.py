@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fcslam.maps import tiles
+from fcslam.maps.occupancy_map import PIXELS, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.maps.tiles import TILE_PX, WORLD_M, finest_zoom, tile_png
-from fcslam.runs.map_files import PIXELS, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
 RESOLUTION_M = 0.05
 ORIGIN = (-13.7, 4.05)

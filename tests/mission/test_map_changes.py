@@ -10,10 +10,10 @@ import fcslam
 from fcslam.cli import main
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import OutputError, SourceError
+from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.records import Keyscan, KeyscanId
-from fcslam.runs import Metric, Occupancy, RobotTrajectory, Run
-from fcslam.runs.map_files import parse_map
+from fcslam.runs import Metric, RobotTrajectory, Run
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import measure
 from fcslam.wire.quantisation import dequantise, quantise

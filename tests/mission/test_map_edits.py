@@ -9,11 +9,11 @@ from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import Track
 from fcslam.errors import EditError
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.mission.map_edits import moved_map, region_in_map
 from fcslam.mission.mission_file import EMPTY
 from fcslam.records import RegionUse, frozen
-from fcslam.runs import OccupancyMap, RobotTrajectory, Run
-from fcslam.runs.map_files import Occupancy
+from fcslam.runs import RobotTrajectory, Run
 
 SIDE_M = 0.05
 WALL_DEG = 0.3

@@ -21,6 +21,7 @@ from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EvaluationError
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.page import ASSETS, MODULES, viewer
 from fcslam.page.report import MOST_TILES, report_html
@@ -28,7 +29,6 @@ from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
 from fcslam.runs import ClosureRow, Join, Metric, RobotTrajectory, Run
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.service.http.app import PREFIX
 from fcslam.wire.packets import decode, measure
 from tests.service.http.desk import A

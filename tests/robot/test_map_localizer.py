@@ -13,12 +13,12 @@ from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.uniqueness import best_elsewhere, two_best
 from fcslam.maps.fusion import fuse
+from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.localization import run_localization
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import Keyscan, KeyscanId
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapLocalizer
-from fcslam.runs.map_files import Occupancy, parse_map
 from tests import small_fleet
 from tests.robot.kidnapping import put_down
 

@@ -10,12 +10,12 @@ from fcslam.config import parse
 from fcslam.errors import ConfigError, FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION
 from fcslam.maps.fusion import joined_tiles, laid_together
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.mission import MissionConfig
 from fcslam.places.words import train_words, write_vocabularies
 from fcslam.records import Channel, Constraint, Keyscan, MapTile, Place, WordPlace
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.words import Sends, WordsConfig, tiles_of
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import measure
 from tests import small_fleet

@@ -19,8 +19,8 @@ import httpx
 import numpy as np
 import pytest
 
+from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.ros.ros1 import DEBIAN
-from fcslam.runs.map_files import Occupancy, parse_map
 from fcslam.sources import write_bag
 from tests import small_fleet
 from tests.robot import spinning

@@ -13,13 +13,13 @@ from fcslam.errors import NetworkError
 from fcslam.geometry import se2
 from fcslam.live.fleet_view import Teammate
 from fcslam.live.records import Wiring
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, parse_map
 from fcslam.ros import node as node_module
 from fcslam.ros.network import Endpoint, Quality
 from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
 from fcslam.ros.outputs import POSE
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
-from fcslam.runs.map_files import Occupancy, OccupancyMap, parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import frozen
 from fcslam.ros import outputs
 from fcslam.ros.outputs import Grid, Outputs, Region, changed_region
 from fcslam.ros.transform_stream import TransformStream
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 from tests.ros.memory_network import MemoryNetwork
 
 SECOND = 10**9

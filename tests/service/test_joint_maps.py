@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fcslam.runs.map_files import Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.service.joint_maps import JointMaps, JointSession, ServedJointMaps
 
 

@@ -9,9 +9,9 @@ import pytest
 from fcslam import untrusted
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import outlines
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import stored_mission
 from fcslam.page.shown_run import ShownRun
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.service import map_layers
 from fcslam.service.http.responses import MapLayer
 from fcslam.service.map_layers import layers_of, map_shapes, walls_of

@@ -23,8 +23,8 @@ from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
 from fcslam.maps.exports import outlines
+from fcslam.maps.occupancy_map import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 from fcslam.records import StrPath
-from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
 
 if TYPE_CHECKING:
     from fcslam.anchoring.deviations import Comparison

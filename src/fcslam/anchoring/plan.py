@@ -10,8 +10,8 @@ import numpy as np
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 NORMAL_SIGMA_PX: Final = 2.0
 """Blur of the drawing whose gradient gives the normals."""

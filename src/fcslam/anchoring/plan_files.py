@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
+from fcslam.maps.ros_map import parse_ros_map
 from fcslam.records import FloatArray, frozen
-from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.runs.ros_map import parse_ros_map
 from fcslam.untrusted import MOST_TEXT_BYTES, read_bytes, read_text
 
 DXF_CELL_M: Final = 0.02

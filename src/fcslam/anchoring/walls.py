@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 _COARSE_RAD: Final = float(np.radians(0.5))
 _FINE_RAD: Final = float(np.radians(0.02))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, server_files
 from fcslam.records import Change, FloatArray, KeyscanId, MapRegion, Placement, RegionUse, frozen
-from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 
 PoseOf = Callable[[KeyscanId], FloatArray]
 """Pose of a keyscan in its map, shape (3,)."""
@@ -88,8 +88,7 @@ def region_files(occupancy: OccupancyMap, stem: str, regions: Sequence[PlacedReg
     if forbidden:
         cells = np.where(_inside(occupancy, forbidden), Occupancy.OCCUPIED, Occupancy.FREE)
         mask = replace(occupancy, cells=frozen(cells, np.uint8))
-        files[f"{stem}_keepout.pgm"] = pgm_bytes(mask)
-        files[f"{stem}_keepout.yaml"] = map_yaml(mask, f"{stem}_keepout.pgm").encode()
+        files |= server_files(f"{stem}_keepout", mask)
     if areas := [region for region in regions if region.use is RegionUse.AREA]:
         collection = {"type": "FeatureCollection", "features": list(map(_feature, areas))}
         files[f"{stem}_areas.geojson"] = (json.dumps(collection, indent=1) + "\n").encode()

@@ -15,12 +15,12 @@ from fcslam.geometry import se2
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse, laid_together
+from fcslam.maps.occupancy_map import OccupancyMap, map_stem, map_yaml, pgm_bytes, server_files
+from fcslam.maps.run_pictures import picture, quality_files
 from fcslam.processes import trim_memory
 from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, frozen
-from fcslam.runs import QUALITY, ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
-from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
+from fcslam.runs import ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
@@ -89,7 +89,7 @@ def run_of(
         pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
         map_files=map_files,
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
-        quality=_quality_files(certificates, fused),
+        quality=quality_files(certificates, fused),
     )
 
 
@@ -180,18 +180,15 @@ def _map_files(
     result: FleetResult, trajectories: Mapping[str, RobotTrajectory], maps: Mapping[int, OccupancyMap]
 ) -> dict[str, bytes]:
     """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
-    drawn = _drawn_closures(result)
     files: dict[str, bytes] = {}
     for k, fused in maps.items():
-        stem, members = map_stem(k), [robot for robot in result.robots if robot.map_index == k]
+        stem = map_stem(k)
+        keyscans = {robot.robot: robot.T_map_base for robot in result.robots if robot.map_index == k}
         regions = [region for region in result.regions if region.map_index == k]
-        files[f"{stem}.pgm"] = pgm_bytes(fused)
-        files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
-        files |= region_files(fused, stem, regions)
-        if k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN:
-            names = {robot.robot for robot in members}
-            ways = {name: robot.T_map_base for name, robot in trajectories.items() if name in names}
-            files[f"{stem}.png"] = map_png(fused, ways, drawn.get(k, ()))
+        files |= server_files(stem, fused) | region_files(fused, stem, regions)
+        if k == 0 or sum(map(len, keyscans.values())) >= LEAST_DRAWN:
+            ways = {name: robot.T_map_base for name, robot in trajectories.items() if name in keyscans}
+            files[f"{stem}.png"] = picture(fused, ways, result.closures, keyscans)
     return files
 
 
@@ -206,18 +203,6 @@ def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict
             paths = [MappedPath(robot.robot, robot.stamps, robot.T_map_base, robot.variables) for robot in members]
             certificates[k] = certify(result.graph, paths, fused)
     return certificates
-
-
-def _quality_files(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]) -> dict[str, bytes]:
-    if not certificates:
-        return {}
-    from fcslam.maps.certificate import certificate_json, certificate_png
-
-    pictures = {
-        f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
-        for k, one in certificates.items()
-    }
-    return {f"{QUALITY}.json": certificate_json(certificates), **pictures}
 
 
 def fused_maps(result: FleetResult, grid: OccupancyConfig) -> Iterator[tuple[int, OccupancyMap]]:
@@ -235,18 +220,6 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid, senders)
     own = [(robot.own_map, robot.T_map_local) for robot in members if robot.own_map is not None]
     return laid_together([(fused, np.zeros(3)), *own], grid.maximum_cells) if own else fused
-
-
-def _drawn_closures(result: FleetResult) -> dict[int, list[DrawnClosure]]:
-    """Accepted closures between robots, as lines of the pictures, by map."""
-    mapped = {robot.robot: robot for robot in result.robots}
-    drawn: dict[int, list[DrawnClosure]] = {}
-    for c in result.closures:
-        if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot:
-            i, j = mapped[c.i.robot], mapped[c.j.robot]
-            line = DrawnClosure(i.T_map_base[c.i.number][:2], j.T_map_base[c.j.number][:2], i.robot, j.robot)
-            drawn.setdefault(i.map_index, []).append(line)
-    return drawn
 
 
 def _counts(result: FleetResult) -> list[Metric]:

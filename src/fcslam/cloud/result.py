@@ -14,6 +14,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.pose_graph import PoseGraph
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import (
     Change,
     ClosureStatus,
@@ -28,7 +29,6 @@ from fcslam.records import (
     TagSighting,
     frozen,
 )
-from fcslam.runs.map_files import OccupancyMap
 
 
 @dataclass(frozen=True, slots=True)

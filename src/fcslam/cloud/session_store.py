@@ -12,6 +12,7 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
 from fcslam.maps.fusion import joined_tiles
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import (
     Channel,
     Constraint,
@@ -24,7 +25,6 @@ from fcslam.records import (
     Place,
     frozen,
 )
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
 

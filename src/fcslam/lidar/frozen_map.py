@@ -11,8 +11,8 @@ from fcslam.errors import SourceError
 from fcslam.lidar.field import CELL_M, TABLE, TILE, TOO_MANY_WALLS, SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 NORMAL_M = 0.1
 """Width of the Gaussian over free cells whose slope is the normal of a wall."""

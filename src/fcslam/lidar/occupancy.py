@@ -18,8 +18,8 @@ from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.geometry.beams import is_full_turn
 from fcslam.lidar.scan import beam_times, ray_at, rays_of
+from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
 from fcslam.records import FloatArray, LaserModel, Ranges, Sweep
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
 
 Counts = NDArray[np.uint32]
 

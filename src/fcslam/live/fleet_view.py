@@ -14,9 +14,9 @@ import numpy as np
 
 from fcslam.errors import FcslamError, UnavailableError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
 

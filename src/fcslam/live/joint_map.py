@@ -16,11 +16,11 @@ from fcslam.live.fleet_view import FleetView
 from fcslam.live.records import RobotPose
 from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
 from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.track import ScanTrack
 from fcslam.robot.warmup import made_up_scans
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Hello, Packet
 
 MOST_DRAWN = 20_000

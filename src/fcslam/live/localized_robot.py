@@ -19,6 +19,7 @@ from fcslam.geometry import se2
 from fcslam.live.inputs import Lasers
 from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, StrPath, frozen
@@ -27,7 +28,6 @@ from fcslam.robot.map_localizer import MapEstimate
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.robot.worker_localizer import WorkerLocalizer
 from fcslam.runs import RobotTrajectory, Run, prepare_output
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Packet
 
 _NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)

@@ -17,10 +17,10 @@ from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import FcslamError
 from fcslam.geometry import se2
 from fcslam.maps.fusion import fuse
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.records import ClosureStatus, Correction, FloatArray, frozen
 from fcslam.runs import Run
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import SizedPacket, decode, measure
 

@@ -28,6 +28,7 @@ from fcslam.live.map_poses import MapPoses
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import WIRED, EventKind, Playback, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.driving import track_of
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import (
@@ -50,7 +51,6 @@ from fcslam.robot.sender import CONNECTING
 from fcslam.robot.uplink import Uplink
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.runs import RobotTrajectory, Run, prepare_output
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server, addresses

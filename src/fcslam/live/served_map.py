@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import CloudError, EvaluationError, SourceError, UnavailableError
+from fcslam.maps.occupancy_map import area_of, map_stem, parse_map
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
-from fcslam.runs.map_files import area_of, map_stem, parse_map
 from fcslam.wire.fleet_client import MapClient, ServedMap
 from fcslam.wire.http_transport import Server, addresses
 from fcslam.wire.keys import Credentials

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.lidar.scan import rays_of
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray, LaserScan
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 OLDEST_S: Final = 2.0
 """An older pose does not say where a robot is now."""

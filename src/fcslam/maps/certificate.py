@@ -22,8 +22,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from fcslam.graph.pose_graph import PoseGraph
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, pixels_of
 from fcslam.records import FloatArray
-from fcslam.runs.map_files import Occupancy, OccupancyMap, pixels_of
 
 SCALE: Final = 0.25
 """Ratio of true errors to the standard deviations of the graph."""

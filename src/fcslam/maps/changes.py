@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fcslam.maps.drawing import highlighted_png
 from fcslam.maps.fusion import Period
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
 
 Mask = NDArray[np.bool_]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.maps import palette
+from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
 from fcslam.records import Channel, FloatArray
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from fcslam.runs.map_files import GEOREFERENCE, Occupancy, OccupancyMap, map_stem, parse_map, pixels_of
+from fcslam.maps.occupancy_map import GEOREFERENCE, Occupancy, OccupancyMap, map_stem, parse_map, pixels_of
 from fcslam.untrusted import MOST_TEXT_BYTES, read_bytes, read_text
 
 _WALL, _FLOOR = "#1a1a1a", "#e8edf2"

@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import dijkstra
 
 from fcslam.geometry.cell_graph import cell_graph
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 CELL_M: Final = 0.1
 """Least side of a cell of the search grid."""

@@ -13,9 +13,9 @@ from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast_periods, classify
 from fcslam.maps.joint_tiles import tiled_map
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.maps.teammates import RobotPath, without_teammates
 from fcslam.records import FloatArray, Keyscan, LaserModel, MapTile
-from fcslam.runs.map_files import OccupancyMap
 
 
 @dataclass(frozen=True, slots=True)

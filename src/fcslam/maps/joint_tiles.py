@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.maps.occupancy_map import PIXELS, Occupancy, parse_image, pixels_of
 from fcslam.runs.folder import identity
-from fcslam.runs.map_files import PIXELS, Occupancy, parse_image, pixels_of
 from fcslam.untrusted import read_bytes, read_text
 
 WORLD_M = 512.0

@@ -19,15 +19,15 @@ from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.maps.drawing import map_png
+from fcslam.maps.occupancy_map import OccupancyMap, map_stem, parse_map, server_files
+from fcslam.maps.ros_map import parse_ros_map
 from fcslam.mission.mission import Beginning, MissionConfig, continued_config, run_mission
 from fcslam.mission.mission_file import read_mission
 from fcslam.records import FloatArray, LaserScan, checked_pose, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
-from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
+from fcslam.runs import LocalizedPoses, Metric, Run
 from fcslam.runs.folder import MISSION, ROBOTS
-from fcslam.runs.map_files import map_stem, map_yaml, parse_map, pgm_bytes
-from fcslam.runs.ros_map import parse_ros_map
 from fcslam.runs.tables import read_robots
 from fcslam.sources import Source
 from fcslam.untrusted import read_bytes
@@ -196,11 +196,9 @@ def _updated(
         seen.append(Casting(scans[stamp].ranges_m, scans[stamp].laser, pose, scans[stamp].sweep))
     updated = draw_over(occupancy, seen, config.map)
     files = {
-        "map.pgm": pgm_bytes(updated),
-        MAP_YAML: map_yaml(updated, "map.pgm").encode(),
+        **server_files("map", updated),
+        **server_files("map_before", occupancy),
         "map.png": map_png(updated, {poses.robot: poses.believed().T_map_base}, ()),
-        "map_before.pgm": pgm_bytes(occupancy),
-        "map_before.yaml": map_yaml(occupancy, "map_before.pgm").encode(),
     }
     return replace(run, map_files=files)
 
@@ -267,8 +265,7 @@ class LocalizedDrive:
             metrics={metric.name: metric for metric in metrics},
             config_yaml=dump(config),
             map_files={
-                "map.pgm": pgm_bytes(occupancy),
-                MAP_YAML: map_yaml(occupancy, "map.pgm").encode(),
+                **server_files("map", occupancy),
                 "map.png": map_png(occupancy, {robot: believed.T_map_base}, ()),
             },
             localized={robot: poses},

@@ -17,10 +17,10 @@ from fcslam.cloud.sessions import in_session
 from fcslam.errors import OutputError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED, Changes, compare
 from fcslam.maps.fusion import Period, fuse_periods, periods_of
+from fcslam.maps.occupancy_map import OccupancyMap, server_files
 from fcslam.mission.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Keyscan, LaserModel
 from fcslam.runs import Run, open_run
-from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
 from fcslam.storage.files import replacing_folder
 from fcslam.wire.messages import Hello
 
@@ -102,9 +102,8 @@ def save_changes(changes: Changes, folder: Path, force: bool = False) -> None:
         folder.resolve().parent.mkdir(parents=True, exist_ok=True)
         with replacing_folder(folder.resolve()) as place:
             for kind, mask in ((APPEARED, changes.appeared), (DISAPPEARED, changes.disappeared)):
-                layer = changes.layer(mask)
-                (place / f"{kind}.pgm").write_bytes(pgm_bytes(layer))
-                (place / f"{kind}.yaml").write_text(map_yaml(layer, f"{kind}.pgm"), encoding="utf-8")
+                for name, content in server_files(kind, changes.layer(mask)).items():
+                    (place / name).write_bytes(content)
             (place / PICTURE).write_bytes(changes.png())
             (place / TABLE).write_text(_table(changes), encoding="utf-8")
     except OSError as error:

@@ -15,11 +15,11 @@ from urllib.parse import quote, unquote
 from fcslam.config import StrictModel
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import export_map
+from fcslam.maps.occupancy_map import OccupancyMap, map_stem
 from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
 from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, OccupancyMap, open_run
-from fcslam.runs.map_files import map_stem
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, open_run
 from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,

@@ -20,6 +20,7 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import solve_single_robot
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.places.words import WordVocabulary, read_vocabularies
 from fcslam.records import (
     Channel,
@@ -33,7 +34,6 @@ from fcslam.records import (
     WordPlace,
     frozen,
 )
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.limits import TILE_CELLS
 from fcslam.wire.messages import Body, Hello
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 from fcslam.errors import FcslamError
 from fcslam.lidar.frozen_map import frozen_map
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Body
 
 

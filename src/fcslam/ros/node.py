@@ -19,6 +19,7 @@ import numpy as np
 
 from fcslam.config import one_line
 from fcslam.errors import FcslamError, NetworkError
+from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
 from fcslam.ros.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
@@ -27,7 +28,6 @@ from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors, Notify
 from fcslam.ros.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
 from fcslam.ros.transform_stream import TransformStream
-from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.transforms import last_part, planar, transform_of

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 from fcslam.ros.network import Publish, Quality, RosNetwork
 from fcslam.ros.topics import resolved
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.sources.bags.codec import GRID_UPDATE, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 

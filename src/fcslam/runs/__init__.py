@@ -12,7 +12,6 @@ from fcslam.runs.folder import (
     open_run,
     prepare_output,
 )
-from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.separations import Separation, separations
 from fcslam.runs.tables import metrics_json, read_tum, write_tum
@@ -29,8 +28,6 @@ __all__ = [
     "LocalMap",
     "LocalizedPoses",
     "Metric",
-    "Occupancy",
-    "OccupancyMap",
     "RobotTrajectory",
     "Run",
     "Separation",

@@ -28,8 +28,8 @@ from functools import cached_property
 from pathlib import Path
 
 from fcslam.errors import EvaluationError, OutputError
+from fcslam.maps.occupancy_map import OccupancyMap, parse_map
 from fcslam.records import StrPath
-from fcslam.runs.map_files import OccupancyMap, parse_map
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
     metrics_json,

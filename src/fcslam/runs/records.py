@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.maps.occupancy_map import OccupancyMap, parse_map
 from fcslam.records import Channel, ClosureStatus, FloatArray, Reason, frozen
-from fcslam.runs.map_files import OccupancyMap, parse_map
 
 
 @dataclass(frozen=True, slots=True, eq=False)

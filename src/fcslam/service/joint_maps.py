@@ -23,8 +23,8 @@ from fcslam.errors import StoreError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.frontiers import Explorer, Frontier, frontiers
 from fcslam.maps.joint_tiles import TileBatch, TileHistory, frame_of
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.runs.folder import identity
-from fcslam.runs.map_files import OccupancyMap
 from fcslam.storage.files import write_file
 
 LONGEST_SPEED_MPS = 3.0

@@ -12,11 +12,11 @@ from fcslam.anchoring.walls import wall_direction
 from fcslam.errors import EvaluationError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED
 from fcslam.maps.exports import outlines
+from fcslam.maps.occupancy_map import map_stem, parse_map
 from fcslam.mission.map_changes import changes_of
 from fcslam.mission.mission_file import check_packets, stored_mission
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import QUALITY, Run
-from fcslam.runs.map_files import map_stem, parse_map
 from fcslam.service.http.responses import MapLayer, MapShape, WallDirection
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import LimitError, read_bytes, read_text

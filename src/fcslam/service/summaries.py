@@ -15,12 +15,12 @@ from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import earth_frame, zipped
+from fcslam.maps.occupancy_map import HEADER_BYTES, area_of, map_stem
 from fcslam.maps.palette import robot_colors
 from fcslam.maps.tiles import finest_zoom
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel, ClosureStatus, Edit
 from fcslam.runs import TRAJECTORIES, ClosureRow, Run, separations
-from fcslam.runs.map_files import HEADER_BYTES, area_of, map_stem
 from fcslam.service.http.responses import (
     ClosureSummary,
     EditSummary,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.geometry.beams import FULL_TURN_RAD, LARGEST_SPAN_RAD
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import (
     CODE_BYTES,
     FLOOR,
@@ -26,7 +27,6 @@ from fcslam.records import (
     TagSighting,
     WordPlace,
 )
-from fcslam.runs.map_files import Occupancy
 from fcslam.wire import limits
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise

@@ -12,8 +12,8 @@ from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.recording import true_map, true_relations, write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.maps.occupancy_map import Occupancy
 from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
-from fcslam.runs.map_files import Occupancy
 from tests.lab.simulation.driving import distances
 
 pytestmark = pytest.mark.slow

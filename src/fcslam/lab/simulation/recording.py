@@ -13,9 +13,9 @@ from fcslam.config import dump
 from fcslam.errors import OutputError, writing
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, ray_caster
+from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, RecordedItem, frozen
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.sources import RecordingWriter
 from fcslam.storage.files import write_file
 

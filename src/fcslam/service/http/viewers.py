@@ -15,10 +15,10 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import export_map
+from fcslam.maps.occupancy_map import map_stem
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, ClosureRow, Run
-from fcslam.runs.map_files import map_stem
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,

@@ -14,12 +14,12 @@ from fcslam.config import one_line, parse_yaml
 from fcslam.errors import EvaluationError
 from fcslam.features.detector import decode_grey
 from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.maps.occupancy_map import check_place
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.metrics.relations import PoseTable
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, read_tum
-from fcslam.runs.map_files import check_place
 from fcslam.untrusted import read_bytes, read_text
 
 GAP_S = 0.25

@@ -99,6 +99,12 @@ def map_yaml(occupancy: OccupancyMap, image: str) -> str:
     return text
 
 
+def server_files(stem: str, occupancy: OccupancyMap) -> dict[str, bytes]:
+    """The map as ``<stem>.pgm`` and ``<stem>.yaml`` for map_server."""
+    image = f"{stem}.pgm"
+    return {image: pgm_bytes(occupancy), f"{stem}.yaml": map_yaml(occupancy, image).encode()}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MapImage:
     """The image of a map, and what its pixels mean."""

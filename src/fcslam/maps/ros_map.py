@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from fcslam.config import one_line
 from fcslam.errors import EvaluationError
+from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, number_in, read_description
 from fcslam.records import frozen
-from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, number_in, read_description
 from fcslam.untrusted import check_image
 
 _MODES: Final = ("trinary", "scale", "raw")
