@@ -12,10 +12,9 @@ GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 HAS_GL := $(BIN)/python -c "from fcslam.lab.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
-# A real ROS as the peer of tests, in an environment of its own: rclpy from PyPI, rospy and roscore from Debian.
+# A real ROS as the peer of tests, in an environment of its own: rclpy from PyPI.
 ROS_VENV := .venv-ros
 RCLPY := ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-sensor-msgs==5.5.1 ros-nav-msgs==5.5.1 ros-std-srvs==5.5.1
-ROSPY := python3-rospy python3-roslaunch python3-rosmaster python3-sensor-msgs python3-nav-msgs python3-std-srvs python3-tf2-ros
 # What the tests of the page drive; axe-core looks for faults of accessibility.
 AXE := axe-core@4.14.1
 # The linter of the page's script.
@@ -47,7 +46,7 @@ help:
 	@echo "make test-training federated training, with attackers and with deployed daemons; run make learning first"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
-	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
+	@echo "make ros-test     install a real ROS 2 as the peer of the tests of live robots"
 	@echo "make browser-test install a browser for the tests of the page, if permitted"
 	@echo "make scale-test   install what tests of a cluster and of several instances need, and run them"
 	@echo "make check        linter, formatting, types, spelling"
@@ -117,8 +116,6 @@ ros-test: $(INSTALLED)
 	@$(PIP) -e ".[$(EXTRAS),ros2]"
 	@$(PYTHON) -m venv $(ROS_VENV)
 	@$(ROS_VENV)/bin/python -m pip install -qq --disable-pip-version-check $(RCLPY) || echo "No rclpy for this Python."
-	@$(AS_ROOT) true 2>/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends $(ROSPY); } >/dev/null || \
-	    echo "No roscore. To have it: sudo apt-get install $(ROSPY)"
 
 # Never fails: without a browser the tests of the page are skipped.
 browser-test: $(INSTALLED)

@@ -7,16 +7,15 @@ from fcslam.sources.bags.codec import MessageCodec
 
 
 class MemoryNetwork:
-    def __init__(self, others=(), ros1=False):
+    def __init__(self, others=()):
         """``others``: publishers and subscriptions of somebody else."""
-        self.ros1 = ros1
         self.others = list(others)
         self.sent = defaultdict(list)
         self.subscribed = {}
         self.services = {}
         self._own = []
         self._subscribers = defaultdict(list)
-        self._codec = MessageCodec(self.ros1)
+        self._codec = MessageCodec(ros1=False)
 
     def endpoints(self):
         return [*self.others, *self._own]

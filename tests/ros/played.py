@@ -4,7 +4,7 @@ import numpy as np
 
 
 def for_player(path, scans):
-    """Write a robot's scans for ``rclpy_player.py`` and ``rospy_player.py``."""
+    """Write a robot's scans for ``rclpy_player.py``."""
     laser, sweep = scans[0].laser, scans[0].sweep
     np.savez(
         path,
@@ -13,5 +13,4 @@ def for_player(path, scans):
         odometry=[scan.T_odom_base for scan in scans],
         laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
         beam_s=0.0 if sweep is None else sweep.duration_s / (laser.beam_count - 1),
-        mounting_x=laser.T_base_laser[0],
     )

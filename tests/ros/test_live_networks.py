@@ -1,4 +1,4 @@
-"""`fcslam robot` and `fcslam record` against real rclpy and a real roscore: the map of a live robot is that of its bag.
+"""`fcslam robot` and `fcslam record` against real rclpy: the map of a live robot is that of its bag.
 
 `make ros-test` installs what this needs. Other environments skip it.
 """
@@ -19,8 +19,6 @@ import httpx
 import numpy as np
 import pytest
 
-from fcslam.maps.occupancy_map import Occupancy, parse_map
-from fcslam.ros.ros1 import DEBIAN
 from fcslam.sources import write_bag
 from tests import small_fleet
 from tests.robot import spinning
@@ -35,9 +33,6 @@ LONGEST_S = 180.0
 
 needs_rclpy = pytest.mark.skipif(
     not RCLPY.exists() or importlib.util.find_spec("cyclonedds") is None, reason="no rclpy or cyclonedds: make ros-test"
-)
-needs_roscore = pytest.mark.skipif(
-    not Path("/usr/bin/roscore").exists() or not Path(DEBIAN, "tf2_ros").exists(), reason="no rospy: make ros-test"
 )
 pytestmark = pytest.mark.system
 
@@ -117,36 +112,6 @@ def ros2(domain):
 
 def mounting(scans):
     return "--sensors=laser-pose=" + ",".join(map(str, scans[0].laser.T_base_laser))
-
-
-def until_there(port):
-    """Wait until something listens at the port."""
-    end = time.monotonic() + LONGEST_S
-    while True:
-        try:
-            socket.create_connection(("localhost", port)).close()
-            return
-        except ConnectionError:
-            assert time.monotonic() < end
-            time.sleep(0.1)
-
-
-@pytest.fixture
-def roscore():
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        port = probe.getsockname()[1]
-    environment = {"ROS_MASTER_URI": f"http://localhost:{port}", "ROS_HOSTNAME": "localhost"}
-    process = subprocess.Popen(
-        ["/usr/bin/roscore", "-p", str(port)],
-        env={**os.environ, **environment, "PYTHONPATH": ""},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    until_there(port)
-    yield environment
-    process.send_signal(signal.SIGINT)
-    process.wait(10.0)
 
 
 def check_drive(played, scans, output, folder):
@@ -234,39 +199,3 @@ def maps_of(port):
     for robot in httpx.get(f"http://127.0.0.1:{port}/api/v1/robots").json():
         maps.setdefault(robot["map"], set()).add(robot["robot"])
     return maps
-
-
-@needs_roscore
-def test_a_robot_of_ros_1(folder, scans, tmp_path, roscore):
-    robot = fcslam("robot", "ros1:/robot1", mounting(scans), "-o", tmp_path / "run", cwd=tmp_path, **roscore)
-    played = play(sys.executable, "rospy_player.py", folder, **roscore)
-    robot.send_signal(signal.SIGTERM)  # while it writes its run, or when it has written it
-    ended(robot, -signal.SIGTERM)
-    assert played["transforms"] > 0
-    assert played["is_monotone"]
-    assert played["is_known"] == [True, True, False]  # transform_bound and transform_timeout after the last scan
-    assert played["saved"] == f"map saved: {tmp_path / 'robot1.yaml'}"
-    assert played["finished"] == "the drive ends"
-    check_drive(played, scans, tmp_path / "run", folder)
-    saved = parse_map("robot1", *((tmp_path / f"robot1.{kind}").read_bytes() for kind in ("pgm", "yaml")))
-    assert {Occupancy.FREE, Occupancy.OCCUPIED} <= set(saved.cells.ravel())
-
-
-@needs_roscore
-def test_a_recording_of_ros_1(folder, scans, tmp_path, roscore):
-    recorder = fcslam("record", "ros1:/robot1", "-o", tmp_path / "robot1.bag", **roscore)
-    play(sys.executable, "rospy_player.py", folder, **roscore)
-    recorder.send_signal(signal.SIGINT)
-    assert f"{len(scans)} of /robot1/scan" in ended(recorder)
-    ended(fcslam("map", tmp_path / "robot1.bag", mounting(scans), "-o", tmp_path / "run", "-q"))
-    assert np.abs(poses(tmp_path / "run") - poses(folder / "expected")).max() < 1e-3
-
-
-@needs_roscore
-def test_a_missing_roscore_is_one_line():
-    process = fcslam("robot", "ros1:/robot1", ROS_MASTER_URI="http://localhost:9")
-    _, error = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 2
-    assert error.splitlines()[-1] == (
-        "fcslam: no roscore answers at http://localhost:9; start roscore, or set ROS_MASTER_URI"
-    )

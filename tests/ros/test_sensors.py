@@ -43,7 +43,7 @@ class Robot:
         self.said = []
         self.kinds = kinds
         topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info, fixes)
-        self.sensors = LiveSensors(topics, "", BagOptions(**options), False, self.hears_of)
+        self.sensors = LiveSensors(topics, "", BagOptions(**options), self.hears_of)
         self.records = []
         self.now_s = 0.0
 

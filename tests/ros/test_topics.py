@@ -95,7 +95,7 @@ def test_an_empty_network_is_told():
 
 def test_addresses():
     assert parse_address("ros2:/robot1") == RosAddress("ros2", "/robot1")
-    assert parse_address("ros1:/").namespace == parse_address("ros2:").namespace == ""
+    assert parse_address("zenoh:/").namespace == parse_address("ros2:").namespace == ""
     assert parse_address("ros2:/fleet/anna/").robot == "anna"
     with pytest.raises(NetworkError, match="'robot1' is not a namespace; give one as in ros2:/robot1"):
         parse_address("ros2:robot1")

@@ -111,14 +111,14 @@ fcslam show runs/building --html report.html
 fcslam show runs/building/mission.fcslam --port 8350 --no-open
 fcslam robot ros2:/robot1 -o runs/robot1
 fcslam robot ros2:/robot1 --server https://hub --state s --credentials c
-fcslam robot anna=ros1:/robot1 --sensors scan-topic=/front/scan
+fcslam robot anna=ros2:/robot1 --sensors scan-topic=/front/scan
 fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state
 fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c
 fcslam localize today.bag --map runs/building
 fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57
 fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy
 fcslam record ros2:/robot1 -o day.mcap
-fcslam record ros1:/ -o day.bag --duration 600
+fcslam record ros2:/ -o day.mcap --duration 600
 fcslam record robot1.clf.gz -o robot1.bag
 fcslam record robot2.mcap -o robot2.clf.gz --sensors scan-topic=/front/scan
 fcslam serve --data cloud

@@ -34,8 +34,8 @@ def record(
         str,
         typer.Argument(
             metavar="ADDRESS|LOG",
-            help="A live robot: ros2:/NAMESPACE, zenoh:/NAMESPACE or ros1:/NAMESPACE; ros2:/ has none. Or a recording, "
-            "to write it in another format.",
+            help="A live robot: ros2:/NAMESPACE or zenoh:/NAMESPACE; ros2:/ has none. Or a recording, to write it in "
+            "another format.",
         ),
     ],
     *,
@@ -45,7 +45,7 @@ def record(
             "--output",
             "-o",
             metavar="FILE",
-            help="File to write. A live robot: .mcap from ROS 2, .bag from ROS 1. A recording: .clf or .log (and .gz, "
+            help="File to write. A live robot: .mcap. A recording: .clf or .log (and .gz, "
             ".xz, .bz2) a CARMEN log, .bag a ROS 1 bag, .mcap or .db3 a ROS 2 bag, no suffix a ROS 2 bag folder, "
             ".fcslam a recording folder.",
         ),
@@ -78,9 +78,8 @@ def _record(
     from fcslam.sources import BagOptions
 
     _, place = named_address(address)
-    suffix = ".bag" if place.network == "ros1" else ".mcap"
-    if output.suffix != suffix:
-        raise OutputError(f"{output}: a recording of {place.network} is a {suffix} file; choose such a name")
+    if output.suffix != ".mcap":
+        raise OutputError(f"{output}: a recording of a live robot is a .mcap file; choose such a name")
     _prepare(output, force)
     stop = Event()
     with closing(open_network(place)) as network:

@@ -31,8 +31,8 @@ def robot(
         str,
         typer.Argument(
             metavar="ADDRESS",
-            help="The robot: ros2:/NAMESPACE, zenoh:/NAMESPACE or ros1:/NAMESPACE, without a namespace ros2:/. The "
-            "namespace names the robot; NAME=ADDRESS gives another name.",
+            help="The robot: ros2:/NAMESPACE or zenoh:/NAMESPACE, without a namespace ros2:/. The namespace names the "
+            "robot; NAME=ADDRESS gives another name.",
         ),
     ],
     *,

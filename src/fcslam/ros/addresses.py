@@ -8,7 +8,7 @@ from typing import NamedTuple
 from fcslam.errors import NetworkError
 from fcslam.ros.network import RosNetwork
 
-_ADDRESS = re.compile(r"(ros[12]|zenoh):(.*)", re.ASCII)
+_ADDRESS = re.compile(r"(ros2|zenoh):(.*)", re.ASCII)
 _NAMESPACE = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)*", re.ASCII)
 _LARGEST_DOMAIN = 232
 
@@ -17,7 +17,7 @@ class RosAddress(NamedTuple):
     """A robot on a ROS network."""
 
     network: str
-    """``ros1``, ``ros2`` (over DDS) or ``zenoh`` (ROS 2 over Zenoh)."""
+    """``ros2`` (over DDS) or ``zenoh`` (ROS 2 over Zenoh)."""
     namespace: str
     """Empty, or with a leading slash and without one at the end."""
 
@@ -54,10 +54,6 @@ def open_network(address: RosAddress, environment: Mapping[str, str] = os.enviro
     Raises:
         NetworkError: the domain is out of range, the middleware is missing, or the network cannot be joined.
     """
-    if address.network == "ros1":
-        from fcslam.ros.ros1 import Ros1Network
-
-        return Ros1Network()
     text = environment.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
         raise NetworkError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")

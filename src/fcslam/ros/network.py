@@ -45,7 +45,7 @@ class Endpoint(NamedTuple):
     topic: str
     """With a leading slash."""
     kind: str
-    """Type of the messages as in ROS 1, without ``msg/``."""
+    """Type of the messages, without ``msg/``."""
     publishes: bool
     quality: Quality
     own: bool = False
@@ -54,9 +54,6 @@ class Endpoint(NamedTuple):
 
 class RosNetwork(Protocol):
     """A connection to a ROS network."""
-
-    ros1: bool
-    """Whether messages are in the format of ROS 1."""
 
     def endpoints(self) -> Sequence[Endpoint]:
         """The publishers and subscriptions that are known now."""

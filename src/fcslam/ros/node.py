@@ -115,7 +115,7 @@ class RobotNode:
         self._map_topic = resolved(namespace, MAP)
         self._robot, self._parameters, self._notify = robot, parameters, notify
         self._suggest_pose, self._change_floor = suggest_pose, change_floor
-        self._codec = MessageCodec(network.ros1)
+        self._codec = MessageCodec(ros1=False)
         self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
         self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
         self._stop = threading.Event()
@@ -134,7 +134,7 @@ class RobotNode:
         self._transforms = TransformStream(
             nanoseconds(parameters.transform_bound), nanoseconds(parameters.transform_timeout)
         )
-        self.sensors = LiveSensors(topics, namespace, options, network.ros1, self._tell_once)
+        self.sensors = LiveSensors(topics, namespace, options, self._tell_once)
         self._restarts = 0
         self._subscribe()
 

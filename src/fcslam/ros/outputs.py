@@ -92,7 +92,7 @@ class Outputs:
     def __init__(self, network: RosNetwork, namespace: str, map_frame: str, tf: str) -> None:
         """``tf``: topic of the transforms; those without a leading slash are in the namespace."""
         self._network, self._namespace, self._map_frame, self._tf = network, namespace, map_frame, tf
-        self._codec = MessageCodec(network.ros1)
+        self._codec = MessageCodec(ros1=False)
         self._lock = threading.Lock()
         self._publishers: dict[str, Publish] = {}
         """By topic; new ones are made under the lock."""
@@ -314,7 +314,9 @@ class Outputs:
     ) -> Any:
         """A marker of points (..., 2), metres in ``map``."""
         make, vector = self._codec.make, self._codec.vector
-        mesh = {} if self._codec.ros1 else self._new_fields(make)
+        image = make(
+            "sensor_msgs/CompressedImage", header=self._codec.header(0, ""), format="", data=np.zeros(0, np.uint8)
+        )
         r, g, b = colour
         return make(
             "visualization_msgs/Marker",
@@ -330,19 +332,14 @@ class Outputs:
             frame_locked=False,
             points=[vector("Point", x, y) for x, y in points.reshape(-1, 2).tolist()],
             colors=[],
+            texture_resource="",
+            texture=image,
+            uv_coordinates=[],
             text="",
             mesh_resource="",
+            mesh_file=make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8)),
             mesh_use_embedded_materials=False,
-            **mesh,
         )
-
-    def _new_fields(self, make: Any) -> dict[str, Any]:
-        """Fields of a marker that ROS 1 does not have."""
-        image = make(
-            "sensor_msgs/CompressedImage", header=self._codec.header(0, ""), format="", data=np.zeros(0, np.uint8)
-        )
-        mesh = make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8))
-        return {"texture_resource": "", "texture": image, "uv_coordinates": [], "mesh_file": mesh}
 
     def _grid_message(self, stamp_ns: int, grid: Grid) -> Any:
         height, width = grid.values.shape

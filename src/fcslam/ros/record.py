@@ -1,12 +1,11 @@
 """Records what a robot publishes into a file that `fcslam map` reads: the messages as they come, undecoded."""
 
-import os
 import queue
 import threading
 import time
 from collections import Counter
 from contextlib import suppress
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -56,7 +55,7 @@ def record(
     kept = ""
     try:
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
-            recording = _Recording(Path(staging, output.stem), network.ros1)
+            recording = _Recording(Path(staging, output.stem))
             try:
                 recording.writer.open()
                 while not stop.is_set() or not inbox.is_empty:
@@ -129,21 +128,16 @@ class _Inbox:
 
 
 class _Recording:
-    """A bag of raw messages: MCAP of ROS 2, or a bag of ROS 1."""
+    """A bag (MCAP) of raw messages."""
 
-    def __init__(self, place: Path, ros1: bool) -> None:
-        from rosbags import rosbag1, rosbag2
+    def __init__(self, place: Path) -> None:
+        from rosbags import rosbag2
 
-        self._ros1, self._store = ros1, typestore(ros1)
+        self._store = typestore(ros1=False)
         self._connections: dict[str, Any] = {}
         self._latest_ns = 0
-        self.writer: Any
-        if ros1:
-            self.writer = rosbag1.Writer(place)
-            self.file = place
-        else:
-            self.writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
-            self.file = place / f"{place.name}.mcap"
+        self.writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        self.file = place / f"{place.name}.mcap"
 
     def rescue(self, error: BaseException) -> bool:
         """End the file after an error, and return whether it holds messages.
@@ -157,7 +151,7 @@ class _Recording:
         with suppress(Exception):
             self.writer.abort()
         try:
-            return _end_bag(self.writer) if self._ros1 else end_mcap(self.file)
+            return end_mcap(self.file)
         except OSError:
             return self.file.exists()
 
@@ -167,21 +161,3 @@ class _Recording:
             self._connections[topic] = self.writer.add_connection(topic, full_name(kind), typestore=self._store)
         self._latest_ns = max(self._latest_ns, received_ns)
         self.writer.write(self._connections[topic], self._latest_ns, payload)
-
-
-def _end_bag(writer: Any) -> bool:
-    """Cut a ROS 1 bag that was not closed after its last whole chunk and write its index; whether it has messages.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    size = writer.path.stat().st_size
-    whole = [(chunk, after.pos) for chunk, after in pairwise(writer.chunks) if -1 < after.pos <= size]
-    if not whole:
-        return False
-    os.truncate(writer.path, whole[-1][1])
-    writer.chunks = [chunk for chunk, _ in whole]
-    writer.bio = writer.path.open("r+b")
-    writer.bio.seek(0, os.SEEK_END)
-    writer.close()
-    return True

@@ -42,8 +42,6 @@ _PEER = re.compile(r"[\w.:-]+", re.ASCII)
 class Ros2Network:
     """A participant of one DDS domain. A process has at most one for each domain."""
 
-    ros1 = False
-
     def __init__(self, domain: int, environment: Mapping[str, str] = os.environ) -> None:
         """Join ``domain``.
 

@@ -45,8 +45,6 @@ _ENDPOINTS_KNOWN = 10_000
 class ZenohNetwork:
     """A session of Zenoh that takes part in one domain of ROS 2."""
 
-    ros1 = False
-
     def __init__(self, domain: int, environment: Mapping[str, str] = os.environ) -> None:
         """Join ``domain`` at a router; the environment configures the session as it does that of rmw_zenoh.
 

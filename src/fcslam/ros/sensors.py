@@ -23,7 +23,6 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     LASER_SCANS,
     ODOMETRY,
-    OLD_TRANSFORMS,
     TRANSFORMS,
     MessageCodec,
 )
@@ -97,7 +96,7 @@ Notify = Callable[[str], None]
 class LiveSensors:
     """Reads the messages of one robot, one at a time."""
 
-    def __init__(self, topics: SensorTopics, namespace: str, options: BagOptions, ros1: bool, notify: Notify) -> None:
+    def __init__(self, topics: SensorTopics, namespace: str, options: BagOptions, notify: Notify) -> None:
         """``namespace`` is "" or begins with a slash."""
         self.audit = Audit("message")
         """Faults so far."""
@@ -111,7 +110,7 @@ class LiveSensors:
         """Stamp of the newest scan that was read."""
         self._topics, self._options, self._notify = topics, options, notify
         self._prefix = namespace.strip("/")
-        self._codec = MessageCodec(ros1)
+        self._codec = MessageCodec(ros1=False)
         self._tree = TransformTree()
         self._has_odometry = self._is_camera_ahead = False
         self._edge: Link | None = None
@@ -214,7 +213,7 @@ class LiveSensors:
                 return True
             self._next_image_s = now_s + RAW_IMAGE_PERIOD_S
         # Once the mountings are known, tf has nothing but the odometry.
-        return self._rig is not None and self._topics.odometry is not None and kind in (TRANSFORMS, OLD_TRANSFORMS)
+        return self._rig is not None and self._topics.odometry is not None and kind == TRANSFORMS
 
     def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
         """The fix in a message, once the mounting is known."""

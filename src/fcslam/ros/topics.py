@@ -12,7 +12,6 @@ from fcslam.sources.bags.codec import (
     FIX,
     IMAGE,
     ODOMETRY,
-    OLD_TRANSFORMS,
     POINT_CLOUD,
     SCAN,
     SCANS,
@@ -99,7 +98,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
         odometry = min(candidates, key=lambda topic: (last_part(topic) != "odom", topic), default=None)
         notes += _note("odometry", "--sensors odom-topic", odometry, candidates)
     else:
-        named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+        named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS)
     own_or_common = {f"{namespace}/{name}": f"/{name}" for name in (TF, TF_STATIC)}  # they may appear later
     transforms = tuple(own if own in known else common for own, common in own_or_common.items())
     if odometry is not None and known[odometry] != ODOMETRY:
