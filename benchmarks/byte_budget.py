@@ -23,7 +23,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
 from fcslam.errors import EvaluationError
-from fcslam.lab.evaluation.fleet.relations import evaluate_relations
+from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.budget import Budget

@@ -24,8 +24,8 @@ import numpy as np
 from relation_closures import evaluate_closures
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.lab.evaluation.fleet.closures import ClosureScope
-from fcslam.lab.evaluation.fleet.relations import evaluate_relations
+from fcslam.lab.evaluation.closures import ClosureScope
+from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend

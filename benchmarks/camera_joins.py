@@ -21,13 +21,13 @@ import numpy as np
 from closure_learning import ROBOTS, TEST, recorded
 
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
-from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+from fcslam.lab.evaluation.report import evaluate_fleet
 from fcslam.metrics.bootstrap import mean_interval
 from fcslam.mission.mission import MissionCloud, MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, FloatArray
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.views import ViewsConfig
-from fcslam.sources import Recording
+from fcslam.sources import open_source
 
 ROWS = {"network": "", "building": ".0f", "maps": ".0f", "false joins": ".0f", "accepted closures": ".0f",
         "driven, m": ".1f", "path, m": ".1f"}  # fmt: skip
@@ -75,7 +75,7 @@ def mapped(name: str, network: Path, seed: int, fleets: Path) -> list[tuple]:
     folder, watch = recorded(seed, len(ROBOTS), fleets), JoinWatch()
     views = ViewsConfig(onnx=OnnxConfig(weights=network))
     config = MissionConfig(robot=RobotConfig(channels=(Channel.CAMERA,), views=views))
-    run = run_mission([Recording(folder / robot, robot) for robot in ROBOTS], config, live=watch)
+    run = run_mission([open_source(folder / robot, name=robot) for robot in ROBOTS], config, live=watch)
     paths = {robot: path_m(run.local_maps[robot].T_local_base) for robot in ROBOTS}
     with tempfile.TemporaryDirectory() as place:
         run.save(Path(place), force=True)

@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 import fcslam
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.relations import pose_table
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.lidar.scan import point_scan

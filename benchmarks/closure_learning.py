@@ -43,21 +43,19 @@ from pathlib import Path
 import common
 import numpy as np
 import torch
-from federated_study.mapped_drives import MappedDrive, map_drives
-from federated_study.poison import PoisonedClient
+from evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detectors, find_scenes
+from evaluation.federated.mapped_drives import MappedDrive, map_drives
+from evaluation.federated.poison import PoisonedClient
+from evaluation.fleet_views import GROUND_TRUTH, lidar_overlap
+from evaluation.homography import HomographyGroundTruth, evaluate_homography, mean
+from evaluation.retrieval import PairTruth, multi_match_curve
+from evaluation.view_overlap import OTHER_OVERLAP, SAME_OVERLAP
 from matplotlib.figure import Figure
 
 from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.lidar_depth import LidarView
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.lab.evaluation.detectors.homography import evaluate_homography
-from fcslam.lab.evaluation.detectors.measures import mean
-from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.lab.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
-from fcslam.lab.evaluation.places.simulated_views import lidar_overlap
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
@@ -81,14 +79,13 @@ from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
 from fcslam.metrics.bootstrap import Interval, mean_interval
-from fcslam.metrics.homography import HomographyGroundTruth
-from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import CameraImage, CameraModel, Channel, FloatArray, LaserScan
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.views import EVERY_M, EVERY_RAD
-from fcslam.sources import Recording
+from fcslam.runs import read_tum
+from fcslam.sources import open_source
 
 TRAIN, TEST, SEEDS = tuple(range(301, 311)), tuple(range(411, 421)), (1, 2, 3)
 ROBOTS = ("robot_1", "robot_2", "robot_3")
@@ -236,7 +233,7 @@ def fleet_examples(folder: Path, kept: Path) -> Fleet:
     file = kept / f"drives-{folder.name}.pickle"
     if not file.exists():
         config = MissionConfig(robot=RobotConfig(channels=(Channel.CAMERA,)))
-        sources = [Recording(folder / name, name) for name in ROBOTS]
+        sources = [open_source(folder / name, name=name) for name in ROBOTS]
         file.write_bytes(pickle.dumps(map_drives(sources, config, OnnxDetector(OnnxConfig()))))
     examples = kept / f"examples-{folder.name}-{common.commit()}.pickle"
     if not examples.exists():
@@ -400,7 +397,7 @@ def building_row(
 def photograph_rows(arm: str, seed: int, networks: Sequence[Path | None]) -> list[tuple]:
     """Measures on photographs: the mean over the networks of an arm."""
     vision = common.recordings(*SCENES, kind="vision")
-    detectors = choose_detectors([EvaluatedDetectorKind.ONNX], [path or BUNDLED_NETWORK for path in networks], [])
+    detectors = choose_detectors([EvaluatedDetectorKind.ONNX], [path or BUNDLED_NETWORK for path in networks])
     report = evaluate_homography(
         find_scenes([vision / name for name in SCENES]), detectors, HomographyGroundTruth.CORRECTED
     )
@@ -422,11 +419,9 @@ def views_of(folder: Path, names: tuple[str, ...]) -> tuple[list[TrueView], Floa
 
 def true_views(folder: Path) -> Iterator[TrueView]:
     """The images of a robot a metre or half a radian apart, with the scan before each and the true poses."""
-    recording = Recording(folder, folder.name)
-    truth = list(recording.ground_truth())
-    stamps, poses = np.array([t.stamp for t in truth]), np.array([t.T_building_base for t in truth])
+    stamps, poses = read_tum(folder / GROUND_TRUTH)
     scan, last = None, None
-    for record in recording.records():
+    for record in open_source(folder).records():
         if isinstance(record, LaserScan):
             scan = record
         elif isinstance(record, CameraImage) and scan is not None:

@@ -31,17 +31,22 @@ import common
 import cv2
 import numpy as np
 from closure_learning import FORGETTING, Learner, federated, photograph_rows, ranked, trained_here
+from evaluation.place_features import (
+    DescribedSet,
+    FeatureChoice,
+    PairVerifier,
+    choose_features,
+    describe_images,
+    strategy_scorer,
+)
+from evaluation.place_sets import PlaceSet, read_place_set
+from evaluation.places import evaluate_set
+from evaluation.retrieval import PairTruth
+from evaluation.view_overlap import DEPTH_AGREEMENT, read_sequence, view_overlap
+from evaluation.view_overlap import Sequence as TumSequence
 
 from fcslam.features.detector import BUNDLED_NETWORK, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.files import read_grey
-from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_images
-from fcslam.lab.evaluation.places.report import evaluate_set
-from fcslam.lab.evaluation.places.scoring import DescribedSet, strategy_scorer
-from fcslam.lab.evaluation.places.sets import PlaceSet, read_place_set
-from fcslam.lab.evaluation.places.tum_sequence import Sequence as TumSequence
-from fcslam.lab.evaluation.places.tum_sequence import read_sequence
-from fcslam.lab.evaluation.places.verification import PairVerifier
-from fcslam.lab.evaluation.places.view_overlap import DEPTH_AGREEMENT, view_overlap
 from fcslam.learning.code_batches import RevisitExamples, RevisitPair
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
@@ -51,7 +56,6 @@ from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.revisits import BORDER_PX, FEWEST_SHARED, correspond_predicted
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.metrics.bootstrap import Interval, mean_interval
-from fcslam.metrics.retrieval import PairTruth
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
 

@@ -17,7 +17,7 @@ import common
 import numpy as np
 from relation_closures import ClosureReport, evaluate_closures
 
-from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureScope
+from fcslam.lab.evaluation.closures import STAGES, ClosureScope
 
 SETS = {"log": "", "closures": "", "stage": ""}
 COUNTS = {**SETS, "all": "", "covered": "", "coverage": ".1%", "wrong": "", "precision": ".2%", "revisits": "",

@@ -19,7 +19,7 @@ Codes: of points of 32 pairs of held-out images: bits that differ between differ
 views of a point; bits that are equal at 98 % of the points; points whose nearest code in the other view is their own.
 
 Development tables: copies of held-out photographs of a corridor, a desk and a tower under random homographies
-(`made_pairs.py`), and eight pairs of "homogr" (Lebeda et al.), with the scales of `fcslam evaluate homography`.
+(`made_pairs.py`), and eight pairs of "homogr" (Lebeda et al.), with the scales of `benchmarks/homography.py`.
 They choose a network; `homography.py` then measures this one on its 25 pairs.
 """
 
@@ -315,13 +315,9 @@ def codes(network: KeypointNetwork, batch: TrainingBatch) -> tuple[float, float,
 
 def measure(chosen: Any) -> None:
     """The report of networks that are trained."""
+    from evaluation.detectors import EvaluatedDetectorKind, choose_detectors, find_scenes
+    from evaluation.homography import MATCHING_NMS_PX, evaluate_homography, mean
     from made_pairs import MEASURES, make_scenes  # a machine that trains may lack what measures
-
-    from fcslam.features.detector_kinds import EvaluatedDetectorKind
-    from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-    from fcslam.lab.evaluation.detectors.homography import MATCHING_NMS_PX, evaluate_homography
-    from fcslam.lab.evaluation.detectors.measures import mean
-    from fcslam.lab.evaluation.detectors.scenes import find_scenes
 
     report = common.Report(__file__, __doc__ or "", chosen)
     vision = common.recordings(*PLANES, kind="vision")
@@ -337,7 +333,7 @@ def measure(chosen: Any) -> None:
             (f"Development: {2 * MADE_IMAGES} made pairs", make_scenes(vision, Path(made), MADE_IMAGES)),
             ("Development: eight pairs of homogr", [vision / name for name in PLANES]),
         ):
-            detectors = choose_detectors([EvaluatedDetectorKind.ONNX], list(weights.values()), [])
+            detectors = choose_detectors([EvaluatedDetectorKind.ONNX], list(weights.values()))
             found = evaluate_homography(find_scenes(scenes), detectors)
             rows = [
                 (name, nms_px, *(mean(found.of(detector.name), f"{each}_nms{nms_px}") for each in MEASURES.values()))

@@ -15,20 +15,20 @@ from pathlib import Path
 import common
 import cv2
 import numpy as np
+from evaluation.detectors import (
+    EvaluatedDetector,
+    EvaluatedDetectorKind,
+    FramedImage,
+    choose_detectors,
+    find_scenes,
+    frame,
+    one_thread,
+)
+from evaluation.homography import LARGE, described, match_pair
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from fcslam.features.detector import GreyImage
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
-from fcslam.lab.evaluation.detectors.evaluated_detectors import (
-    EvaluatedDetector,
-    FramedImage,
-    choose_detectors,
-    frame,
-    one_thread,
-)
-from fcslam.lab.evaluation.detectors.homography import LARGE, described, match_pair
-from fcslam.lab.evaluation.detectors.scenes import find_scenes
 
 SCENES = ("oxford_affine", "hpatches_subset")
 DETECTORS = [name for name in EvaluatedDetectorKind if name is not EvaluatedDetectorKind.LOGITS]
@@ -46,7 +46,7 @@ def main() -> None:
     report = common.Report(__file__, __doc__ or "", chosen)
     folder = common.recordings(*SCENES, kind="vision")
     pictures = [frame(scene.reference, LARGE) for scene in find_scenes([folder / name for name in SCENES])]
-    detectors = choose_detectors(DETECTORS, chosen.weights, [])
+    detectors = choose_detectors(DETECTORS, chosen.weights)
     with one_thread():
         columns = {"": "s"} | {f"{shift} px": ".3f" for shift in SHIFTS_PX}
         report.table("Shift: keypoints found again", columns, [_shift_row(each, pictures) for each in detectors])

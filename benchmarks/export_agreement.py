@@ -13,13 +13,12 @@ from pathlib import Path
 
 import common
 import numpy as np
+from evaluation.detectors import Scene, find_scenes, frame, one_thread
+from evaluation.homography import LARGE, MATCHED
 from homography import SCENES
 
 from fcslam.features.dense import Logits, Probabilities, sample_codes
 from fcslam.features.detector import GreyImage, OnnxConfig, OnnxDetector
-from fcslam.lab.evaluation.detectors.evaluated_detectors import frame, one_thread
-from fcslam.lab.evaluation.detectors.homography import LARGE, MATCHED
-from fcslam.lab.evaluation.detectors.scenes import Scene, find_scenes
 
 Network = Callable[[GreyImage], tuple[Probabilities, Logits]]
 BITS = {"compared": "s", "images": "d", "codes": "d", "bits that differ, %": ".4f", "in the worst image, %": ".4f",

@@ -44,7 +44,7 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
-    from federated_study.study import StudyResults
+    from evaluation.federated.study import StudyResults
     from training_fleet import Rows
 
 PUBLIC = "sun_hays80"
@@ -168,7 +168,7 @@ def places() -> list[tuple[str, str]]:
 
 def home_rows(findings: "StudyResults", own: Iterable[str]) -> Iterator[tuple[object, ...]]:
     """What robots' own networks make of their own images, and of others', beside the networks that all have."""
-    from federated_study.pairs import MEASURES
+    from evaluation.federated.pairs import MEASURES
 
     owners = np.array(findings.owners)
     everybody = {arm: np.nanmean(findings.measured[arm], axis=(0, 1)) for arm in ("central", "together")}

@@ -19,18 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import common
+from evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detectors, find_scenes
+from evaluation.homography import HomographyGroundTruth, difference, evaluate_homography, mean
 from training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
-from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.lab.evaluation.detectors.homography import evaluate_homography
-from fcslam.lab.evaluation.detectors.measures import difference, mean
-from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.metrics.homography import HomographyGroundTruth
 
 if TYPE_CHECKING:
-    from fcslam.lab.evaluation.detectors.homography import HomographyReport
+    from evaluation.homography import HomographyReport
 
 SCENES = ("oxford_affine", "hpatches_subset")
 ROUNDS, PAIRS, IMAGES = 40, 1000, 64
@@ -67,7 +63,7 @@ def main() -> None:
     for measure, title in (TITLES | OTHERS).items():
         report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED])
     networks = [BUNDLED_NETWORK, *(exported(folder / "shipped" / "seed1", arm) for arm in COMPARED[1:])]
-    detectors = choose_detectors([EvaluatedDetectorKind.ONNX], networks, [])
+    detectors = choose_detectors([EvaluatedDetectorKind.ONNX], networks)
     scenes = find_scenes([vision / name for name in SCENES])
     measured = evaluate_homography(scenes, detectors, HomographyGroundTruth.CORRECTED)
     report.table("Photographs of elsewhere", ELSEWHERE, elsewhere_rows(measured))

@@ -17,7 +17,9 @@ from typing import Any
 
 import common
 import numpy as np
-from vocabulary_growth import (
+from evaluation.place_features import FeatureChoice, choose_features, describe_sets, describe_training
+from evaluation.places import COLOURS, panel_figure, save
+from evaluation.vocabulary_growth import (
     BATCH,
     MEASURES,
     Arrival,
@@ -29,8 +31,6 @@ from vocabulary_growth import (
     grow_vocabulary,
 )
 
-from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.lab.evaluation.places.report import COLOURS, panel_figure, save
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import FloatArray

@@ -23,7 +23,7 @@ from pathlib import Path
 import common
 
 from fcslam.config import load
-from fcslam.lab.evaluation.fleet.report import evaluate_fleet
+from fcslam.lab.evaluation.report import evaluate_fleet
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import Run

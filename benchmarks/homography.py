@@ -1,6 +1,7 @@
 """Detectors on scenes with known homographies, corrected and legacy ground truth.
 
     FCSLAM_DATA=/path/to/data python benchmarks/homography.py [--weights detector.onnx ...]
+    python benchmarks/homography.py --scenes hpatches --csv pairs.csv
 
 Four scenes of the Oxford affine set and one of HPatches, at most 640 pixels wide: 25 pairs, so differences of a few
 hundredths are chance; intervals are 95 % by bootstrap over pairs, those of differences paired. NMS 0: keypoints as the
@@ -16,19 +17,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import common
-
-from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.lab.evaluation.detectors.homography import (
+from evaluation.detectors import SceneKind, choose_detectors, find_scenes
+from evaluation.homography import (
     LARGE,
     MATCHING_NMS_PX,
     SMALL,
+    HomographyGroundTruth,
     HomographyReport,
+    difference,
     evaluate_homography,
+    interval,
+    mean,
+    write_pairs,
 )
-from fcslam.lab.evaluation.detectors.measures import difference, interval, mean
-from fcslam.lab.evaluation.detectors.scenes import SceneKind, find_scenes
+
 from fcslam.metrics.bootstrap import Interval
-from fcslam.metrics.homography import HomographyGroundTruth
 
 SCENES = ("oxford_affine", "hpatches_subset")
 SEED = 1
@@ -49,16 +52,19 @@ BY_SCENE = {"scene": "s", "": "s", "repeatability": SHARE} | {
 def main() -> None:
     parser = common.options(__doc__ or "")
     parser.add_argument("--weights", nargs="+", type=Path, default=[], help="networks, if not the one of fcslam")
+    parser.add_argument("--scenes", nargs="+", type=Path, help="folders of other scenes, in the layout of HPatches")
+    parser.add_argument("--csv", type=Path, help="file for all measures of all pairs")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
-    folder = common.recordings(*SCENES, kind="vision")
-    scenes = find_scenes([folder / name for name in SCENES])
-    detectors = choose_detectors([], chosen.weights, [])
+    scenes = find_scenes(chosen.scenes or [common.recordings(*SCENES, kind="vision") / name for name in SCENES])
+    detectors = choose_detectors([], chosen.weights)
     for truth in HomographyGroundTruth:
         measured = evaluate_homography(scenes, detectors, truth)
         report.table(f"Repeatability, {truth}", REPEATABILITY, _repeatability(measured))
         report.table(f"Homography and matching, {truth}", MATCHING, _matching(measured))
         if truth is HomographyGroundTruth.CORRECTED:
+            if chosen.csv is not None:
+                write_pairs(measured, chosen.csv)
             report.table(f"Bits less logits, {truth}", BITS, _bits_less_logits(measured))
             report.table(f"Scene by scene, {truth}", BY_SCENE, _by_scene(measured))
     report.write()

@@ -37,7 +37,7 @@ import fcslam
 from fcslam import sources
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.relations import evaluate_relations
+from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap

@@ -16,13 +16,10 @@ from pathlib import Path
 import common
 import cv2
 import numpy as np
+from evaluation.detectors import EvaluatedDetectorKind, choose_detectors, find_scenes
+from evaluation.homography import MATCHING_NMS_PX, HomographyReport, difference, evaluate_homography, interval, mean
 
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_grey
-from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-from fcslam.lab.evaluation.detectors.homography import MATCHING_NMS_PX, HomographyReport, evaluate_homography
-from fcslam.lab.evaluation.detectors.measures import difference, interval, mean
-from fcslam.lab.evaluation.detectors.scenes import find_scenes
 from fcslam.learning.warps import random_change, relight, warp_image
 from fcslam.metrics.bootstrap import Interval
 
@@ -52,7 +49,7 @@ def main() -> None:
     folder = common.recordings(*SOURCES, kind="vision")
     with tempfile.TemporaryDirectory() as made:
         scenes = make_scenes(folder, Path(made), IMAGES)
-        measured = evaluate_homography(find_scenes(scenes), choose_detectors(DETECTORS, chosen.weights, []))
+        measured = evaluate_homography(find_scenes(scenes), choose_detectors(DETECTORS, chosen.weights))
     columns = {"": "s", "NMS": "d", "repeatability": "s"} | dict.fromkeys(MEASURES, "s")
     report.table("Homography and matching", columns, _rows(measured))
     columns = {"": "s", "NMS": "d"} | dict.fromkeys(MEASURES, "s")

@@ -17,13 +17,12 @@ from typing import NamedTuple
 
 import common
 import numpy as np
+from evaluation.fleet_views import read_fleet_views
+from evaluation.place_features import DescribedSet, FeatureChoice, choose_features, describe_sets, index_scores
+from evaluation.place_sets import FLEET
+from evaluation.retrieval import recall_at, single_best
 
-from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets
-from fcslam.lab.evaluation.places.scoring import DescribedSet, index_scores
-from fcslam.lab.evaluation.places.sets import FLEET
-from fcslam.lab.evaluation.places.simulated_views import read_fleet_views
 from fcslam.metrics.bootstrap import mean_interval
-from fcslam.metrics.retrieval import recall_at, single_best
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray

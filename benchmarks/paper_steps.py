@@ -31,9 +31,11 @@ import common
 import numpy as np
 import simulated_fleet
 import yaml
+from evaluation.fleet_views import judge_views
 
 from fcslam.lab.presets import Preset
 from fcslam.metrics.bootstrap import mean_interval
+from fcslam.records import ClosureStatus
 
 
 class Step(NamedTuple):
@@ -126,7 +128,7 @@ def measures(run: Path, fleet: Path, picture: Path | None = None) -> tuple[float
         common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result, *drawn)
         found = simulated_fleet.read(result)
     robots = [f"robot_{k + 1}" for k in range(simulated_fleet.ROBOTS)]
-    matches, views = "inter_robot_verified_both", "inter_robot_verified_camera_views"
+    matches, views = "inter_robot_verified_both", judge_views(run, fleet)[ClosureStatus.VERIFIED]
     return (
         found["joins"] - found["false_joins"],
         found["false_joins"],
@@ -134,9 +136,9 @@ def measures(run: Path, fleet: Path, picture: Path | None = None) -> tuple[float
         found["map_f1"],
         found[f"{matches}_closures"],
         found[f"{matches}_wrong"],
-        found[f"{views}_judged"],
-        found[f"{views}_same"],
-        found[f"{views}_different"],
+        views.judged,
+        views.same,
+        views.different,
         found[f"{matches}_recall"],
         sum(found[f"uplink_bytes_{robot}"] for robot in robots) / len(robots) / 1e3,
     )

@@ -17,11 +17,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import common
+from evaluation.place_features import (
+    DescribedSet,
+    FeatureChoice,
+    PairVerifier,
+    choose_features,
+    choose_scorers,
+    describe_sets,
+    describe_training,
+)
+from evaluation.places import SetResult, curves_figure, evaluate_set
 
-from fcslam.lab.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.lab.evaluation.places.report import SetResult, curves_figure, evaluate_set
-from fcslam.lab.evaluation.places.scoring import DescribedSet, choose_scorers
-from fcslam.lab.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes

@@ -18,7 +18,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.lab.evaluation.fleet.relations import evaluate_relations
+from fcslam.lab.evaluation.relations import evaluate_relations
 
 CASES = (*((name, 1) for name in common.SPLITS), ("intel", 3))
 TITLE = "Figures"

@@ -20,8 +20,8 @@ from fcslam.geometry import se2
 from fcslam.graph.initialization import initialize_robust
 from fcslam.graph.optimizer import optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lab.evaluation.fleet.closures import STAGES, ClosureScope, closure_rows, closure_sets
-from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.closures import STAGES, ClosureScope, closure_rows, closure_sets
+from fcslam.lab.evaluation.relations import pose_table
 from fcslam.metrics.closures import (
     WITHIN_GAP_S,
     ClosureErrors,

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import common
 
-from fcslam.lab.evaluation.fleet.relations import evaluate_relations
+from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.lidar.frontend import Tracker
 from fcslam.metrics.relations import RelationErrors
 

@@ -20,7 +20,7 @@ import common
 import numpy as np
 from robustness import Recording
 
-from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.relations import pose_table
 from fcslam.metrics.relations import read_relations, relation_errors
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserScan, frozen

@@ -22,7 +22,7 @@ import common
 import numpy as np
 from robustness import Recording
 
-from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.relations import pose_table
 from fcslam.lab.simulation.noise import SCANNERS, LidarSettings
 from fcslam.lab.simulation.odometry import KINDS
 from fcslam.lab.simulation.options import OdometryKind, Scanner

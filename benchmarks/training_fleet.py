@@ -10,8 +10,8 @@ import common
 from fcslam.metrics.bootstrap import Interval
 
 if TYPE_CHECKING:
-    from federated_study.report import ArmReport
-    from federated_study.study import StudyResults
+    from evaluation.federated.report import ArmReport
+    from evaluation.federated.study import StudyResults
 
     Rows = dict[tuple[str, str], ArmReport]
     """By measure and arm."""
@@ -35,7 +35,7 @@ def robots(vision: Path, folder: Path) -> dict[str, Path]:
 def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> "StudyResults":
     """Train and measure whatever is missing of a study in a folder; ``content``: further fields of ``Study``."""
     import torch
-    from federated_study.study import Arm, Study, run_study
+    from evaluation.federated.study import Arm, Study, run_study
 
     from fcslam.learning.federated.settings import FederatedSettings
 
@@ -52,7 +52,7 @@ def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> 
 
 def compare(findings: "StudyResults", against: str) -> "Rows":
     """Every arm by every measure, compared to one."""
-    from federated_study.report import report
+    from evaluation.federated.report import report
 
     return {(row.measure, row.arm): row for row in report(findings, against=against)}
 

@@ -140,7 +140,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     Run({}).save(tmp_path / "run")
-    monkeypatch.setattr("fcslam.lab.evaluation.fleet.relations.read_relations", interrupted)
+    monkeypatch.setattr("fcslam.lab.evaluation.relations.read_relations", interrupted)
     assert main(["evaluate", "relations", str(tmp_path / "run"), "relations"]) == 130
     assert capsys.readouterr().err.strip() == "fcslam: interrupted"
 

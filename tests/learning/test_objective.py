@@ -6,10 +6,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.learning.batches import collate  # noqa: E402
+from fcslam.learning.homography import warp  # noqa: E402
 from fcslam.learning.labels import Labels  # noqa: E402
 from fcslam.learning.objective import views_aligned  # noqa: E402
 from fcslam.learning.pairs import TrainingExample, draw_pair  # noqa: E402
-from fcslam.metrics.homography import warp  # noqa: E402
 from tests.learning.textures import textured  # noqa: E402
 
 SIZE = (120, 96)

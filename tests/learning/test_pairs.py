@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from fcslam.learning.homography import inverse, warp
 from fcslam.learning.labels import Labels, Teacher
 from fcslam.learning.pairs import TrainingExample, draw_pair, splat_points
 from fcslam.learning.warps import random_change, random_view, relight, visible_mask, warp_image, well_inside
-from fcslam.metrics.homography import inverse, warp
 from tests.learning.textures import textured
 
 SIZE = (96, 80)

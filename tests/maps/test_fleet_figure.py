@@ -10,7 +10,7 @@ import pytest
 from fcslam.cli import main
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.charts import fleet_charts
+from fcslam.lab.evaluation.charts import fleet_charts
 from fcslam.maps import palette
 from fcslam.maps.fleet_figure import (
     MATCHES_DRAWN,

@@ -110,7 +110,7 @@ def _prepare(output: Path) -> None:
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.fleet.charts import fleet_charts
+    from fcslam.lab.evaluation.charts import fleet_charts
     from fcslam.lab.simulation.floorplan import PieceKind
     from fcslam.maps.fleet_figure import Outline, write_figure
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-RUNS, RECORDINGS, FEATURES, TRAINING, EVALUATIONS = "runs", "recordings", "features", "training", "evaluations"
+RUNS, RECORDINGS, FEATURES, TRAINING = "runs", "recordings", "features", "training"
 CHANGES = "changes"
 """Default parents of output folders."""
 

@@ -8,16 +8,3 @@ class DetectorKind(StrEnum):
 
     ORB = "orb"
     ONNX = "onnx"
-
-
-class EvaluatedDetectorKind(StrEnum):
-    """Detectors of the homography evaluation."""
-
-    ONNX = "onnx"
-    LOGITS = "logits"
-    """The same network, its descriptors compared by logits instead of bits."""
-    ORB = "orb"
-    SIFT = "sift"
-    FAST = "fast"
-    HARRIS = "harris"
-    SHI = "shi"

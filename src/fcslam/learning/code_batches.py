@@ -15,9 +15,9 @@ from torch import Tensor
 
 from fcslam.features.detector import GreyImage
 from fcslam.learning.batches import TensorRecord
+from fcslam.learning.homography import Size
 from fcslam.learning.labels import Points
 from fcslam.learning.warps import random_change, relight, warp_image
-from fcslam.metrics.homography import Size
 from fcslam.records import FloatArray
 
 REVISIT_IMAGES: Final = 4

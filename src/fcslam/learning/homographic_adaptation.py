@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from fcslam.features.dense import find_peaks
 from fcslam.features.detector import GreyImage
+from fcslam.learning.homography import inverse
 from fcslam.learning.labels import Points
 from fcslam.learning.warps import random_change, warp_image
-from fcslam.metrics.homography import inverse
 from fcslam.records import FloatArray
 
 Response = NDArray[np.float32]

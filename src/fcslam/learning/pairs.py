@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
+from fcslam.learning.homography import Mask, Size, inverse, warp
 from fcslam.learning.labels import Labels, Teacher
 from fcslam.learning.warps import (
     random_change,
@@ -17,7 +18,6 @@ from fcslam.learning.warps import (
     warp_image,
     well_inside,
 )
-from fcslam.metrics.homography import Mask, Size, inverse, warp
 from fcslam.records import FloatArray
 
 BORDER_PX: Final = 4

@@ -10,10 +10,7 @@ from torch import Tensor
 
 from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
 from fcslam.features.dense import find_peaks, sample_codes
-from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import ViewPair
-from fcslam.learning.warps import well_inside
-from fcslam.metrics.homography import (
+from fcslam.learning.homography import (
     CORRECT_PX,
     in_common_view,
     inverse,
@@ -21,6 +18,9 @@ from fcslam.metrics.homography import (
     matching_accuracy,
     repeatability,
 )
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.pairs import ViewPair
+from fcslam.learning.warps import well_inside
 from fcslam.records import Codes, FloatArray
 
 NMS_PX: Final = 4.0

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
-from fcslam.metrics.homography import Mask, Size
+from fcslam.learning.homography import Mask, Size
 from fcslam.records import FloatArray
 
 SCALE_SPREAD: Final = 0.7

@@ -10,8 +10,8 @@ from benchmarks.relation_closures import build_relation_graph, evaluate_closures
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.closures import ClosureScope, closure_rows
-from fcslam.lab.evaluation.fleet.relations import pose_table
+from fcslam.lab.evaluation.closures import ClosureScope, closure_rows
+from fcslam.lab.evaluation.relations import pose_table
 from fcslam.metrics.relations import Relations, write_relations
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, RobotTrajectory, Run

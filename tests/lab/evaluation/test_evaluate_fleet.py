@@ -9,9 +9,9 @@ import pytest
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.closures import ClosureScope
-from fcslam.lab.evaluation.fleet.ground_truth import read_grid
-from fcslam.lab.evaluation.fleet.report import EvaluatedJoin, evaluate_fleet, fleet_metrics
+from fcslam.lab.evaluation.closures import ClosureScope
+from fcslam.lab.evaluation.ground_truth import read_grid
+from fcslam.lab.evaluation.report import EvaluatedJoin, evaluate_fleet, fleet_metrics
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 

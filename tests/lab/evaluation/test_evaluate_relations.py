@@ -9,7 +9,7 @@ import pytest
 
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.fleet.relations import (
+from fcslam.lab.evaluation.relations import (
     evaluate_relations,
     pose_table,
     relation_metrics,

@@ -1,4 +1,4 @@
-"""`fcslam evaluate`: measure runs, detectors and place recognition against references."""
+"""`fcslam evaluate`: measure runs against references."""
 
 import json
 from pathlib import Path
@@ -6,10 +6,9 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.options import Csv, examples, output_option
-from fcslam.cli.output import EVALUATIONS, new_folder, notices
+from fcslam.cli.options import Csv, examples
+from fcslam.cli.output import notices
 from fcslam.errors import EvaluationError
-from fcslam.features.detector_kinds import EvaluatedDetectorKind
 
 _FLEET = "fcslam evaluate fleet fleet/run --truth fleet"
 _RELATIONS = "fcslam evaluate relations runs/intel intel.relations.gz"
@@ -20,7 +19,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback(epilog=examples(_FLEET, _RELATIONS))
 def evaluate() -> None:
-    """Measure runs, detectors and place recognition against references."""
+    """Measure runs against references."""
 
 
 @app.command(epilog=examples(_FLEET, "fcslam evaluate fleet demo/run --csv fleet.csv --figure fleet.png"))
@@ -47,7 +46,7 @@ def fleet(
 
     report_fleet(run, truth, csv, notices())
     if figure is not None:
-        from fcslam.lab.evaluation.fleet.charts import fleet_charts
+        from fcslam.lab.evaluation.charts import fleet_charts
         from fcslam.maps.fleet_figure import write_figure
 
         with ProgressDisplay(notices()) as display:
@@ -77,7 +76,7 @@ def relations(
 ) -> None:
     """Measure a run by the relations metric of Kuemmerle et al. 2009: mean, standard deviation and maximum."""
     from fcslam.cli.evaluate.fleet_tables import show_relations
-    from fcslam.lab.evaluation.fleet.relations import evaluate_relations, relation_metrics, write_metrics
+    from fcslam.lab.evaluation.relations import evaluate_relations, relation_metrics, write_metrics
 
     errors = evaluate_relations(run, reference, across_robots, parts)
     show_relations(errors, "relations across robots" if across_robots else "relations")
@@ -108,113 +107,3 @@ def quality(run: RunFolder) -> None:
             )
         for drive in one["drives"]:
             typer.echo(f"map {k}: {drive['text']}")
-
-
-@app.command(
-    epilog=examples(
-        "fcslam evaluate homography hpatches --detector onnx --detector orb",
-        "fcslam evaluate homography hpatches --detector features --csv pairs.csv",
-    )
-)
-def homography(
-    scenes: Annotated[
-        list[Path], typer.Argument(metavar="SCENES...", help="Folders of scenes in the layout of HPatches.")
-    ],
-    *,
-    detector: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME|FILE|FOLDER",
-            help="Evaluate only this detector: onnx, logits (the network's descriptors before they are bits), orb, "
-            "sift, fast, harris or shi; the .onnx file of a network for onnx and logits; or a folder of extracted "
-            "features, SCENE/1.npz ..., as `fcslam tools extract` writes them. Can be repeated.",
-            show_default="all",
-        ),
-    ] = None,
-    csv: Annotated[Path | None, typer.Option(help="Write all measures of all pairs to this CSV file.")] = None,
-) -> None:
-    """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
-    from fcslam.cli.evaluate.vision_tables import show_homography
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.detectors.evaluated_detectors import choose_detectors
-    from fcslam.lab.evaluation.detectors.homography import evaluate_homography
-    from fcslam.lab.evaluation.detectors.measures import write_pairs
-    from fcslam.lab.evaluation.detectors.scenes import find_scenes
-    from fcslam.metrics.homography import HomographyGroundTruth
-
-    found = find_scenes(scenes)
-    kinds = [EvaluatedDetectorKind(one) for one in detector or () if one in list(EvaluatedDetectorKind)]
-    places = [Path(one) for one in detector or () if one not in list(EvaluatedDetectorKind)]
-    weights = [place for place in places if place.suffix == ".onnx"]
-    if weights and not set(kinds) & {EvaluatedDetectorKind.ONNX, EvaluatedDetectorKind.LOGITS}:
-        kinds.append(EvaluatedDetectorKind.ONNX)
-    detectors = choose_detectors(kinds, weights, [place for place in places if place.suffix != ".onnx"])
-    with ProgressDisplay(notices()) as display:
-        evaluated = display.start("evaluating", len(found) * len(detectors))
-        report = evaluate_homography(found, detectors, HomographyGroundTruth.CORRECTED, evaluated)
-    if csv is not None:
-        write_pairs(report, csv)
-    show_homography(report)
-
-
-@app.command(
-    epilog=examples(
-        "fcslam evaluate places corridor tower",
-        "fcslam evaluate places corridor --features onnx --train-on photos --verify",
-    )
-)
-def places(
-    sets: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SETS...",
-            help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), "
-            "fleets with cameras that fcslam tools simulate wrote, or recordings of a LiDAR.",
-        ),
-    ],
-    *,
-    output: Annotated[
-        Path | None, output_option("Folder for the table, the curves and the similarity matrices.", EVALUATIONS)
-    ] = None,
-    features: Annotated[
-        str,
-        typer.Option(
-            help="Features of images: orb, onnx (the bundled network), an .onnx file, or a folder that `fcslam tools "
-            "extract` wrote, with a subfolder for each set."
-        ),
-    ] = "orb",
-    train_on: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of other images, to train the static vocabulary on. Can be repeated."),
-    ] = None,
-    label: Annotated[
-        list[str] | None,
-        typer.Option(help="Use only this label of sets with labels. Can be repeated.", show_default="all"),
-    ] = None,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Also verify the geometry of the most similar places.")
-    ] = False,
-) -> None:
-    """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
-    from fcslam.cli.evaluate.vision_tables import SEED, show_places
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.places.features import choose_features, describe_sets, describe_training
-    from fcslam.lab.evaluation.places.report import curves_figure, evaluate_set, save, write_results
-    from fcslam.lab.evaluation.places.scoring import choose_scorers
-    from fcslam.lab.evaluation.places.verification import PairVerifier
-    from fcslam.places.vocabulary import Strategy, VocabularyConfig
-
-    output = output or new_folder(EVALUATIONS)
-    with ProgressDisplay(notices()) as display:
-        chosen, advance = choose_features(features), display.start("describing")
-        training = describe_training(train_on or (), chosen, advance)
-        described = describe_sets(sets, label or (), chosen, advance)
-        strategies = Strategy.STATIC, Strategy.WINDOWED, Strategy.INCREMENTAL
-        scorers = choose_scorers(strategies, VocabularyConfig(), training, SEED)
-        advance = display.start("comparing", len(scorers) * len(described))
-        results = [
-            evaluate_set(each, scorers, PairVerifier(each) if verify else None, SEED, advance) for each in described
-        ]
-    write_results(output, results)
-    save(curves_figure(results), output / "precision_recall.png")
-    show_places(results, output)

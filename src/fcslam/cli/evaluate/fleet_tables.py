@@ -10,9 +10,9 @@ from rich.table import Table
 
 from fcslam.cli.output import answers
 from fcslam.cli.progress import ProgressDisplay
-from fcslam.lab.evaluation.fleet.closures import BOTH, LIKE_HEADING_DEG, ClosureScope
-from fcslam.lab.evaluation.fleet.relations import write_metrics
-from fcslam.lab.evaluation.fleet.report import FleetReport, evaluate_fleet, fleet_metrics
+from fcslam.lab.evaluation.closures import BOTH, LIKE_HEADING_DEG, ClosureScope
+from fcslam.lab.evaluation.relations import write_metrics
+from fcslam.lab.evaluation.report import FleetReport, evaluate_fleet, fleet_metrics
 from fcslam.metrics.closures import EVERY_M, RADIUS_M, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
 from fcslam.metrics.grid import TOLERANCE_M
 from fcslam.metrics.relations import RelationErrors

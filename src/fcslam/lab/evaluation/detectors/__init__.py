@@ -1,1 +1,0 @@
-"""Evaluation of keypoint detectors on scenes with known homographies."""

@@ -1,1 +1,0 @@
-"""Evaluation of runs against the ground truth or reference relations."""

@@ -1,0 +1,118 @@
+"""Reads the ground truth of a fleet, simulated or measured: true poses and the true map, in one coordinate frame.
+
+The true poses of a robot are a TUM file, `<folder>/<robot>/ground_truth.tum` or `<folder>/<robot>.tum`. The true map is
+`<folder>/ground_truth/map.yaml`, in the format of ROS map_server.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fcslam.config import one_line, parse_yaml
+from fcslam.errors import EvaluationError
+from fcslam.features.detector import decode_grey
+from fcslam.lab.evaluation.relations import pose_table
+from fcslam.maps.occupancy_map import check_place
+from fcslam.metrics.grid import LabelledGrid
+from fcslam.metrics.relations import PoseTable
+from fcslam.metrics.trajectory import interpolate
+from fcslam.records import FloatArray, frozen
+from fcslam.runs import RobotTrajectory, Run, read_tum
+from fcslam.untrusted import read_bytes, read_text
+
+GAP_S = 0.25
+"""Longest gap between true poses that is interpolated."""
+
+LEAST_COVERED = 0.5
+"""Smallest share of a robot's scans with a true pose. With fewer, the truth is probably of another recording."""
+
+TRUE_MAP = Path("ground_truth", "map.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPoses:
+    """Estimated and true poses of a run, at the stamps at which the truth is known."""
+
+    estimate: PoseTable
+    truth: PoseTable
+    """True poses, row by row as in ``estimate``, in the frame of the truth, which counts as one map."""
+
+
+def truth_folder(run: Path, named: Path | None) -> Path:
+    """Folder with the ground truth of a run: ``named`` if given, else ``recordings`` beside the run, else its parent.
+
+    Raises:
+        EvaluationError: the folder does not exist.
+    """
+    beside = run.resolve().parent / "recordings"
+    folder = named or (beside if beside.is_dir() else run.resolve().parent)
+    if not folder.is_dir():
+        raise EvaluationError(f"{folder}: no folder with the truth; name one with --truth")
+    return folder
+
+
+def known_poses(run: Run, folder: Path) -> KnownPoses:
+    """Interpolate the true poses at the stamps of a run.
+
+    Raises:
+        EvaluationError: the truth of a robot is missing, cannot be read, or does not cover the robot's scans.
+    """
+    if not run.trajectories:
+        raise EvaluationError("the run has no robot, so there is nothing to compare with the truth")
+    estimate = pose_table(run)
+    true = np.empty_like(estimate.T_map_base)
+    for number, trajectory in enumerate(run.trajectories.values()):
+        rows = estimate.robots == number
+        true[rows] = _true_poses(trajectory, estimate.stamps[rows], folder)
+    known = np.isfinite(true[:, 0])
+    stamps, robots = estimate.stamps[known], estimate.robots[known]
+    return KnownPoses(
+        PoseTable.of(stamps, estimate.T_map_base[known], robots, estimate.maps[known]),
+        PoseTable.of(stamps, true[known], robots),
+    )
+
+
+def read_grid(path: Path) -> LabelledGrid:
+    """Read a map in the format of ROS map_server from its YAML file.
+
+    Raises:
+        EvaluationError: one of the two files is missing or invalid.
+    """
+    try:
+        meta = parse_yaml(read_text(path))
+        pixels = decode_grey(read_bytes(path.parent / meta["image"], path.parent))
+        if pixels is None:
+            raise ValueError(f"{one_line(str(meta['image']))} is not an image")
+        resolution_m, origin = float(meta["resolution"]), np.array(meta["origin"], dtype=np.float64)
+        occupied_over, free_under = float(meta["occupied_thresh"]), float(meta["free_thresh"])
+        check_place(resolution_m, *origin[:2].tolist())
+        if not (origin.shape == (3,) and np.isfinite(origin).all()):
+            raise ValueError("resolution or origin is wrong")
+    except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
+        raise EvaluationError(f"{path}: not a map of ROS map_server ({error!r})") from error
+    occupancy = (pixels if meta.get("negate") else 255 - pixels)[::-1] / 255.0
+    return LabelledGrid(occupancy > occupied_over, occupancy < free_under, resolution_m, frozen(origin))
+
+
+def _true_poses(trajectory: RobotTrajectory, stamps: FloatArray, folder: Path) -> FloatArray:
+    """True poses (N, 3) at ``stamps`` (N,); NaN if unknown."""
+    places = folder / trajectory.robot / "ground_truth.tum", folder / f"{trajectory.robot}.tum"
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise EvaluationError(
+            f"{folder}: no truth of '{trajectory.robot}', neither {places[0].relative_to(folder)} nor "
+            f"{places[1].name}; name the folder that has it with --truth"
+        )
+    known, poses = read_tum(path)
+    if not len(known):
+        raise EvaluationError(f"{path}: empty, so where '{trajectory.robot}' was is not known")
+    true = interpolate(known, poses, stamps, GAP_S)
+    covered = int(np.isfinite(true[:, 0]).sum())
+    if covered < max(LEAST_COVERED * len(stamps), 1):
+        raise EvaluationError(
+            f"{path}: has poses at only {covered} of the {len(stamps)} scans of '{trajectory.robot}'; "
+            "is it the truth of another recording?"
+        )
+    return true

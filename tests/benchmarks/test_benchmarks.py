@@ -1,0 +1,200 @@
+"""Benchmarks are not run by the tests, but they must start: each names its command, imports, and skips politely."""
+
+import ast
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from fcslam.config import load as load_config
+from fcslam.features.classical import OrbConfig
+from fcslam.geometry import se2
+from fcslam.mission.mission import MissionConfig
+from fcslam.records import Channel
+from tests.features.networks import tiny_network
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+SHARED = (
+    "common",
+    "device_pairs",
+    "map_search",
+    "processes",
+    "training_fleet",
+    "wall_tags",
+    "relation_closures",
+    "subpixel_loss",
+    "g2o_files",
+    "floor_worlds",
+)
+SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
+
+
+def load(path: Path):
+    """The script as a module of a name that no test folder has."""
+    spec = importlib.util.spec_from_file_location(f"benchmark_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def common(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.delitem(sys.modules, "common", raising=False)
+    yield load(FOLDER / "common.py")
+    for name in SHARED:  # they hold one another
+        sys.modules.pop(name, None)
+
+
+def test_there_are_benchmarks():
+    assert len(SCRIPTS) >= 8
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_the_docstring_names_the_command(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    assert f"python benchmarks/{path.name}" in docstring
+
+
+def test_every_script_has_a_report():
+    assert [path.name for path in SCRIPTS if not (FOLDER / "results" / f"{path.stem}.md").exists()] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.usefixtures("common")
+def test_imports_without_running(path, capsys):
+    try:
+        script = load(path)
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "flwr"):
+            raise
+        pytest.skip("needs fcslam[federated]")
+    assert callable(script.main)
+    assert capsys.readouterr().out == ""
+
+
+def test_without_recordings_one_line_and_success(common, monkeypatch, capsys):
+    monkeypatch.delenv("FCSLAM_DATA", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        common.recordings("slam-benchmark/intel.clf.xz")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == "skipped: needs recordings; set FCSLAM_DATA to their folder\n"
+
+
+def test_missing_recordings_fail_with_their_names(common, monkeypatch, tmp_path):
+    monkeypatch.setenv("FCSLAM_DATA", str(tmp_path))
+    with pytest.raises(SystemExit, match=r"intel\.clf\.xz missing"):
+        common.recordings("slam-benchmark/intel.clf.xz")
+
+
+def test_a_script_without_recordings_succeeds(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "FCSLAM_DATA"}
+    environment["PYTHONPATH"] = str(FOLDER.parent / "src")
+    command = [sys.executable, FOLDER / "relations.py", "--results", tmp_path]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert ended.stdout.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_is_two_files_that_say_the_same(common, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["sample.py"])
+    chosen = common.options("Sample.").parse_args(["--results", str(tmp_path), "--date", "2026-11-05"])
+    report = common.Report("benchmarks/sample.py", "Sample.", chosen)
+    report.table("Numbers", {"what": "", "m": ".2f"}, [("a", 1.23456), ("b", float("nan"))])
+    report.write()
+    markdown = (tmp_path / "sample.md").read_text(encoding="utf-8")
+    assert "| a | 1.23 |" in markdown
+    assert "| b | - |" in markdown
+    assert "- date: 2026-11-05" in markdown
+    assert markdown in capsys.readouterr().out
+    content = json.loads((tmp_path / "sample.json").read_text(encoding="utf-8"))
+    assert content["tables"] == {"Numbers": [{"what": "a", "m": 1.23456}, {"what": "b", "m": None}]}
+    assert {"date", "machine", "versions", "command"} <= set(content)
+
+
+@pytest.mark.slow
+def test_a_picture_lies_beside_the_report(common, tmp_path, monkeypatch, capsys):
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(sys, "argv", ["sample.py"])
+    chosen = common.options("Sample.").parse_args(["--results", str(tmp_path / "results")])
+    report = common.Report("benchmarks/sample.py", "Sample.", chosen)
+    figure = Figure()
+    figure.subplots().plot([1, 2])
+    report.picture("A line", figure)
+    report.write()
+    assert (tmp_path / "results" / "sample.png").read_bytes().startswith(b"\x89PNG")
+    assert "![A line](sample.png)" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_command_is_measured_and_its_failure_ends_the_script(common):
+    cost = common.run_fcslam("--version")
+    assert cost.cpu_s > 0.0
+    assert 0.0 < cost.wall_s < 60.0
+    assert cost.peak_mb > 5.0  # the system counts what this process held when it forked, so no upper bound
+    with pytest.raises(SystemExit, match="failed"):
+        common.run_fcslam("map", "no-such-log", "--output", "nowhere")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("common")
+def test_the_search_finds_where_a_piece_was_cut_out():
+    map_search = load(FOLDER / "map_search.py")
+    rng = np.random.default_rng(5)
+    free = np.zeros((160, 200), bool)
+    for row, column in zip(rng.integers(20, 110, 8), rng.integers(20, 140, 8), strict=True):
+        free[row : row + 30, column : column + 40] = True
+    walls = binary_dilation(free) & ~free
+    whole = map_search.Plan(walls, free, 0.1, np.array([-3.0, 2.0]))
+    T_whole_piece = np.array([4.0, 6.0, 2.2])
+    corner = np.array([-9.0, -9.0])
+    cells = [np.zeros((180, 180), bool) for _ in range(2)]
+    for into, of in zip(cells, (walls, free), strict=True):
+        points = se2.transform(se2.inverse(T_whole_piece), whole.points(of))
+        inside = np.floor((points[np.abs(points).max(axis=1) < 7.0] - corner) / 0.1).astype(int)
+        into[inside[:, 1], inside[:, 0]] = True
+    best, second = map_search.search(map_search.Plan(cells[0], cells[1] & ~cells[0], 0.1, corner), whole)
+    np.testing.assert_allclose(se2.between(T_whole_piece, best.T_target_query), 0.0, atol=0.06)
+    assert second.score < 0.7 * best.score
+
+
+@pytest.fixture
+def camera_detectors(common):
+    return load(FOLDER / "camera_detectors.py")
+
+
+def outcome(module, seed, detector, recall):
+    found = {f"{module.VERIFIED}_{name}": recall for name in module.RECALLS.values()}
+    return module.Outcome("default", seed, detector, found, 1.0)
+
+
+def test_detectors_are_compared_fleet_by_fleet(camera_detectors):
+    recalls = {"orb": (0.5, 0.9, 0.7), "net": (0.6, 0.8, 1.0)}
+    outcomes = [
+        outcome(camera_detectors, seed, name, values[seed]) for seed in range(3) for name, values in recalls.items()
+    ]
+    (row,) = camera_detectors.gains(outcomes, ["default"], ("orb", "net"))
+    assert row[:2] == ("default", "net")
+    assert row[-1] == "2 of 3"
+    assert row[2].startswith("+0.100 [-0.100, +0.300]")
+
+
+def test_each_detector_alone_describes_the_camera_places(camera_detectors, tmp_path):
+    paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
+    for path in paths:
+        tiny_network(path, version=path.stem)
+    files = camera_detectors.settings(paths, tmp_path)
+    assert list(files) == ["orb", "first", "second"]
+    robots = [load_config(MissionConfig, file).robot for file in files.values()]
+    assert {robot.channels for robot in robots} == {(Channel.CAMERA,)}
+    assert [str(robot.views.detector) for robot in robots] == ["orb", "onnx", "onnx"]
+    assert [robot.views.onnx.weights for robot in robots] == [None, *paths]
+    assert robots[0].views.orb == OrbConfig()

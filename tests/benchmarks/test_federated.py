@@ -1,0 +1,244 @@
+"""The study of federated training: it compares like with like, resumes, and its arithmetic is right."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.learning.textures import textured
+
+torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from benchmarks.evaluation.federated.pairs import (  # noqa: E402
+    MEASURES,
+    DetectedFeatures,
+    detect_features,
+    held_out_pairs,
+    measure_pair,
+)
+from benchmarks.evaluation.federated.poison import PoisonedClient  # noqa: E402
+from benchmarks.evaluation.federated.report import report  # noqa: E402
+from benchmarks.evaluation.federated.study import Arm, Study, StudyResults, run_study  # noqa: E402
+from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
+from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
+from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
+from fcslam.learning.images import find_images  # noqa: E402
+from fcslam.learning.network import KeypointNetwork  # noqa: E402
+from tests.learning.federated.fakes import Fake  # noqa: E402
+
+TINY = {
+    "rounds": 2,
+    "local_steps": 2,
+    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
+}
+ARMS = {"averaged": Arm(), "bad": Arm(settings={"strategy": "fedmedian"}, poison="nan")}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def brief(brief_validation):
+    """Short validation, and one export of each network: several studies train the same ones."""
+    files = {}
+
+    def export_once(network, path):
+        if (version := detector_version(network)) not in files:
+            export_onnx(network, path)
+            files[version] = path.read_bytes()
+        path.write_bytes(files[version])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.evaluation.federated.study.export_onnx", export_once)
+        yield
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory):
+    made = tmp_path_factory.mktemp("robots")
+    for number, robot in enumerate(("north", "south")):
+        (made / robot).mkdir()
+        for seed in range(6):
+            cv2.imwrite(str(made / robot / f"{seed}.png"), textured(100 * number + seed, 160, 128))
+    return {robot: made / robot for robot in ("north", "south")}
+
+
+def study(robots, folder, watch=lambda *_: None, **changes):
+    given = {"arms": ARMS, "seeds": 2, "local_seeds": 2, "pairs": 4} | changes
+    return Study(robots, folder, FederatedSettings.model_validate(TINY), on_progress=watch, **given)
+
+
+@pytest.fixture(scope="module")
+def finished(robots, tmp_path_factory):
+    """The folder and the results of a whole study."""
+    folder = tmp_path_factory.mktemp("finished")
+    return folder, run_study(study(robots, folder))
+
+
+def with_shapes(finished, folder):
+    """A folder in which the weights that all arms start from are trained already."""
+    shutil.copytree(finished[0] / "shapes", folder / "shapes")
+    return folder
+
+
+@pytest.mark.training
+def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_path):
+    whole = finished[1]
+
+    def stop(name, done, _of):
+        if name == "averaged, seed 2" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study(robots, tmp_path / "torn", stop))
+    told = []
+    torn = run_study(study(robots, tmp_path / "torn", lambda name, done, _of: told.append((name, done))))
+    assert ("averaged, seed 2", 2) in told
+    assert not [name for name, _ in told if name.startswith("central") or name == "averaged, seed 1"]
+    assert {name: values.shape for name, values in whole.measured.items()} == {
+        "start": (1, 1, 4, 5), "central": (2, 1, 4, 5), "local": (2, 2, 4, 5), "alone": (2, 2, 4, 5),
+        "averaged": (2, 1, 4, 5), "bad": (2, 1, 4, 5),
+    }  # fmt: skip
+    assert whole.owners == (0, 0, 1, 1)
+    start = whole.measured["start"]
+    assert np.array_equal(start[..., 1], start[..., 3])  # it is the former network itself
+    assert not np.array_equal(start, whole.measured["central"][:1], equal_nan=True)
+    for name, values in whole.measured.items():
+        assert np.array_equal(values, torn.measured[name], equal_nan=True)
+    again = run_study(study(robots, tmp_path / "torn", lambda *_: pytest.fail("all is done")))
+    assert again.robots == ("north", "south")
+
+
+@pytest.mark.training
+def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
+    with_shapes(finished, tmp_path)
+    arms = {"frozen": Arm(settings={"normalisation": "frozen"}, seeds=1)}
+    found = run_study(study(robots, tmp_path, arms=arms, local_seeds=1))
+    shapes = {name: values.shape[:2] for name, values in found.measured.items()}
+    assert shapes == {"start": (1, 1), "central": (2, 1), "local": (1, 2), "alone": (1, 2), "frozen": (1, 1)}
+
+
+@pytest.mark.training
+def test_robots_own_networks_share_the_pairs_out(finished):
+    local = finished[1].measured["local"]
+    shown = np.isfinite(local[..., 0])
+    assert (shown.sum(axis=1) == 1).all()
+    assert (shown.sum(axis=0) == 1).all()  # over two seeds each of both networks sees each pair once
+
+
+@pytest.mark.training
+def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
+    folder, first = finished
+    seen = set()
+    changes = {"seeds": 1, "arms": {"averaged": Arm()}, "start": folder / "shapes" / "checkpoint.npz"}
+    again = run_study(study(robots, tmp_path, lambda name, *_: seen.add(name), **changes))
+    assert "shapes" not in seen
+    assert all(
+        np.array_equal(first.measured[name][:1], again.measured[name], equal_nan=True) for name in again.measured
+    )
+
+
+@pytest.mark.training
+def test_every_network_sees_as_many_samples(finished, robots, tmp_path):
+    with_shapes(finished, tmp_path)
+    steps = {}
+
+    def watch(name, done, of):
+        steps[name] = of
+
+    wide = Arm(together=False, settings={"training": TINY["training"] | {"pairs": 2}})
+    run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": Arm(), "wide": wide}))
+    assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
+    assert steps["alone-north, seed 1"] == 2 * 2
+    assert steps["averaged, seed 1"] == 2
+    assert steps["wide, seed 1"] == 2 * 2
+
+
+@pytest.mark.training
+def test_a_network_matches_a_view_with_itself(robots, tmp_path):
+    torch.manual_seed(1)
+    network = KeypointNetwork("light").eval()
+    network.body.code_head[-1].bias.data.zero_()  # or all its codes are equal
+    export_onnx(network, tmp_path / "detector.onnx")
+    detector = OnnxDetector(OnnxConfig(weights=tmp_path / "detector.onnx"))
+    (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], 1)
+    same = type(pair)(
+        (pair.views[0], pair.views[0]), pair.valid, pair.teacher_valid, pair.teacher_descriptors, np.eye(3)
+    )
+    own = detect_features(detector, pair.views[0])
+    correct, accuracy, again, former, between = measure_pair(detector, detector, same, own)
+    assert (correct, again) == (1.0, 1.0)
+    assert accuracy > 0.95
+    assert former == between == accuracy
+    assert measure_pair(detector, detector, same, DetectedFeatures(own.points, np.bitwise_not(own.codes)))[3] < 0.2
+    nothing = DetectedFeatures(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+    assert measure_pair(detector, detector, same, nothing)[3] == 0.0
+
+
+def findings(central, federated, local):
+    """One seed, one measure's worth of pairs repeated for all measures; two robots own half of the pairs each."""
+    count = len(central)
+    owners = tuple(int(index >= count // 2) for index in range(count))
+
+    def stacked(*networks):
+        return np.stack([np.repeat(np.asarray(each, float)[:, None], len(MEASURES), axis=1) for each in networks])[None]
+
+    measured = {"central": stacked(central), "local": stacked(*local), "federated": stacked(federated)}
+    measured["alone"] = measured["local"] - 0.2
+    return StudyResults(("north", "south"), owners, measured)
+
+
+def test_an_arm_of_fewer_seeds_is_compared_with_those():
+    rng = np.random.default_rng(3)
+    central = rng.random(60)
+    whole = findings(central, central - 0.1, [central - 0.2, central - 0.2])
+    later = findings(central + 0.5, central, [central - 0.2, central - 0.2]).measured
+    measured = {name: np.concatenate((whole.measured[name], later[name])) for name in ("central", "local", "alone")}
+    measured |= {"federated": whole.measured["federated"], "poor": whole.measured["federated"] - 0.03}
+    found = StudyResults(whole.robots, whole.owners, measured)
+    rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
+    assert rows["federated"].gap.mean == pytest.approx(0.1)
+    assert rows["federated"].closed == pytest.approx(0.5)
+    assert rows["local"].gap.mean == pytest.approx(0.45)
+    against = {row.arm: row for row in report(found, against="federated") if row.measure == MEASURES[0]}
+    assert against["poor"].gap == pytest.approx((0.03, 0.03, 0.03))
+
+
+def test_gaps_are_paired_and_the_worst_robot_is_named():
+    rng = np.random.default_rng(1)
+    hard = rng.random(400)
+    lost = np.where(np.arange(400) < 200, 0.0, 0.04)
+    found = findings(hard, hard - lost, [hard - 0.1, hard - 0.3])
+    rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
+    assert rows["central"].gap == (0.0, 0.0, 0.0)
+    assert rows["federated"].gap.mean == pytest.approx(0.02)
+    assert 0.017 < rows["federated"].gap.low < 0.02 < rows["federated"].gap.high < 0.023
+    assert (rows["federated"].worst_robot, rows["federated"].worst_gap) == ("south", pytest.approx(0.04))
+    assert rows["federated"].closed == pytest.approx((0.2 - 0.02) / 0.2)
+    assert rows["federated"].closed_alone == pytest.approx((0.4 - 0.02) / 0.4)
+    assert rows["local"].mean == pytest.approx(hard.mean() - 0.2)
+    assert rows["local"].closed == pytest.approx(0.0)
+
+
+def test_nothing_is_closed_where_central_is_no_better():
+    rng = np.random.default_rng(2)
+    central = rng.random(50)
+    rows = report(findings(central, central, [central + 0.01 * rng.normal(size=50)]))
+    assert all(np.isnan(row.closed) for row in rows)
+
+
+@pytest.mark.parametrize("poison", ["flipped", "scaled", "reversed", "random", "nan"])
+def test_poison_is_what_it_says(poison):
+    before = {"weight": np.zeros(6, np.float32)}
+    bad = PoisonedClient(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
+    sent = bad.train(before, 0, "run", FederatedSettings()).weights["weight"]
+    expected = {
+        "flipped": -np.arange(6.0),
+        "scaled": 10 * np.arange(6.0),
+        "reversed": -10 * np.arange(6.0),
+        "nan": np.full(6, np.nan),
+    }
+    if poison == "random":
+        assert sorted(sent) == list(range(6))
+        assert list(sent) != list(range(6))
+    else:
+        assert np.array_equal(sent, expected[poison], equal_nan=True)

@@ -1,0 +1,160 @@
+"""Retrieval measures against plain loops over every order of equals and every threshold, and their laws."""
+
+from itertools import pairwise, permutations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.evaluation.places import measure_interval
+from benchmarks.evaluation.retrieval import (
+    PairTruth,
+    excluding_recent,
+    mismatches,
+    multi_match_curve,
+    recall_at,
+    relative_significance,
+    significance,
+    single_best,
+)
+
+MATCH, DIFFERENT, IGNORED = 1, -1, 0
+
+
+@st.composite
+def questions(draw, most_queries=4, most_places=6):
+    """Similarities with many ties, zeros among them, and what is known of each pair."""
+    queries, places = draw(st.integers(1, most_queries)), draw(st.integers(1, most_places))
+    cells = queries * places
+    similarity = draw(st.lists(st.integers(0, 3), min_size=cells, max_size=cells))
+    known = draw(st.lists(st.sampled_from((MATCH, DIFFERENT, IGNORED)), min_size=cells, max_size=cells))
+    relation = np.array(known).reshape(queries, places)
+    truth = PairTruth(relation == MATCH, relation == DIFFERENT)
+    return np.array(similarity, float).reshape(queries, places), truth
+
+
+def orders(row, truth, query):
+    """Every order of the candidates of a query that its similarities allow, retrieved ones only."""
+    known = np.flatnonzero((truth.matches | truth.different)[query] & (row > 0))
+    return [order for order in permutations(known) if all(row[a] >= row[b] for a, b in pairwise(order))]
+
+
+@given(questions(), st.integers(1, 4))
+def test_recall_is_the_mean_over_all_orders_of_equals(question, k):
+    similarity, truth = question
+    expected = [
+        np.mean([any(truth.matches[q, place] for place in order[:k]) for order in orders(similarity[q], truth, q)])
+        for q in range(len(similarity))
+        if truth.matches[q].any()
+    ]
+    np.testing.assert_allclose(recall_at(similarity, truth, k), expected)
+
+
+@given(questions())
+def test_single_best_answers_are_the_mean_over_all_orders_of_equals(question):
+    similarity, truth = question
+    answers = single_best(similarity, truth)
+    for q, row in enumerate(similarity):
+        firsts = [order[0] for order in orders(row, truth, q) if order]
+        assert answers.scores[q] == (row[firsts[0]] if firsts else 0.0)
+        assert answers.right[q] == pytest.approx(
+            np.mean([truth.matches[q, first] for first in firsts]) if firsts else 0.0
+        )
+
+
+def area_by_loops(answers, to_find):
+    """Average precision and the largest recall at full precision, from (score, right) pairs."""
+    area, before, full = 0.0, 0.0, 0.0
+    for threshold in sorted({score for score, _ in answers}, reverse=True):
+        said = [right for score, right in answers if score >= threshold]
+        precision, recall = sum(said) / len(said), sum(said) / to_find
+        area += (recall - before) * precision
+        before = recall
+        full = recall if precision == 1.0 else full
+    return area, full
+
+
+@given(questions())
+def test_curves_are_those_of_every_threshold(question):
+    similarity, truth = question
+    best = single_best(similarity, truth)
+    single = [(score, right) for score, right in zip(best.scores, best.right, strict=True) if score > 0]
+    known = (truth.matches | truth.different) & (similarity > 0)
+    multi = [(similarity[at], float(truth.matches[at])) for at in zip(*np.nonzero(known), strict=True)]
+    for curve, answers, to_find in (
+        (best.curve(), single, int(truth.answerable.sum())),
+        (multi_match_curve(similarity, truth), multi, int(truth.matches.sum())),
+    ):
+        if not to_find:
+            assert not answers or np.isnan(curve.average_precision)
+            continue
+        area, full = area_by_loops(answers, to_find)
+        assert curve.average_precision == pytest.approx(area)
+        assert curve.recall_at_full_precision == pytest.approx(full)
+
+
+@given(questions())
+def test_a_mismatch_is_no_match_ahead_of_every_wrong_place(question):
+    similarity, truth = question
+    rows = [q for q in range(len(similarity)) if truth.matches[q].any()]
+    right = [max(similarity[q][truth.matches[q]]) for q in rows]
+    wrong = [max([0.0, *similarity[q][truth.different[q]]]) for q in rows]
+    ahead = [a - b for a, b in zip(right, wrong, strict=True)]
+    np.testing.assert_allclose(significance(similarity, truth), ahead)
+    np.testing.assert_allclose(mismatches(similarity, truth), [float(value <= 0.0) for value in ahead])
+    relative = [max(-1.0, value / of) if of else -1.0 for value, of in zip(ahead, right, strict=True)]
+    np.testing.assert_allclose(relative_significance(similarity, truth), relative)
+
+
+@given(questions(), st.randoms(use_true_random=False))
+def test_ignored_pairs_and_the_scale_count_for_nothing(question, random):
+    similarity, truth = question
+    changed = np.where(truth.matches | truth.different, similarity**3, random.random() * 100.0)
+    np.testing.assert_array_equal(recall_at(similarity, truth, 2), recall_at(changed, truth, 2))
+    np.testing.assert_allclose(
+        single_best(similarity, truth).curve().recall, single_best(changed, truth).curve().recall
+    )
+    np.testing.assert_array_equal(mismatches(similarity, truth), mismatches(changed, truth))
+
+
+def test_queries_without_a_match_count_against_precision_only():
+    similarity = np.array([[0.9, 0.1], [0.2, 0.95]])
+    truth = PairTruth(np.array([[True, False], [False, False]]), np.array([[False, True], [True, True]]))
+    assert recall_at(similarity, truth, 1).tolist() == [1.0]
+    curve = single_best(similarity, truth).curve()
+    assert curve.precision.tolist() == [0.0, 0.5]
+    assert curve.recall.tolist() == [0.0, 1.0]
+
+
+def test_nothing_to_find_is_no_number():
+    truth = PairTruth(np.zeros((1, 2), bool), np.ones((1, 2), bool))
+    curve = single_best(np.ones((1, 2)), truth).curve()
+    assert np.isnan(curve.average_precision)
+    assert np.isnan(curve.recall_at_full_precision)
+    assert len(recall_at(np.ones((1, 2)), truth, 1)) == 0
+
+
+def test_a_pair_cannot_be_both():
+    both = np.ones((1, 1), bool)
+    with pytest.raises(ValueError, match="match and be different"):
+        PairTruth(both, both)
+    with pytest.raises(ValueError, match=r"\(Q, G\)"):
+        PairTruth(both, np.ones((1, 2), bool))
+
+
+def test_the_interval_of_a_mean_is_that_of_its_samples():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    interval = measure_interval(lambda rows: float(values[rows].mean()), len(values), np.random.default_rng(1))
+    assert interval.mean == pytest.approx(values.mean())
+    half = 1.96 * values.std() / np.sqrt(len(values))
+    assert (interval.low, interval.high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.3 * half)
+    assert np.isnan(measure_interval(lambda _: np.nan, 3, np.random.default_rng(1)).low)
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=20), st.integers(0, 12))
+def test_only_places_from_long_before_may_answer(steps, gap):
+    stamps = np.cumsum(steps)
+    admitted = excluding_recent(stamps, gap)
+    for t, j in np.ndindex(admitted.shape):
+        assert admitted[t, j] == (j < t and stamps[t] - stamps[j] >= gap)
