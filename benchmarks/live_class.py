@@ -78,7 +78,7 @@ def overhead(log: Path) -> tuple[np.ndarray, np.ndarray]:
                 ended = time.thread_time_ns(), time.perf_counter_ns()
                 timed[number, way] = np.subtract(ended, began) / 1e6
             robot.wait_for_room()
-            while bare.backlog > LARGEST_BACKLOG:
+            while bare.packets.backlog > LARGEST_BACKLOG:
                 time.sleep(0.01)
                 bare.ready()
     return timed[..., 0], timed[..., 1]

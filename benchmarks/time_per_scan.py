@@ -147,7 +147,7 @@ def live(records: Any, robot: RobotFrontend) -> Iterator[tuple[float, float]]:
             wall, cpu = time.perf_counter(), time.thread_time()
             robot.process(record)
             yield 1e3 * (time.thread_time() - cpu), 1e3 * (time.perf_counter() - wall)
-            while robot.backlog > LARGEST_BACKLOG:
+            while robot.packets.backlog > LARGEST_BACKLOG:
                 time.sleep(0.01)
                 robot.ready()
 

@@ -160,7 +160,7 @@ def test_a_process_of_its_own_finds_the_robot(fleet, building, scans):
     with fcslam.LocalizedRobot("anna", building, scans[0].laser) as robot:
         for scan in scans:
             pose = robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
-            while robot._frontend.backlog > 5:  # a simulated robot is faster than a real one
+            while robot._frontend.packets.backlog > 5:  # a simulated robot is faster than a real one
                 robot._frontend.ready()
         assert pose.is_localized
         off = se2.between(small_fleet.truth_at(fleet.robots[2], [pose.stamp])[0], pose.T_map_base)

@@ -67,11 +67,11 @@ def test_poses_are_known_while_the_back_end_is_busy(scans):
         assert robot.process(scan) == []
         assert len(robot.scan_poses) == number
     assert robot.scan_poses.T_odom_base().tobytes() == inline.scan_poses.T_odom_base().tobytes()
-    assert robot.backlog == sum(isinstance(packet.body, Keyscan) for packet in expected)
+    assert robot.packets.backlog == sum(isinstance(packet.body, Keyscan) for packet in expected)
     executor.work()
     executor.holds = False
     assert contents([*robot.ready(), *robot.finish()]) == contents(expected)
-    assert robot.backlog == 0
+    assert robot.packets.backlog == 0
 
 
 def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
@@ -90,7 +90,7 @@ def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
 def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
     expected = driven(scans)[1]
     robot, packets = driven(scans, WorkerBackend("r", CONFIG, Held(breaks_after=10)))
-    assert robot.backend_failure == "BrokenExecutor: it was killed"
+    assert robot.packets.failure == "BrokenExecutor: it was killed"
     assert contents(packets[:10]) == contents(expected[:10])
     kept = [p.body for p in expected if not isinstance(p.body, Place) and not is_closure(p.body)]
     assert contents_of([packet.body for packet in packets]) == contents_of(kept)
@@ -144,7 +144,7 @@ def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothi
         assert backend._executor.submit(os.getpid).result() == worker
         os.kill(worker, signal.SIGKILL)
         robot, packets = driven(scans, backend)
-        assert "BrokenProcessPool" in robot.backend_failure
+        assert "BrokenProcessPool" in robot.packets.failure
         assert keyscans(packets) == keyscans(expected)
 
 

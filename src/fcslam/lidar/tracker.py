@@ -108,6 +108,11 @@ class TrackingResult(NamedTuple):
     usual: float
     """Usual log-likelihood of a scan per point, learned from the latest matches; NaN before the first."""
 
+    @property
+    def quality(self) -> float:
+        """Share of the points in known area that lie on a surface; NaN if the scan was not matched."""
+        return self.explained / self.known if self.known > 0.0 else math.nan
+
 
 class ScanTracker:
     """Tracks one robot in a running buffer of keyscans (Karto), kept as two overlapping surfel fields.

@@ -119,7 +119,7 @@ class LocalizedRobot(LiveTracker):
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: whether it knows its pose, and counts since its start."""
-        estimate, failure = self._estimate(), self._frontend.backend_failure
+        estimate, failure = self._estimate(), self._frontend.packets.failure
         broken = f"not localized any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
@@ -197,7 +197,7 @@ class LocalizedRobot(LiveTracker):
             0,
             newest.pose.T_keyscan_base,
             newest.tracked,
-            self._frontend.odometry_model,
+            self._frontend.motion.model,
             estimate.covariance,
         )
 
@@ -208,5 +208,5 @@ class LocalizedRobot(LiveTracker):
             self._event(EventKind.LOCALIZED, f"localized, quality {estimate.quality:.2f}")
         elif estimate is None and was_localized:
             self._event(EventKind.LOST, "not localized any more: the walls are others than in the map")
-        if self._frontend.backend_failure:
-            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.backend_failure}")
+        if self._frontend.packets.failure:
+            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.packets.failure}")
