@@ -8,7 +8,7 @@ from fcslam.geometry import se2
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.backend import LidarBackend, chained
-from fcslam.lidar.closing import ClosingConfig, _shortest_paths
+from fcslam.lidar.closing import MOST_NEARBY, _shortest_paths
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, motion_information
 from fcslam.lidar.odometry import WHEELS
 from fcslam.lidar.tracker import TrackedScan
@@ -173,13 +173,10 @@ def guest():
     return truth, recording(truth, odometry, hotel(spacing, rooms=4))
 
 
-@pytest.mark.parametrize("drift", [0.03, 1.0])
-def test_rooms_that_look_alike_stay_apart(guest, drift):
-    """With the default drift. With so much allowed for that every twin lies inside the search, most drives have some
-    false closures, and the others outvote them."""
+def test_rooms_that_look_alike_stay_apart(guest):
     truth, scans = guest
-    mapped = Mapped(scans, LidarConfig(closing=ClosingConfig(drift=drift)))
-    assert drift > 0.03 or mapped.false_closures(truth) == []
+    mapped = Mapped(scans)
+    assert mapped.false_closures(truth) == []
     assert len(mapped.closures) > 0
     assert pose_errors(mapped.poses, truth)[0].max() < 0.05
 
@@ -211,14 +208,12 @@ def test_motions_combined_solve_as_the_keyscans_between_would():
 
 def test_a_well_known_area_holds_no_more_submaps_however_often_it_is_crossed():
     """A robot that goes to and fro on one spot's surroundings; what it forgets costs no closure of the newest visit."""
-    truth = drive([(1.5, 1.5), (6.0, 1.5)] * 5)
-    there = recording(truth, truth, ring())
-    few = LidarConfig(closing=ClosingConfig(most_nearby=3))
-    mapped, unlimited = Mapped(there, few), Mapped(there)
+    truth = drive([(1.5, 1.5), (6.0, 1.5)] * 9)
+    mapped = Mapped(recording(truth, truth, ring()))
     anchors = mapped.backend._poses[list(mapped.backend._closer._held)]
     squares, counts = np.unique(np.floor(anchors[:, :2] / 2.0 + 0.5), axis=0, return_counts=True)
-    assert counts.max() <= 3
-    assert len(anchors) < len(mapped.submaps) == len(unlimited.submaps)
+    assert counts.max() <= MOST_NEARBY + 1  # the graph is solved afterwards, and moves some across an edge
+    assert len(anchors) < len(mapped.submaps)
     newest = mapped.submaps[-6:]
     assert len(squares) >= 3
     assert all(submap.closures for submap in newest)

@@ -9,7 +9,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar import closing
 from fcslam.lidar.backend import LidarBackend
-from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LoopCloser
+from fcslam.lidar.closing import AnchoredSubmap, LoopCloser
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
@@ -75,8 +75,8 @@ def submaps_of(world, length_m):
     return truth, submaps
 
 
-def closures(submaps, poses, recognizer, config=None):
-    closer = LoopCloser(config or ClosingConfig(), recognizer)
+def closures(submaps, poses, recognizer):
+    closer = LoopCloser(recognizer)
     anchors = np.array([poses[anchored.keyscan] for anchored, _ in submaps])
     found = [closer.add(anchored, submap, anchors[: k + 1]) for k, (anchored, submap) in enumerate(submaps)]
     return [(2 * c.earlier, 2 * c.later, c) for closures in found for c in closures]

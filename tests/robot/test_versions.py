@@ -12,7 +12,6 @@ from fcslam.features.detector_file import describe_detector_file
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.records import CameraImage, Channel, LaserScan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.image_buffer import ImageBufferConfig
 from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
@@ -71,19 +70,6 @@ def test_old_places_are_described_again_and_new_ones_by_the_new_detector_alone(s
 def content(packets):
     """Places as bytes, whenever they were sent."""
     return {p.body.id: encode(replace(p, sequence=0, time=1e9)) for p in packets if isinstance(p.body, Place)}
-
-
-def test_a_robot_that_keeps_no_images_describes_none_again(seen):
-    config = with_image_buffer(WITH_ORB, ImageBufferConfig(most_images=0))
-    half = len(seen) // 2
-    packets = driven(RobotFrontend("r", config), seen, half)
-    numbers = [packet.body.id.number for packet in packets if isinstance(packet.body, Place)]
-    assert numbers == sorted(set(numbers))
-    assert places(packets, SHIPPED.version)
-
-
-def with_image_buffer(config, image_buffer):
-    return config.model_copy(update={"views": config.views.model_copy(update={"image_buffer": image_buffer})})
 
 
 def test_a_detector_that_comes_before_the_first_scan_is_announced_once(seen):

@@ -49,7 +49,7 @@ class LidarBackend:
         """``recognizer`` proposes loops whose drift is beyond the reach of the search; without one they stay open."""
         self.robot = robot
         self._gate = config.keyscans
-        self._closer = LoopCloser(config.closing, recognizer)
+        self._closer = LoopCloser(recognizer)
         self._graph = PoseGraph()
         self._factors = FactorCache(self._graph)
         self._poses = np.empty((0, 3))

@@ -14,10 +14,8 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from fcslam.compiled import njit
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
@@ -56,10 +54,11 @@ LOOP_M, LOOP_PER_M = 0.25, 0.02
 """Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
 LOOP_RAD, LOOP_RAD_PER_M = 0.05, 0.002
 """The same for the heading, in radians and radians per metre."""
-NEARBY_M = 2.0
-"""Side of the squares of the map in which ``most_nearby`` limits the submaps, metres."""
+MOST_NEARBY, NEARBY_M = 10, 2.0
+"""Most submaps in a square of the map, of this side in metres, that later ones are compared with; beyond, the oldest is
+forgotten."""
 KNOWN_CANDIDATES = 1
-"""Earlier visits that a submap in a square with more than ``most_nearby`` is compared with: one closure ties it to a
+"""Earlier visits that a submap in a square with more than ``MOST_NEARBY`` is compared with: one closure ties it to a
 well-known area."""
 SIMILAR_PLACES = 24
 """Most similar earlier submaps among which the places to compare are chosen."""
@@ -70,8 +69,8 @@ SIGHT_M = 8.0
 overlap too little, metres."""
 MOST_CANDIDATES = 4
 """Largest number of earlier visits that a submap is compared with."""
-DRIFT_RAD_M = 0.006
-"""Drift of the heading allowed for, per metre of path through the graph, radians per metre."""
+DRIFT_M_M, DRIFT_RAD_M = 0.03, 0.006
+"""Drift of the position and the heading allowed for, per metre of path through the graph: metres, and radians."""
 WIDEST_M = 15.0
 """Largest half side of the search window, metres."""
 WIDEST_RAD = 0.7
@@ -81,20 +80,6 @@ LEAST_SCORE = 0.5
 RECOGNIZED_DRIFT = 0.25
 """Largest drift of the position, metres per metre of path through the graph, at which place recognition closes a loop
 out of the search's reach."""
-
-
-class ClosingConfig(Settings):
-    """Loop closing inside one robot."""
-
-    drift: float = Field(
-        default=0.03, gt=0, description="drift of the position allowed for, per metre of path through the graph [m/m]"
-    )
-    most_nearby: int = Field(
-        default=10,
-        gt=0,
-        description="most submaps in a square of 2 m that later ones are compared with; beyond, the oldest is "
-        "forgotten, and the newest is compared with one earlier visit",
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +136,7 @@ class PlaceRecognizer(Protocol):
 class LoopCloser:
     """Collects the submaps of one robot and decides which closures between them are accepted."""
 
-    def __init__(
-        self,
-        config: ClosingConfig,
-        recognizer: PlaceRecognizer | None = None,
-    ) -> None:
-        self._config = config
+    def __init__(self, recognizer: PlaceRecognizer | None = None) -> None:
         self._recognizer = recognizer
         self.submaps: list[AnchoredSubmap] = []
         """All submaps so far."""
@@ -202,7 +182,7 @@ class LoopCloser:
     def _forget_surplus(self, anchors: FloatArray) -> bool:
         """Forget the oldest submaps around the newest one beyond the limit; returns whether there were any."""
         held = np.array(list(self._held))
-        surplus = surplus_places(anchors[held, :2], NEARBY_M, self._config.most_nearby)
+        surplus = surplus_places(anchors[held, :2], NEARBY_M, MOST_NEARBY)
         for row in surplus:
             index = int(held[row])
             del self._held[index]
@@ -224,8 +204,8 @@ class LoopCloser:
 
     def _drift_allowance(self, path_m: ArrayLike) -> FloatArray:
         """Error of the estimate allowed for after paths (...) through the graph: metres and radians, (..., 2)."""
-        config, path = self._config, np.asarray(path_m)[..., None]
-        allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((config.drift, DRIFT_RAD_M)) * path
+        path = np.asarray(path_m)[..., None]
+        allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((DRIFT_M_M, DRIFT_RAD_M)) * path
         return np.asarray(np.minimum((WIDEST_M, WIDEST_RAD), allowed))
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:

@@ -15,7 +15,6 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.information import limited_information
 from fcslam.lidar.karto import KartoTracker
 from fcslam.lidar.lasers import Lasers
@@ -39,6 +38,8 @@ from fcslam.records import (
 TURN_AS_TRAVEL_M = 0.1
 """Travel that one radian of turning counts as, metres: a robot that only turns completes submaps, too."""
 
+KEYSCAN_TURN_RAD = 0.25
+"""Turn since the last keyscan after which a scan becomes a keyscan."""
 SUBMAP_REACH_M = 5.0
 """Travel before and after its anchor that a submap covers."""
 POINT_INFORMATION_SHARE = 0.1
@@ -71,9 +72,6 @@ class KeyscanConfig(Settings):
     minimum_travel_distance_m: float = Field(
         default=0.25, gt=0, description="travel since the last keyscan after which a scan becomes a keyscan [m]"
     )
-    minimum_travel_heading_rad: float = Field(
-        default=0.25, gt=0, description="turn since the last keyscan after which a scan becomes a keyscan [rad]"
-    )
     submap_every_m: float = Field(default=2.0, gt=0, description="travel between the anchors of two submaps [m]")
 
 
@@ -103,7 +101,6 @@ class LidarConfig(Settings):
         "a keyscan by exhaustive search on a grid, as on the robots of the paper",
     )
     keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
-    closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
 
 
 class ScanPose(NamedTuple):
@@ -230,8 +227,7 @@ class LidarFrontend:
         if laser not in self._T_local_newest:
             return True
         x, y, turn = se2.motion(self._T_local_newest[laser], tracked.T_local_base)
-        gate = self.config.keyscans
-        return math.hypot(x, y) >= gate.minimum_travel_distance_m or abs(turn) >= gate.minimum_travel_heading_rad
+        return math.hypot(x, y) >= self.config.keyscans.minimum_travel_distance_m or abs(turn) >= KEYSCAN_TURN_RAD
 
     def scan_pose(self, stamp: float, tracked: TrackedScan) -> ScanPose:
         """Pose of a localized scan relative to the newest keyscan, of which there is one after the first scan."""
@@ -279,8 +275,7 @@ class LidarFrontend:
 def _tracker(config: LidarConfig, odometry: OdometryModel) -> ScanTracker:
     if config.tracker is Tracker.SURFELS:
         return ScanTracker(odometry)
-    gate = config.keyscans
-    return KartoTracker(odometry, gate.minimum_travel_distance_m, gate.minimum_travel_heading_rad)
+    return KartoTracker(odometry, config.keyscans.minimum_travel_distance_m, KEYSCAN_TURN_RAD)
 
 
 def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryModel) -> FloatArray:

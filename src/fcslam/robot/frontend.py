@@ -30,7 +30,6 @@ from fcslam.robot.deferred_scans import DeferredScans, Outcome
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.motion import RobotMotion
 from fcslam.robot.motion_prediction import MotionPrediction
-from fcslam.robot.odometry_gate import OdometryLimits
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.session import Session, WaitingFixes
 from fcslam.robot.track import ScanTrack
@@ -43,9 +42,6 @@ class RobotConfig(SessionConfig):
     """Settings of one robot."""
 
     lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
-    odometry: OdometryLimits = Field(
-        default=OdometryLimits(), description="jumps of the wheel odometry, which scan matching bridges"
-    )
 
 
 class NewestScan(NamedTuple):
@@ -86,7 +82,7 @@ class RobotFrontend:
         self.robot = robot
         self.tracks: list[ScanTrack] = []
         """Poses of the scans, by session."""
-        self.motion = RobotMotion(config.odometry, config.lidar.scan_duration_s)
+        self.motion = RobotMotion(config.lidar.scan_duration_s)
         self.packets = PacketQueue(
             robot, InlineBackend(RobotBackend(robot, config)) if backend is None else backend, config.sends
         )

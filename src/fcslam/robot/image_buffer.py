@@ -3,18 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pydantic import Field
-
-from fcslam.config import Settings
 from fcslam.features.lidar_depth import LidarView
 from fcslam.records import CameraModel, FloatArray
 
-
-class ImageBufferConfig(Settings):
-    """Size of the buffer, which is in memory; the oldest images are dropped first."""
-
-    most_images: int = Field(default=500, ge=0, description="largest number of images; 0 for none")
-    most_megabytes: float = Field(default=32.0, ge=0.0, description="largest total size of the encoded images [MB]")
+MOST_IMAGES, MOST_BYTES = 500, 32_000_000
+"""Size of the buffer, which is in memory: images, and bytes of all encoded images together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +26,7 @@ class KeyframeImage:
 class ImageBuffer:
     """The newest images, one a keyscan."""
 
-    def __init__(self, config: ImageBufferConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._images: dict[int, KeyframeImage] = {}
         self._bytes = 0
 
@@ -47,7 +39,7 @@ class ImageBuffer:
         self._images[image.keyscan] = image
         dropped = []
         self._bytes += len(image.encoded)
-        while len(self._images) > self._config.most_images or self._bytes > 1e6 * self._config.most_megabytes:
+        while len(self._images) > MOST_IMAGES or self._bytes > MOST_BYTES:
             oldest = self._images.pop(next(iter(self._images)))
             self._bytes -= len(oldest.encoded)
             dropped.append(oldest.keyscan)

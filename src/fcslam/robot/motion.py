@@ -9,20 +9,15 @@ from fcslam.lidar.odometry import WHEELS, OdometryModel
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, LaserScan, Sweep
 from fcslam.robot.motion_prediction import LONGEST_S, PREDICTED, MotionPrediction
-from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits, WheelCheck
+from fcslam.robot.odometry_gate import OdometryGate, WheelCheck
 
 
 class RobotMotion:
     """Gives every scan the pose from which its match starts, and the velocity by which its points are deskewed."""
 
-    def __init__(self, limits: OdometryLimits, scan_duration_s: float) -> None:
-        """Begin with wheel odometry.
-
-        Args:
-            limits: the fastest motion that it may report.
-            scan_duration_s: time from the first beam to the last one of scans that do not say it; 0: none.
-        """
-        self.odometry = OdometryGate(limits)
+    def __init__(self, scan_duration_s: float) -> None:
+        """Begin with wheel odometry. ``scan_duration_s`` is the duration of scans that do not state it."""
+        self.odometry = OdometryGate()
         self.wheels = WheelCheck()
         self.prediction: MotionPrediction | None = None
         """Stands in for the odometry; None if there is odometry."""

@@ -6,9 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
 from fcslam.sources.contradictions import CHANGED, changed_share, stands_still
@@ -20,11 +18,10 @@ LEAST_BRIDGE_M, LEAST_BRIDGE_RAD = 0.02, 0.02
 
 WITHOUT_CLOCK_S = 2.0
 """Scans with equal stamps may be so far apart: some logs were recorded without a clock, a scan every two metres."""
-SLACK_M = 1.0
-"""Length allowed to any step, metres, as stamps may be wrong."""
-SLACK_RAD = 1.5
-"""Turn allowed to any step, radians."""
-
+LARGEST_SPEED_M_S, LARGEST_TURN_RAD_S = 5.0, 6.0
+"""The fastest motion that wheel odometry may report between two scans; a faster one is a jump."""
+SLACK_M, SLACK_RAD = 1.0, 1.5
+"""Length and turn allowed to any step besides, metres and radians, as stamps may be wrong."""
 
 SCANS_THAT_CHANGED = 10
 """So many scans in a row that changed while the odometry said nothing show that it measures nothing."""
@@ -34,22 +31,14 @@ FROZEN = "stands still while the scans change"
 """Fault of odometry that measured the motion before."""
 
 
-class OdometryLimits(Settings):
-    """The fastest motion that wheel odometry may report between two scans; a faster one is a jump."""
-
-    speed_m_s: float = Field(default=5.0, gt=0, description="largest speed [m/s]")
-    turn_rad_s: float = Field(default=6.0, gt=0, description="largest speed of a turn [rad/s]")
-
-
 class OdometryGate:
     """Moves the frame ``odom`` at every jump, so that odometry goes on as before the jump."""
 
-    def __init__(self, limits: OdometryLimits) -> None:
+    def __init__(self) -> None:
         self.jumps = 0
         """Number of jumps so far."""
         self.largest_m = 0.0
         """Length of the largest one, metres."""
-        self._limits = limits
         self._last: tuple[float, FloatArray] | None = None
         """Stamp and pose, as it was read, of the scan before."""
         self._bridge: FloatArray | None = None
@@ -69,7 +58,7 @@ class OdometryGate:
                 read = se2.compose(before, self._motion)
             x, y, turn = motion = se2.motion(before, read)
             moved_m = math.hypot(x, y)
-            if self._is_jump(moved_m, abs(turn), scan.stamp - stamp):
+            if _is_jump(moved_m, abs(turn), scan.stamp - stamp):
                 self.jumps += 1
                 self.largest_m = max(self.largest_m, moved_m)
                 self._bridge = se2.compose(se2.compose(self.bridged(before), self._motion), se2.inverse(read))
@@ -83,12 +72,12 @@ class OdometryGate:
 
     def _with_possible_sweep(self, scan: LaserScan) -> LaserScan:
         """The scan; if odometry jumped during its sweep, with the velocity in the sweep before."""
-        sweep, limits = scan.sweep, self._limits
+        sweep = scan.sweep
         if sweep is None:
             return scan
         (x, y, theta), (mean_x, mean_y, mean_theta) = sweep.velocity, sweep.mean_velocity
         speed_m_s = math.hypot(max(abs(x), abs(mean_x)), max(abs(y), abs(mean_y)))
-        if speed_m_s <= limits.speed_m_s and max(abs(theta), abs(mean_theta)) <= limits.turn_rad_s:
+        if speed_m_s <= LARGEST_SPEED_M_S and max(abs(theta), abs(mean_theta)) <= LARGEST_TURN_RAD_S:
             self._velocity = sweep.velocity
             return scan
         return replace(scan, sweep=sweep._replace(velocity=self._velocity, acceleration=(0.0, 0.0, 0.0)))
@@ -103,10 +92,10 @@ class OdometryGate:
         """A pose that was read, shape (3,), in the first frame ``odom``."""
         return T_odom_base if self._bridge is None else se2.compose(self._bridge, T_odom_base)
 
-    def _is_jump(self, moved_m: float, turned_rad: float, within_s: float) -> bool:
-        limits = self._limits
-        within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
-        return moved_m > SLACK_M + limits.speed_m_s * within_s or turned_rad > SLACK_RAD + limits.turn_rad_s * within_s
+
+def _is_jump(moved_m: float, turned_rad: float, within_s: float) -> bool:
+    within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
+    return moved_m > SLACK_M + LARGEST_SPEED_M_S * within_s or turned_rad > SLACK_RAD + LARGEST_TURN_RAD_S * within_s
 
 
 class WheelCheck:

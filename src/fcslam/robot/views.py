@@ -18,31 +18,27 @@ from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
-from fcslam.robot.image_buffer import ImageBuffer, ImageBufferConfig, KeyframeImage
+from fcslam.robot.image_buffer import ImageBuffer, KeyframeImage
 from fcslam.robot.keyframe_folder import KeyframeFolder
 
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
 EVERY_M, EVERY_RAD = 1.0, 0.5
 """Travel or turn after which an image becomes a camera place; after the turn, about half of the view is new."""
+CEILING_M = 3.0
+"""Keypoints higher above the floor are on the ceiling, so the LiDAR does not measure them."""
 FEWEST_KEYPOINTS = 20
 """Least number of keypoints with a position; an image with fewer is not a place."""
 
 
 class ViewsConfig(Settings):
-    """Which images become places, and which are kept."""
+    """How images are described."""
 
-    ceiling_m: float = Field(
-        default=3.0, gt=0.0, description="height of the ceiling above the floor; keypoints above it are dropped [m]"
-    )
     detector: DetectorKind = Field(
         default=DetectorKind.ONNX, description="detector of camera images: onnx (a network) or orb"
     )
     orb: OrbConfig = Field(default=OrbConfig(), description="settings of the detector orb")
     onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of the detector onnx")
-    image_buffer: ImageBufferConfig = Field(
-        default=ImageBufferConfig(), description="images that a new detector describes again"
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +64,7 @@ class ViewExtractor:
         """
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
-        self._image_buffer = ImageBuffer(config.image_buffer)
+        self._image_buffer = ImageBuffer()
         self._folder = folder
         self._last: tuple[int, FloatArray] | None = None
         """Keyscan and odometry of the last view."""
@@ -129,7 +125,7 @@ class ViewExtractor:
 
     def reset(self) -> None:
         """Start a new session: forget all images."""
-        self._image_buffer = ImageBuffer(self._config.image_buffer)
+        self._image_buffer = ImageBuffer()
         self._last = None
 
     def describe_again(self) -> list[CameraView]:
@@ -140,8 +136,7 @@ class ViewExtractor:
 
     def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
-        pixels, ceiling_m = features.keypoints_px, self._config.ceiling_m
-        positions, placed = locate_among(pixels, image.camera, image.surroundings, ceiling_m)
+        positions, placed = locate_among(features.keypoints_px, image.camera, image.surroundings, CEILING_M)
         if placed.sum() < FEWEST_KEYPOINTS:
             return None
         if self._folder is not None:
