@@ -3,7 +3,7 @@
     python benchmarks/gnss.py
     python benchmarks/gnss.py --seeds 1 2
 
-One robot drives 300 to 750 m in a yard (docs/howto/simulation.md) with one fix a second, 1.5 m standard deviation east
+One robot drives 300 to 750 m in a yard (benchmarks/worlds/yard.py) with one fix a second, 1.5 m standard deviation east
 and north, from an antenna beside its base. In "reflections", a third of the fixes in the middle of the drive are off by
 a further 5 to 15 m that change slowly, as indoors, with the same stated covariance. The true coordinate frame is turned
 against east. Errors are of the positions at all scans in the earth's frame, without alignment; "without fixes" is the

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import common
 import numpy as np
+from worlds.yard import Yard
 
 import fcslam
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
@@ -86,8 +87,8 @@ def overhead(log: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def drive(seconds: float) -> tuple[np.ndarray, float]:
     """Wall milliseconds of each scan in real time, shape (N,), and the share of a core that the robot takes."""
-    settings = SimulationSettings(robots=1, building="yard", path_length_m=SPEED_M_S * seconds, camera=None)
-    simulated = simulate_fleet(settings, seed=1).robots[0]
+    settings = SimulationSettings(robots=1, path_length_m=SPEED_M_S * seconds, camera=None)
+    simulated = simulate_fleet(settings, 1, Yard()).robots[0]
     scans = list(simulated.scans())
     pace = PlaybackPace(1.0, time.monotonic, time.sleep)
     latency_ms = []

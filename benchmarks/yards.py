@@ -3,7 +3,7 @@
     python benchmarks/yards.py
     python benchmarks/yards.py --seeds 1 2 --odometry good
 
-Trees, hedges, parked cars, glass, slopes and open ground (docs/howto/simulation.md). Five scanners take turns over the
+Trees, hedges, parked cars, glass, slopes and open ground (benchmarks/worlds/yard.py). Five scanners take turns over the
 seeds, and drives of 300 to 750 m come back to their start. Errors are of positions at all scans after alignment
 (SE(2), least squares): their mean is the ATE here. A slip is an error of the motion over 1 s, or from scan to
 scan if that is longer. A closure is wrong if it is off by more than 0.5 m or 10 deg. A robot that believes itself
@@ -22,11 +22,12 @@ import common
 import numpy as np
 from numpy.typing import NDArray
 from robustness import Recording, position_errors
+from worlds.yard import Yard
 
 from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.odometry import KINDS
-from fcslam.lab.simulation.options import Building, OdometryKind
+from fcslam.lab.simulation.options import OdometryKind
 from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, FloatArray
@@ -109,14 +110,13 @@ def simulated_robot(kind: OdometryKind, seed: int, scanner: Scanner) -> Simulate
         rate_hz=scanner.rate_hz,
     )
     settings = SimulationSettings(
-        building=Building.YARD,
         robots=1,
         path_length_m=SHORTEST_M + LONGER_M * (seed % 10),
         lidar=lidar,
         drift=KINDS[kind],
         camera=None,
     )
-    return simulate_fleet(settings, seed).robots[0]
+    return simulate_fleet(settings, seed, Yard()).robots[0]
 
 
 def largest_map(run: Run, robot: SimulatedRobot) -> tuple[NDArray[np.intp], FloatArray]:

@@ -3,9 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-
-from benchmarks.evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detectors, find_scenes
-from benchmarks.evaluation.homography import (
+from evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detectors, find_scenes
+from evaluation.homography import (
     LARGE,
     SMALL,
     HomographyGroundTruth,
@@ -15,6 +14,7 @@ from benchmarks.evaluation.homography import (
     match_pair,
     mean,
 )
+
 from fcslam.errors import EvaluationError
 from fcslam.features.detector import ImageFeatures
 from fcslam.learning.homography import warp

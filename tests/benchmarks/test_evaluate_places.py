@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from benchmarks.evaluation.place_features import (
+from evaluation.place_features import (
     ACCEPTED_INLIERS,
     PairVerifier,
     PretrainedVocabulary,
@@ -14,8 +13,9 @@ from benchmarks.evaluation.place_features import (
     index_scores,
     strategy_scorer,
 )
-from benchmarks.evaluation.place_sets import read_place_set
-from benchmarks.evaluation.retrieval import recall_at
+from evaluation.place_sets import read_place_set
+from evaluation.retrieval import recall_at
+
 from fcslam.cli import main
 from fcslam.features.codes import hamming_matrix
 from fcslam.places.index import PlaceIndex

@@ -11,16 +11,17 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from benchmarks.evaluation.federated.pairs import (  # noqa: E402
+from evaluation.federated.pairs import (  # noqa: E402
     MEASURES,
     DetectedFeatures,
     detect_features,
     held_out_pairs,
     measure_pair,
 )
-from benchmarks.evaluation.federated.poison import PoisonedClient  # noqa: E402
-from benchmarks.evaluation.federated.report import report  # noqa: E402
-from benchmarks.evaluation.federated.study import Arm, Study, StudyResults, run_study  # noqa: E402
+from evaluation.federated.poison import PoisonedClient  # noqa: E402
+from evaluation.federated.report import report  # noqa: E402
+from evaluation.federated.study import Arm, Study, StudyResults, run_study  # noqa: E402
+
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
 from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
@@ -48,7 +49,7 @@ def brief(brief_validation):
         path.write_bytes(files[version])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("benchmarks.evaluation.federated.study.export_onnx", export_once)
+        patch.setattr("evaluation.federated.study.export_onnx", export_once)
         yield
 
 

@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 import pytest
+from evaluation.fleet_views import MatchViews, judge_views, lidar_overlap, read_fleet_views
+from evaluation.place_sets import read_place_set
 
-from benchmarks.evaluation.fleet_views import MatchViews, judge_views, lidar_overlap, read_fleet_views
-from benchmarks.evaluation.place_sets import read_place_set
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.records import (

@@ -3,15 +3,15 @@
 import cv2
 import numpy as np
 import pytest
-
-from benchmarks.evaluation.detectors import Framing
-from benchmarks.evaluation.homography import (
+from evaluation.detectors import Framing
+from evaluation.homography import (
     HomographyGroundTruth,
     corner_error,
     estimate_homography,
     framed_homography,
     matching_score,
 )
+
 from fcslam.learning.homography import inside, inverse, match_errors, matching_accuracy, warp
 
 H = np.array([[1.1, 0.1, -8.0], [-0.05, 0.95, 6.0], [2e-4, -1e-4, 1.0]])

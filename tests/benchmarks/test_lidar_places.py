@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from evaluation.place_features import PlaceFeatures, describe_recording, planar_inliers
 
-from benchmarks.evaluation.place_features import PlaceFeatures, describe_recording, planar_inliers
 from fcslam.geometry import se2
 from fcslam.sources import write_carmen
 from tests import small_fleet

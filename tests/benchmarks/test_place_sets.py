@@ -5,9 +5,9 @@ import re
 import cv2
 import numpy as np
 import pytest
+from evaluation.place_sets import read_place_set
+from evaluation.view_overlap import DepthCamera, view_overlap
 
-from benchmarks.evaluation.place_sets import read_place_set
-from benchmarks.evaluation.view_overlap import DepthCamera, view_overlap
 from fcslam.errors import EvaluationError
 from tests.benchmarks import place_folders
 

@@ -4,11 +4,8 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-from benchmarks.evaluation.places import measure_interval
-from benchmarks.evaluation.retrieval import (
+from evaluation.places import measure_interval
+from evaluation.retrieval import (
     PairTruth,
     excluding_recent,
     mismatches,
@@ -18,6 +15,8 @@ from benchmarks.evaluation.retrieval import (
     significance,
     single_best,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 MATCH, DIFFERENT, IGNORED = 1, -1, 0
 

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-
-from benchmarks.evaluation.place_features import choose_features, describe_sets
-from benchmarks.evaluation.vocabulary_growth import (
+from evaluation.place_features import choose_features, describe_sets
+from evaluation.vocabulary_growth import (
     BATCH,
     MEASURES,
     ahead_of,
@@ -13,6 +12,7 @@ from benchmarks.evaluation.vocabulary_growth import (
     group_measures,
     grow_vocabulary,
 )
+
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from tests.benchmarks import place_folders

@@ -1,28 +1,23 @@
 """Yards: what stands in them, what beams meet there, and walks that come home."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
+from worlds.outdoor_rays import LASER_HEIGHT_M, OutdoorRayCaster
+from worlds.walk import draw_starts, plan_walk
+from worlds.yard import Yard, draw_yard, move_cars
+from worlds.yard_plan import CELL_M, Terrain, YardKind, YardPlan
 
-from fcslam.errors import SimulationError
 from fcslam.lab.simulation.drivable_space import ROBOT_RADIUS_M
-from fcslam.lab.simulation.floorplan import FloorPlan, Piece, PieceKind, disc, rectangle, segments_of
+from fcslam.lab.simulation.floorplan import Piece, disc, rectangle, segments_of
 from fcslam.lab.simulation.noise import LidarSettings
-from fcslam.lab.simulation.odometry import KINDS, simulate_odometry
-from fcslam.lab.simulation.options import Building, OdometryKind
-from fcslam.lab.simulation.outdoor_rays import LASER_HEIGHT_M, OutdoorRayCaster
-from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
-from fcslam.lab.simulation.terrain import CELL_M, Terrain
-from fcslam.lab.simulation.walk import draw_starts, plan_walk
-from fcslam.lab.simulation.yard import draw_yard, move_cars
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.records import LaserModel
 from tests.lab.simulation.driving import distances, drive
 
 pytestmark = pytest.mark.slow
 
 SICK = LidarSettings(beams=181, field_of_view_rad=np.pi, max_range_m=81.9, rate_hz=0.5)
-TINY = SimulationSettings(building=Building.YARD, robots=2, path_length_m=60.0, camera=None, lidar=SICK)
+TINY = SimulationSettings(robots=2, path_length_m=60.0, camera=None, lidar=SICK)
 HERE = np.array([20.0, 20.0, 0.0])
 AHEAD = LaserModel(3, -0.001, 0.001, 30.0)
 
@@ -31,7 +26,7 @@ def meadow(*pieces, slope=0.0):
     """40 m by 40 m that rises towards the east, with ``pieces``."""
     heights = np.tile(slope * CELL_M * np.arange(42.0), (42, 1))
     lanes = ((np.array([20.0, 1.0]), np.array([20.0, 39.0])),)
-    return FloorPlan((40.0, 40.0), tuple(pieces), segments_of(pieces), lanes, (), Terrain(heights))
+    return YardPlan((40.0, 40.0), tuple(pieces), segments_of(pieces), lanes, (), Terrain(heights))
 
 
 def ahead(kind, distance_m, depth_m=0.2, wide_m=8.0):
@@ -47,7 +42,7 @@ def scans(plan, count=400, laser=AHEAD):
 
 
 def test_each_beam_starts_where_the_robot_is_at_its_time():
-    caster = OutdoorRayCaster(meadow(ahead(PieceKind.WALL, 6.0)))
+    caster = OutdoorRayCaster(meadow(ahead(YardKind.WALL, 6.0)))
     poses = HERE + np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.1], [2.0, -0.5, -0.2]])
     alone = [caster.cast(pose, AHEAD)[beam] for beam, pose in enumerate(poses)]
     np.testing.assert_array_equal(caster.cast(poses, AHEAD), alone)
@@ -59,28 +54,23 @@ def ranges(robot):
 
 
 def test_the_same_seed_gives_the_same_scans_and_another_another():
-    first, again, other = (ranges(simulate_fleet(TINY, seed).robots[1]) for seed in (1, 1, 2))
+    first, again, other = (ranges(simulate_fleet(TINY, seed, Yard()).robots[1]) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or np.any(first != other)
 
 
 def test_a_further_robot_changes_nothing_for_the_others():
-    few, more = simulate_fleet(TINY, 1), simulate_fleet(TINY.model_copy(update={"robots": 3}), 1)
+    few, more = (simulate_fleet(TINY.model_copy(update={"robots": count}), 1, Yard()) for count in (2, 3))
     for a, b in zip(few.robots, more.robots[:2], strict=True):
         np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
         np.testing.assert_array_equal(ranges(a), ranges(b))
 
 
 def test_ranges_stay_below_the_maximum_and_some_beams_return_nothing():
-    found = ranges(simulate_fleet(TINY, 3).robots[0])
+    found = ranges(simulate_fleet(TINY, 3, Yard()).robots[0])
     assert found.min() > 0.0
     assert found.max() <= np.float32(81.9)
     assert 0.4 < np.mean(found < 80.0) < 0.95
-
-
-def test_a_yard_has_no_images():
-    with pytest.raises(SimulationError, match=r"^a yard .* \(--no-camera\)$"):
-        simulate_fleet(TINY.model_copy(update={"camera": CameraSettings()}), 1)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -88,7 +78,7 @@ def test_everything_stands_in_the_yard_and_clear_of_its_ways(seed):
     plan = draw_yard(np.random.default_rng(seed))
     assert all(60.0 < size < 160.0 for size in plan.size_m)
     kinds = {piece.kind for piece in plan.pieces}
-    assert kinds >= {PieceKind.WALL, PieceKind.TRUNK, PieceKind.CAR}
+    assert kinds >= {YardKind.WALL, YardKind.TRUNK, YardKind.CAR}
     corners = np.concatenate([piece.outline for piece in plan.pieces])
     assert np.all((corners > 0.0) & (corners < plan.size_m))
     for start, end in plan.lanes:
@@ -121,14 +111,14 @@ def test_a_short_walk_goes_there_and_back():
 def test_some_cars_drive_away():
     plan = draw_yard(np.random.default_rng(2))
     moved = move_cars(plan, 0.5, np.random.default_rng(3))
-    cars, fewer = (sum(piece.kind is PieceKind.CAR for piece in p.pieces) for p in (plan, moved))
+    cars, fewer = (sum(piece.kind is YardKind.CAR for piece in p.pieces) for p in (plan, moved))
     assert 0 < fewer < cars
     assert len(plan.pieces) - len(moved.pieces) == cars - fewer
     assert len(moved.segments) < len(plan.segments)
 
 
 def test_a_trunk_is_met_at_its_bark():
-    plan = meadow(Piece(PieceKind.TRUNK, disc(0.2) + HERE[:2] + (6.0, 0.0)))
+    plan = meadow(Piece(YardKind.TRUNK, disc(0.2) + HERE[:2] + (6.0, 0.0)))
     assert OutdoorRayCaster(plan).cast(HERE, AHEAD)[1] == pytest.approx(5.8, abs=1e-9)
     assert scans(plan, 20) == pytest.approx(5.8, abs=0.01)
     laser = LaserModel(3, np.pi - 0.001, 0.001, 30.0, T_base_laser=(0.3, 0.0, 0.0))
@@ -137,8 +127,8 @@ def test_a_trunk_is_met_at_its_bark():
 
 def test_walls_are_met_where_lines_cross_them():
     plan = draw_yard(np.random.default_rng(4))
-    walls = tuple(piece for piece in plan.pieces if piece.kind is PieceKind.WALL)
-    bare = FloorPlan(plan.size_m, walls, segments_of(walls), plan.lanes, (), plan.terrain)
+    walls = tuple(piece for piece in plan.pieces if piece.kind is YardKind.WALL)
+    bare = YardPlan(plan.size_m, walls, segments_of(walls), plan.lanes, (), plan.terrain)
     laser = LaserModel(90, -np.pi, 2.0 * np.pi / 90, 30.0)
     x, y = min(
         (np.mean(lane, axis=0) for lane in plan.lanes), key=lambda point: distances(point[None], bare.segments)[0]
@@ -154,22 +144,22 @@ def test_walls_are_met_where_lines_cross_them():
 
 
 def test_a_hedge_returns_from_its_depth_and_a_fence_lets_beams_through():
-    discs = [Piece(PieceKind.HEDGE, disc(0.5) + HERE[:2] + (5.0, y)) for y in np.arange(-3.0, 3.0, 0.4)]
+    discs = [Piece(YardKind.HEDGE, disc(0.5) + HERE[:2] + (5.0, y)) for y in np.arange(-3.0, 3.0, 0.4)]
     hedge = scans(meadow(*discs))
     returned = hedge[hedge < 30.0]
     assert 0.8 < len(returned) / len(hedge) <= 1.0
     assert returned.min() > 4.49
     assert 0.05 < returned.std() < 0.3
-    fence = scans(meadow(ahead(PieceKind.FENCE, 4.0, 0.1), ahead(PieceKind.WALL, 8.0)))
+    fence = scans(meadow(ahead(YardKind.FENCE, 4.0, 0.1), ahead(YardKind.WALL, 8.0)))
     assert {*np.round(fence, 1)} == {4.0, 4.1, 8.0}
     assert 0.2 < np.mean(fence > 7.0) < 0.7
 
 
 def test_glass_returns_what_it_faces_and_else_lets_through_or_mirrors():
-    pane = ahead(PieceKind.GLASS, 4.9)
+    pane = ahead(YardKind.GLASS, 4.9)
     assert scans(meadow(pane)) == pytest.approx(5.0, abs=0.01)
-    beside = Piece(PieceKind.WALL, rectangle((9.0, 0.2), 0.0) + HERE[:2] + (0.0, 7.0))
-    room = meadow(pane, ahead(PieceKind.WALL, 7.0, wide_m=14.0), beside)
+    beside = Piece(YardKind.WALL, rectangle((9.0, 0.2), 0.0) + HERE[:2] + (0.0, 7.0))
+    room = meadow(pane, ahead(YardKind.WALL, 7.0, wide_m=14.0), beside)
     laser = LaserModel(3, 0.499, 0.001, 30.0)
     caster, rng = OutdoorRayCaster(room), np.random.default_rng(1)
     found = np.array([caster.scan(HERE, laser, rng)[1] for _ in range(400)])
@@ -180,7 +170,7 @@ def test_glass_returns_what_it_faces_and_else_lets_through_or_mirrors():
 
 
 def test_uphill_the_beam_ends_on_the_ground_and_downhill_it_passes_over_a_low_wall():
-    wall = ahead(PieceKind.LOW_WALL, 12.0)
+    wall = ahead(YardKind.LOW_WALL, 12.0)
     level = scans(meadow(wall))
     assert np.mean(np.abs(level - 12.0) < 0.1) > 0.9
     # A hill of 4 % begins where the robot leaves level ground.
@@ -188,7 +178,7 @@ def test_uphill_the_beam_ends_on_the_ground_and_downhill_it_passes_over_a_low_wa
     x = CELL_M * np.arange(42.0)
     rising, falling = (np.tile(slope * np.maximum(x - 22.0, 0.0), (42, 1)) for slope in (0.08, -0.04))
     uphill, downhill = (
-        scans(FloorPlan(plan.size_m, plan.pieces, plan.segments, plan.lanes, (), Terrain(heights)))
+        scans(YardPlan(plan.size_m, plan.pieces, plan.segments, plan.lanes, (), Terrain(heights)))
         for heights in (rising, falling)
     )
     reach = 2.0 + LASER_HEIGHT_M / 0.08
@@ -206,31 +196,6 @@ def test_the_slope_of_a_yard_is_an_option_that_moves_nothing_else(slope):
 
 
 def test_a_dark_car_is_not_met_from_far():
-    near, far = (np.mean(scans(meadow(ahead(PieceKind.CAR, at)), 200) < 30.0) for at in (8.0, 18.0))
+    near, far = (np.mean(scans(meadow(ahead(YardKind.CAR, at)), 200) < 30.0) for at in (8.0, 18.0))
     assert near > 0.8
     assert far == 0.0
-
-
-def test_good_odometry_is_right_to_a_few_percent_and_slipping_odometry_slips():
-    _, poses = drive(np.array([[0.0, 0.0], [100.0, 0.0]]), 0.1)
-    ends, steps = {}, {}
-    for kind in (OdometryKind.GOOD, OdometryKind.SLIPPING):
-        drives = np.array([simulate_odometry(poses, KINDS[kind], np.random.default_rng(k)) for k in range(100)])
-        ends[kind], steps[kind] = drives[:, 500], np.linalg.norm(np.diff(drives[..., :2], axis=1), axis=2)
-    half = poses[500, 0]
-    good, slipping = ends[OdometryKind.GOOD], ends[OdometryKind.SLIPPING]
-    assert np.std(good[:, 0] - half) < 0.04 * half
-    assert np.rad2deg(np.std(good[:, 2])) < 6.0
-    assert steps[OdometryKind.GOOD].max() < 0.15
-    slips = steps[OdometryKind.SLIPPING] > 0.15
-    assert 0.02 < slips.sum() / (len(slips) * 100.0) < 0.06
-    assert 0.6 < steps[OdometryKind.SLIPPING].max() < 0.85
-    assert np.std(slipping[:, 0]) > np.std(good[:, 0])
-
-
-def test_scanners_of_less_than_a_turn_end_at_their_edges():
-    half, full = (settings.model((0.0, 0.0, 0.0)) for settings in (SICK, LidarSettings()))
-    np.testing.assert_allclose(half.angles_rad()[[0, 90, 180]], [-np.pi / 2.0, 0.0, np.pi / 2.0], atol=1e-12)
-    assert full.angles_rad()[0] == -np.pi
-    assert all(a < b for a, b in pairwise(full.angles_rad()))
-    assert full.angles_rad()[-1] < np.pi - 0.5 * full.angle_increment_rad

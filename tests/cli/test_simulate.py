@@ -47,24 +47,6 @@ def test_a_bag_holds_the_same_scans(simulated, tmp_path):
     )
 
 
-def test_the_robot_of_a_yard_is_as_asked(tmp_path):
-    file = tmp_path / "sick.yaml"
-    file.write_text(f"lidar: {{beams: 91, field_of_view_rad: {np.pi}, max_range_m: 81.9, rate_hz: 2}}")
-    asked = ["--config", str(file), "--odometry", "good"]
-    tiny = ["tools", "simulate", "--building", "yard", "--no-camera", "--robots", "1", "--path-length", "5"]
-    assert main([*tiny, *asked, "--output", str(tmp_path / "yard")]) == 0
-    scans = [record for record in open_source(tmp_path / "yard" / "robot_1").records() if isinstance(record, LaserScan)]
-    laser = scans[0].laser
-    assert (laser.beam_count, laser.max_range_m) == (91, 81.9)
-    assert np.rad2deg(np.ptp(laser.angles_rad())) == pytest.approx(180.0)
-    assert scans[1].stamp - scans[0].stamp == pytest.approx(0.5)
-    assert main([*tiny, "--output", str(tmp_path / "default")]) == 0
-    settings = (tmp_path / "default" / "simulation.yaml").read_text(encoding="utf-8")
-    assert "max_range_m: 30.0" in settings
-    assert main([*tiny, "--scanner", "ld19", "--output", str(tmp_path / "ld19")]) == 0
-    assert "max_range_m: 12.0" in (tmp_path / "ld19" / "simulation.yaml").read_text(encoding="utf-8")
-
-
 def test_a_scanner_is_as_asked_and_a_file_overrides_it(tmp_path):
     file = tmp_path / "other.yaml"
     file.write_text("{lidar: {beams: 100, rate_hz: 5, max_range_m: 8}, turn_rate_rad_s: 1}")

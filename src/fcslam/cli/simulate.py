@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     from fcslam.records import RecordedItem
 
 
-OUTDOORS_M = 30.0
-"""Range of the instantaneous scanner outdoors, unless a configuration says more."""
-
-
 def simulate(
     *,
     output: Annotated[
@@ -83,9 +79,6 @@ def simulate(
     settings = settings.model_copy(update={key: value for key, value in given.items() if value is not None})
     if odometry is not None:
         settings = settings.model_copy(update={"drift": KINDS[odometry]})  # none is a kind, too
-    usual_m = SCANNERS[Scanner.INSTANT].max_range_m
-    if settings.building.is_outdoors and scanner is None and settings.lidar.max_range_m == usual_m:
-        settings = settings.model_copy(update={"lidar": settings.lidar.model_copy(update={"max_range_m": OUTDOORS_M})})
     if no_camera:
         settings = settings.model_copy(update={"camera": None})
     fleet = simulate_fleet(settings, seed)

@@ -2,10 +2,7 @@
 
 import numpy as np
 
-from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.route import draw_goals, plan_route, schedule
-
-INDOORS = [building for building in Building if not building.is_outdoors]
 
 
 def route(plan, length_m, rng):

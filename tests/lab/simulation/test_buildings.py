@@ -17,9 +17,9 @@ from fcslam.lab.simulation.floorplan import (
 )
 from fcslam.lab.simulation.options import Building, Lighting
 from fcslam.lab.simulation.route import schedule
-from tests.lab.simulation.driving import INDOORS, distances, drive, route
+from tests.lab.simulation.driving import distances, drive, route
 
-every_building = pytest.mark.parametrize("building", INDOORS)
+every_building = pytest.mark.parametrize("building", list(Building))
 
 
 @every_building

@@ -11,7 +11,7 @@ from fcslam.lab.simulation.drivable_space import ROBOT_RADIUS_M, DrivableSpace
 from fcslam.lab.simulation.floorplan import FloorPlan, Piece, PieceKind, Room, draw_floor_plan, move_furniture
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, draw_goals, plan_route, schedule
-from tests.lab.simulation.driving import INDOORS, distances, drive, route
+from tests.lab.simulation.driving import distances, drive, route
 
 
 def box(west, south, east, north):
@@ -38,7 +38,7 @@ def route_of(seed, building=Building.DEFAULT, length_m=60.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("building", INDOORS)
+@pytest.mark.parametrize("building", list(Building))
 def test_robots_touch_nothing_wherever_furniture_stands(building):
     rng = np.random.default_rng(0)
     plan = draw_floor_plan(rng, building)
@@ -117,7 +117,7 @@ def test_a_further_robot_changes_no_goals():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("building", INDOORS)
+@pytest.mark.parametrize("building", list(Building))
 def test_neighbours_share_ground_and_return_to_their_own(building):
     rng = np.random.default_rng(0)
     plan = draw_floor_plan(rng, building)

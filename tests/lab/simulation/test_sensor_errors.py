@@ -1,5 +1,7 @@
 """Errors of sensors: odometry drifts and ranges are noisy as the settings say."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -147,3 +149,29 @@ def test_default_odometry_is_bad_enough_to_need_a_map(seed):
 def test_impossible_settings_are_refused(content):
     with pytest.raises(ConfigError, match="fleet"):
         config.parse(SimulationSettings, content, "fleet")
+
+
+def test_good_odometry_is_right_to_a_few_percent_and_slipping_odometry_slips():
+    _, poses = drive(np.array([[0.0, 0.0], [100.0, 0.0]]), 0.1)
+    ends, steps = {}, {}
+    for kind in (OdometryKind.GOOD, OdometryKind.SLIPPING):
+        drives = np.array([simulate_odometry(poses, KINDS[kind], np.random.default_rng(k)) for k in range(100)])
+        ends[kind], steps[kind] = drives[:, 500], np.linalg.norm(np.diff(drives[..., :2], axis=1), axis=2)
+    half = poses[500, 0]
+    good, slipping = ends[OdometryKind.GOOD], ends[OdometryKind.SLIPPING]
+    assert np.std(good[:, 0] - half) < 0.04 * half
+    assert np.rad2deg(np.std(good[:, 2])) < 6.0
+    assert steps[OdometryKind.GOOD].max() < 0.15
+    slips = steps[OdometryKind.SLIPPING] > 0.15
+    assert 0.02 < slips.sum() / (len(slips) * 100.0) < 0.06
+    assert 0.6 < steps[OdometryKind.SLIPPING].max() < 0.85
+    assert np.std(slipping[:, 0]) > np.std(good[:, 0])
+
+
+def test_scanners_of_less_than_a_turn_end_at_their_edges():
+    sick = LidarSettings(beams=181, field_of_view_rad=np.pi)
+    half, full = (settings.model((0.0, 0.0, 0.0)) for settings in (sick, LidarSettings()))
+    np.testing.assert_allclose(half.angles_rad()[[0, 90, 180]], [-np.pi / 2.0, 0.0, np.pi / 2.0], atol=1e-12)
+    assert full.angles_rad()[0] == -np.pi
+    assert all(a < b for a, b in pairwise(full.angles_rad()))
+    assert full.angles_rad()[-1] < np.pi - 0.5 * full.angle_increment_rad

@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from benchmarks.evaluation.federated.poison import PoisonedClient
+from evaluation.federated.poison import PoisonedClient
+
 from fcslam.errors import OutputError, TrainingError
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, read_state, write_state
 from fcslam.learning.federated.history import ROUNDS_FILE

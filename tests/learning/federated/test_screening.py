@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from benchmarks.evaluation.federated.poison import apply_update
+from evaluation.federated.poison import apply_update
+
 from fcslam.learning.federated.screening import agreements, screen, statistics_distances, update_length
 from fcslam.learning.federated.settings import ScreeningSettings
 from fcslam.learning.federated.weights import trained_names, update_vector, weights_error

@@ -13,7 +13,6 @@ import numpy as np
 
 from fcslam.lab.simulation.layouts import Lane, Layout, Row, draw_layout
 from fcslam.lab.simulation.options import Building
-from fcslam.lab.simulation.terrain import Terrain
 from fcslam.records import FloatArray, frozen
 
 WALL_M = 0.12
@@ -22,6 +21,9 @@ DOOR_M = 1.0
 """Width of a door."""
 CLEARANCE_M = 0.5
 """Distance of furniture from the centre lines of corridors and the entrances of rooms."""
+
+DISC_CORNERS = 8
+"""Corners of the outline of a round piece."""
 
 _ATTEMPTS = 20
 """Attempts to place a piece of furniture before it is omitted."""
@@ -39,27 +41,16 @@ class PieceKind(StrEnum):
     COLUMN = "column"
     LINTEL = "lintel"
     """The wall above a door; robots and LiDAR beams pass under it."""
-    GLASS = "glass"
-    TRUNK = "trunk"
-    BOLLARD = "bollard"
-    HEDGE = "hedge"
-    """A bush; hedges are rows of them."""
-    FENCE = "fence"
-    LOW_WALL = "low wall"
-    CAR = "car"
-
-
-ROUND = frozenset({PieceKind.COLUMN, PieceKind.TRUNK, PieceKind.BOLLARD, PieceKind.HEDGE})
-"""Kinds of pieces that are discs, with eight corners on their edge."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A wall, a piece of furniture or something that stands in a yard, seen from above."""
+    """A wall or a piece of furniture, seen from above."""
 
-    kind: PieceKind
+    kind: StrEnum
+    """``PieceKind``, or that of another world."""
     outline: FloatArray
-    """Corners counter-clockwise, metres: (8, 2) of a round kind, else (4, 2) of a rectangle or (K, 2) of a car."""
+    """Corners counter-clockwise, metres: (8, 2) of a ``disc``, else (4, 2) of a rectangle or (K, 2) of a polygon."""
 
     @property
     def centre(self) -> FloatArray:
@@ -68,8 +59,8 @@ class Piece:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Length and width, metres; for round kinds the diameter twice."""
-        if self.kind in ROUND:
+        """Length and width, metres; of a disc the diameter twice."""
+        if len(self.outline) == DISC_CORNERS:
             diameter = float(np.linalg.norm(self.outline[4] - self.outline[0]))
             return diameter, diameter
         sides = np.linalg.norm(np.diff(self.outline[:3], axis=0), axis=1)
@@ -102,7 +93,7 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """Obstacles, corridors and rooms of one floor; or a yard, which has ways and no rooms."""
+    """Obstacles, corridors and rooms of one floor."""
 
     size_m: tuple[float, float]
     """From west to east and from south to north."""
@@ -110,10 +101,8 @@ class FloorPlan:
     segments: FloatArray
     """Sides of walls and furniture at the laser's height: x1 y1 x2 y2, shape (S, 4)."""
     lanes: tuple[Lane, ...]
-    """Centre lines of the corridors, or of a yard's ways, which meet at their ends."""
+    """Centre lines of the corridors, which meet at their ends."""
     rooms: tuple[Room, ...]
-    terrain: Terrain | None = None
-    """The ground of a yard; None for a building, whose floor is level."""
 
 
 def draw_floor_plan(rng: np.random.Generator, building: Building = Building.DEFAULT) -> FloorPlan:
@@ -292,7 +281,7 @@ def rotation(heading_rad: float) -> FloatArray:
 
 def disc(radius: float) -> FloatArray:
     """Outline of a round piece around the origin, shape (8, 2)."""
-    angles = np.arange(8) * np.pi / 4.0
+    angles = np.arange(DISC_CORNERS) * np.pi / 4.0
     return radius * np.column_stack((np.cos(angles), np.sin(angles)))
 
 

@@ -10,13 +10,6 @@ class Building(StrEnum):
     DEFAULT = "default"
     OFFICE = "office"
     CORRIDOR = "corridor"
-    YARD = "yard"
-    """Outdoors, between buildings."""
-
-    @property
-    def is_outdoors(self) -> bool:
-        """Whether it has a terrain instead of a level floor."""
-        return self is Building.YARD
 
 
 class Scanner(StrEnum):

@@ -12,7 +12,7 @@ import fcslam
 from fcslam.config import dump
 from fcslam.errors import OutputError, writing
 from fcslam.geometry import se2
-from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, ray_caster
+from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, RecordedItem, frozen
@@ -129,7 +129,7 @@ def true_map(fleet: SimulatedFleet) -> OccupancyMap:
 def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:
     import cv2
 
-    caster = ray_caster(robot.plan)
+    caster = robot.world.caster(robot.plan)
     for pose, laser in product(_spaced(robot.T_building_base), robot.lasers):
         start, ends = _beams(caster.cast(pose, laser), laser, pose)
         columns, rows = np.floor(ends).astype(int).T

@@ -63,6 +63,10 @@ class RayCaster:
             )
         return np.where(distances < 0.0, far, np.minimum(distances, far))
 
+    def scan(self, T_building_base: FloatArray, laser: LaserModel, rng: np.random.Generator) -> FloatArray:  # noqa: ARG002
+        """The ranges of a scan without noise, which in a building are those of ``cast``."""
+        return self.cast(T_building_base, laser)
+
 
 class Camera:
     """Renders images of the model's camera; close it, or use it in a ``with``.

@@ -17,17 +17,14 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.errors import SimulationError
 from fcslam.lab.simulation.decoration import Decoration, decorate, light_of
-from fcslam.lab.simulation.floorplan import FloorPlan, doors_after, draw_floor_plan, move_furniture, with_closed_doors
+from fcslam.lab.simulation.floorplan import FloorPlan, doors_after, with_closed_doors
 from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, simulate_ranges
 from fcslam.lab.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
-from fcslam.lab.simulation.outdoor_rays import OutdoorRayCaster
-from fcslam.lab.simulation.route import TURN_RATE_RAD_S, Schedule, draw_goals, plan_route, schedule
-from fcslam.lab.simulation.scene import bare_model, furnished_model
-from fcslam.lab.simulation.sensors import Camera, RayCaster
-from fcslam.lab.simulation.terrain import SLOPE
-from fcslam.lab.simulation.walk import draw_starts, plan_walk
-from fcslam.lab.simulation.yard import draw_yard, move_cars
+from fcslam.lab.simulation.route import TURN_RATE_RAD_S, Schedule, schedule
+from fcslam.lab.simulation.scene import furnished_model
+from fcslam.lab.simulation.sensors import Camera
+from fcslam.lab.simulation.world import IndoorWorld, World
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -80,7 +77,7 @@ class SimulationSettings(Settings):
     """A simulated fleet."""
 
     building: Building = Field(
-        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor or yard"
+        default=Building.DEFAULT, description="kind of building: flat, default, office or corridor"
     )
     robots: int = Field(default=3, ge=1, description="number of robots")
     path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
@@ -91,8 +88,7 @@ class SimulationSettings(Settings):
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="share of the furniture in rooms that moves before the second and each further robot; "
-        "in a yard, share of the parked cars that drive away",
+        description="share of the furniture in rooms that moves before the second and each further robot",
     )
     lasting_changes: bool = Field(
         default=False,
@@ -107,12 +103,6 @@ class SimulationSettings(Settings):
     )
     turn_rate_rad_s: float = Field(
         default=TURN_RATE_RAD_S, gt=0.0, le=6.0, description="rate at which the robots turn [rad/s]"
-    )
-    slope: float = Field(
-        default=SLOPE,
-        ge=0.0,
-        le=0.3,
-        description="root mean square slope of a yard in each direction",
     )
     lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
     drift: OdometryNoiseSettings | None = Field(
@@ -138,6 +128,7 @@ class SimulatedRobot:
     """Wheel odometry as it is read; None without odometry. A LiDAR that does not spin has one reading at each scan."""
     image_stamps: FloatArray
     """Stamps of its images, shape (M,), seconds; empty without a camera."""
+    world: World
     plan: FloorPlan
     """The building with the furniture at the time of this robot."""
     lighting: Lighting
@@ -187,7 +178,7 @@ class SimulatedRobot:
         Raises:
             SimulationError: MuJoCo is missing.
         """
-        caster, settings, (laser,) = ray_caster(self.plan), self.settings.lidar, self.lasers
+        caster, settings, (laser,) = self.world.caster(self.plan), self.settings.lidar, self.lasers
         for k in range(len(self.stamps)):
             rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
             sweep = settings.sweep(laser.beams)
@@ -196,8 +187,7 @@ class SimulatedRobot:
                 poses = self.route.at(stamp - self.first_stamp + times_s)
                 if self.readings is not None:
                     sweep = moving_sweep(sweep, stamp, self.readings.around(stamp, stamp + sweep.duration_s))
-            met = caster.scan(poses, laser, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(poses, laser)
-            ranges = simulate_ranges(met, laser, settings, rng)
+            ranges = simulate_ranges(caster.scan(poses, laser, rng), laser, settings, rng)
             yield LaserScan(stamp, frozen(ranges, np.float32), laser, self.T_odom_base[k], sweep)
 
     def _images(self) -> Generator[CameraImage, None, None]:
@@ -249,33 +239,28 @@ class SimulatedFleet:
     robots: tuple[SimulatedRobot, ...]
 
 
-def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
+def simulate_fleet(settings: SimulationSettings, seed: int, world: World | None = None) -> SimulatedFleet:
     """Draw a building and plan the route of each robot; the same seed gives the same fleet.
+
+    ``world`` replaces the building of the settings; cameras see buildings only.
 
     Raises:
         SimulationError: the building is too small for this many robots, or has too little free space.
     """
-    outdoors = settings.building.is_outdoors
     if settings.closed_doors and settings.camera:
         raise SimulationError("closed doors are simulated for LiDARs only; leave the cameras off")
-    if outdoors and settings.camera:
-        raise SimulationError(
-            f"a {settings.building} is simulated for LiDARs only; leave the cameras off (--no-camera)"
-        )
-    building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
-    plan = draw_yard(building, settings.slope) if outdoors else draw_floor_plan(building, settings.building)
+    world = world or IndoorWorld(settings.building)
+    plan = world.draw(_generator(seed, _RandomStream.BUILDING))
     _check_room(plan, settings)
-    if outdoors:
-        goals = draw_starts(plan, settings.robots, goals_rng)
-    else:
-        goals = draw_goals(plan, settings.robots, settings.path_length_m, goals_rng)
+    goals = world.goals(plan, settings.robots, settings.path_length_m, _generator(seed, _RandomStream.GOALS))
     decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
     robots: list[SimulatedRobot] = []
     left, closed = plan, frozenset[int]()
     for number in range(settings.robots):
         rng = _generator(seed, _RandomStream.ROBOTS, number)
-        found = _moved(left, goals[number], settings, rng) if number else plan
-        robot = _robot(found, decoration, number, goals[number], settings, seed, rng)
+        visited = goals[number] if settings.lasting_changes else None
+        found = world.changed(left, settings.moved_furniture, rng, visited) if number else plan
+        robot = _robot(world, found, decoration, number, goals[number], settings, seed, rng)
         if settings.closed_doors:
             doors_rng, route = _generator(seed, _RandomStream.DOORS, number), robot.T_building_base[:, :2]
             closed = doors_after(found, closed, settings.closed_doors, route, doors_rng)
@@ -283,13 +268,6 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
         robots.append(robot)
         left = found if settings.lasting_changes else plan
     return SimulatedFleet(plan, tuple(robots))
-
-
-def _moved(plan: FloorPlan, goals: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
-    """The plan as a further robot finds it."""
-    if plan.terrain is not None:
-        return move_cars(plan, settings.moved_furniture, rng)
-    return move_furniture(plan, settings.moved_furniture, rng, goals if settings.lasting_changes else None)
 
 
 def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
@@ -303,6 +281,7 @@ def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
 
 
 def _robot(
+    world: World,
     plan: FloorPlan,
     decoration: Decoration | None,
     number: int,
@@ -311,8 +290,7 @@ def _robot(
     seed: int,
     rng: np.random.Generator,
 ) -> SimulatedRobot:
-    find_way = plan_route if plan.terrain is None else plan_walk
-    route = schedule(find_way(plan, goals, settings.path_length_m, rng), settings.turn_rate_rad_s)
+    route = schedule(world.route(plan, goals, settings.path_length_m, rng), settings.turn_rate_rad_s)
     if settings.lidar.spin:
         route = route.eased()
     times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
@@ -330,6 +308,7 @@ def _robot(
         T_odom_base=frozen(np.tile(UNKNOWN_POSE, (len(stamps), 1))) if readings is None else readings.at(stamps),
         readings=readings,
         image_stamps=frozen(np.round(first_stamp + image_times, 6)),
+        world=world,
         plan=plan,
         lighting=settings.lighting[number % len(settings.lighting)],
         settings=settings,
@@ -350,15 +329,6 @@ def _readings(
     if settings.lidar.spin:
         times = np.arange(0.0, times[-1] + 1.0 / settings.lidar.rate_hz + 1.0 / READING_RATE_HZ, 1.0 / READING_RATE_HZ)
     return read_odometry(np.round(first_stamp + times, 6), route.at(times), settings.drift, rng)
-
-
-def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
-    """Return the ray caster for a building or a yard.
-
-    Raises:
-        SimulationError: MuJoCo is missing, which buildings need.
-    """
-    return RayCaster(bare_model(plan)) if plan.terrain is None else OutdoorRayCaster(plan)
 
 
 def _jpeg(pixels: FloatArray) -> bytes:

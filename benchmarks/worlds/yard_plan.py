@@ -1,9 +1,14 @@
-"""Sloping ground of a yard. It tilts the robot and its scan plane, but poses stay those seen from above."""
+"""The plan of a yard: what stands there, and its sloping ground.
+
+The ground tilts the robot and its scan plane, but poses stay those seen from above.
+"""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
+from fcslam.lab.simulation.floorplan import FloorPlan
 from fcslam.records import FloatArray, frozen
 
 CELL_M = 1.0
@@ -34,6 +39,33 @@ class Terrain:
         across, up = column - j, row - i
         below, above = self.heights_m[i : i + 2, j : j + 2] @ (1.0 - across, across)
         return float(below + up * (above - below))
+
+
+class YardKind(StrEnum):
+    """Kinds of pieces in a yard."""
+
+    WALL = "wall"
+    GLASS = "glass"
+    COLUMN = "column"
+    CABINET = "cabinet"
+    TRUNK = "trunk"
+    BOLLARD = "bollard"
+    HEDGE = "hedge"
+    """A bush; hedges are rows of them."""
+    FENCE = "fence"
+    LOW_WALL = "low wall"
+    CAR = "car"
+
+
+ROUND = frozenset({YardKind.COLUMN, YardKind.TRUNK, YardKind.BOLLARD, YardKind.HEDGE})
+"""Kinds of pieces that are discs."""
+
+
+@dataclass(frozen=True, slots=True)
+class YardPlan(FloorPlan):
+    """What stands in a yard; its lanes are the ways, and it has no rooms."""
+
+    terrain: Terrain
 
 
 def draw_terrain(size_m: tuple[float, float], rng: np.random.Generator, slope: float = SLOPE) -> Terrain:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2
-from fcslam.lab.simulation.floorplan import ROUND, FloorPlan, Piece, PieceKind
-from fcslam.lab.simulation.terrain import CELL_M as TERRAIN_CELL_M
-from fcslam.lab.simulation.terrain import Terrain
+from fcslam.lab.simulation.floorplan import Piece
 from fcslam.records import FloatArray, LaserModel
+
+from .yard_plan import CELL_M as TERRAIN_CELL_M
+from .yard_plan import ROUND, YardKind, YardPlan
 
 LASER_HEIGHT_M: Final = 0.5
 
@@ -57,16 +58,16 @@ class Layer(NamedTuple):
 
 
 LAYERS: Final = {
-    PieceKind.WALL: (Layer(0.0, 8.0, 1.0, 0.5),),
-    PieceKind.GLASS: (Layer(0.0, 2.5, 1.0, 0.5, glass=True), Layer(2.5, 8.0, 1.0, 0.5)),
-    PieceKind.COLUMN: (Layer(0.0, 4.0, 1.0, 0.5),),
-    PieceKind.CABINET: (Layer(0.0, 1.1, 1.0, 0.5),),
-    PieceKind.TRUNK: (Layer(0.0, 3.0, 1.0, 0.3),),
-    PieceKind.BOLLARD: (Layer(0.0, 0.9, 1.0, 0.5),),
-    PieceKind.LOW_WALL: (Layer(0.0, 0.6, 1.0, 0.5),),
-    PieceKind.HEDGE: (Layer(0.0, 1.3, 1.0, 0.3, free_path_m=0.18),),
-    PieceKind.FENCE: (Layer(0.0, 1.6, 0.5, 0.5),),
-    PieceKind.CAR: (Layer(0.2, 0.85, 0.95, 0.3), Layer(0.85, 1.4, 0.4, 0.3)),
+    YardKind.WALL: (Layer(0.0, 8.0, 1.0, 0.5),),
+    YardKind.GLASS: (Layer(0.0, 2.5, 1.0, 0.5, glass=True), Layer(2.5, 8.0, 1.0, 0.5)),
+    YardKind.COLUMN: (Layer(0.0, 4.0, 1.0, 0.5),),
+    YardKind.CABINET: (Layer(0.0, 1.1, 1.0, 0.5),),
+    YardKind.TRUNK: (Layer(0.0, 3.0, 1.0, 0.3),),
+    YardKind.BOLLARD: (Layer(0.0, 0.9, 1.0, 0.5),),
+    YardKind.LOW_WALL: (Layer(0.0, 0.6, 1.0, 0.5),),
+    YardKind.HEDGE: (Layer(0.0, 1.3, 1.0, 0.3, free_path_m=0.18),),
+    YardKind.FENCE: (Layer(0.0, 1.6, 0.5, 0.5),),
+    YardKind.CAR: (Layer(0.2, 0.85, 0.95, 0.3), Layer(0.85, 1.4, 0.4, 0.3)),
 }
 """Objects in a yard, from the ground upwards."""
 
@@ -88,11 +89,10 @@ class _World(NamedTuple):
 class OutdoorRayCaster:
     """Casts beams in a yard."""
 
-    def __init__(self, plan: FloorPlan) -> None:
-        """Index everything that stands on ``plan``, which has a terrain."""
-        assert plan.terrain is not None, "a building has no terrain; use RayCaster"
+    def __init__(self, plan: YardPlan) -> None:
+        """Index everything that stands on ``plan``."""
         self._terrain = plan.terrain
-        self._world = _world(plan, plan.terrain)
+        self._world = _world(plan)
 
     def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
         """Ranges (beam_count,) in metres on level ground, as if everything returned every beam.
@@ -114,7 +114,7 @@ class OutdoorRayCaster:
         return np.asarray(_cast_beams(origins, angles, tilt, far, np.uint64(seed or 0), ideal, self._world))
 
 
-def _world(plan: FloorPlan, terrain: Terrain) -> _World:
+def _world(plan: YardPlan) -> _World:
     surfaces = np.array([row for piece in plan.pieces for row in _rows(piece)])
     columns, rows = (int(np.ceil(size / _CELL_M)) for size in plan.size_m)
     cells, members = [], []
@@ -130,14 +130,14 @@ def _world(plan: FloorPlan, terrain: Terrain) -> _World:
     cell, member = np.concatenate(cells), np.concatenate(members)
     order = np.argsort(cell, kind="stable")
     first = np.searchsorted(cell[order], np.arange(columns * rows + 1))
-    return _World(surfaces, first, member[order], columns, rows, np.ascontiguousarray(terrain.heights_m))
+    return _World(surfaces, first, member[order], columns, rows, np.ascontiguousarray(plan.terrain.heights_m))
 
 
 def _rows(piece: Piece) -> list[list[float]]:
     layers = [[float(value) for value in layer] for layer in LAYERS[piece.kind]]
     if piece.kind in ROUND:
         return [[1.0, *piece.centre, 0.5 * piece.size[0], 0.0, *layer[:5]] for layer in layers]
-    if piece.kind is PieceKind.GLASS:
+    if piece.kind is YardKind.GLASS:
         # One pane along the middle, or beams would have to pass two.
         long = 0 if piece.size[0] >= piece.size[1] else 1
         a, b, c, d = np.roll(piece.outline, -long, axis=0)

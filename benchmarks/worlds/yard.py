@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from fcslam.lab.simulation.floorplan import (
     FloorPlan,
     Piece,
-    PieceKind,
     disc,
     distance_m,
     rectangle,
@@ -23,8 +22,11 @@ from fcslam.lab.simulation.floorplan import (
     segments_of,
 )
 from fcslam.lab.simulation.layouts import Lane
-from fcslam.lab.simulation.terrain import SLOPE, draw_terrain
 from fcslam.records import FloatArray, frozen
+
+from .outdoor_rays import OutdoorRayCaster
+from .walk import draw_starts, plan_walk
+from .yard_plan import SLOPE, YardKind, YardPlan, draw_terrain
 
 CLEARANCE_M = 1.7
 """Distance of everything from the centre line of a way."""
@@ -55,7 +57,7 @@ class _Site:
     rng: np.random.Generator
     pieces: list[Piece]
 
-    def stand(self, kind: PieceKind, outline: FloatArray) -> bool:
+    def stand(self, kind: YardKind, outline: FloatArray) -> bool:
         """Add a piece if it keeps clear of the ways."""
         centre, radius = outline.mean(axis=0), float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).max())
         points = _along(outline, 0.5) if radius > 0.5 else centre[None]
@@ -66,12 +68,35 @@ class _Site:
         self.pieces.append(Piece(kind, frozen(outline)))
         return True
 
-    def disc(self, kind: PieceKind, centre: FloatArray, radius: float) -> bool:
+    def disc(self, kind: YardKind, centre: FloatArray, radius: float) -> bool:
         """Add a round piece if it keeps clear of the ways."""
         return self.stand(kind, disc(radius) + centre)
 
 
-def draw_yard(rng: np.random.Generator, slope: float = SLOPE) -> FloorPlan:
+@dataclass(frozen=True, slots=True)
+class Yard:
+    """A yard as the world of a fleet, for LiDARs."""
+
+    slope: float = SLOPE
+    """Root mean square slope in each direction."""
+
+    def draw(self, rng: np.random.Generator) -> YardPlan:
+        return draw_yard(rng, self.slope)
+
+    def goals(self, plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:  # noqa: ARG002
+        return draw_starts(plan, robots, rng)
+
+    def changed(self, plan: YardPlan, share: float, rng: np.random.Generator, visited: FloatArray | None) -> YardPlan:  # noqa: ARG002
+        return move_cars(plan, share, rng)
+
+    def route(self, plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
+        return plan_walk(plan, goals, length_m, rng)
+
+    def caster(self, plan: YardPlan) -> OutdoorRayCaster:
+        return OutdoorRayCaster(plan)
+
+
+def draw_yard(rng: np.random.Generator, slope: float = SLOPE) -> YardPlan:
     """Draw a yard of 70 to 120 m in each direction; the same generator state gives the same one.
 
     ``slope`` describes its ground as in ``draw_terrain``; it changes nothing else.
@@ -92,12 +117,12 @@ def draw_yard(rng: np.random.Generator, slope: float = SLOPE) -> FloorPlan:
         _beside_ways(block, site)
     _around(size_m, site)
     terrain = draw_terrain(size_m, rng, slope)
-    return FloorPlan(size_m, tuple(site.pieces), segments_of(site.pieces), site.lanes, (), terrain)
+    return YardPlan(size_m, tuple(site.pieces), segments_of(site.pieces), site.lanes, (), terrain)
 
 
-def move_cars(plan: FloorPlan, share: float, rng: np.random.Generator) -> FloorPlan:
+def move_cars(plan: YardPlan, share: float, rng: np.random.Generator) -> YardPlan:
     """Let a ``share`` of the parked cars drive away."""
-    stays = tuple(piece for piece in plan.pieces if piece.kind is not PieceKind.CAR or rng.random() >= share)
+    stays = tuple(piece for piece in plan.pieces if piece.kind is not YardKind.CAR or rng.random() >= share)
     return replace(plan, pieces=stays, segments=segments_of(stays))
 
 
@@ -144,7 +169,7 @@ def _building(block: _Block, site: _Site) -> None:
         _front(site, float(length), heading, middle, -0.5 * float(depth))
         inner = -0.5 * depth + 3.5
         end = 0.5 * length - 3.5
-        _wall_between(site, PieceKind.WALL, (-end, inner), (end, inner), heading, middle)
+        _wall_between(site, YardKind.WALL, (-end, inner), (end, inner), heading, middle)
 
 
 def _front(site: _Site, length: float, heading_rad: float, middle: FloatArray, across: float) -> None:
@@ -154,7 +179,7 @@ def _front(site: _Site, length: float, heading_rad: float, middle: FloatArray, a
         _wall_between(site, kind, (a - 0.5 * length, y), (b - 0.5 * length, y), heading_rad, middle)
 
 
-def _facade(length: float, rng: np.random.Generator) -> Iterator[tuple[float, float, float, PieceKind]]:
+def _facade(length: float, rng: np.random.Generator) -> Iterator[tuple[float, float, float, YardKind]]:
     """Walls along and across one side: start and end along it, depth behind its line, kind. Across, start is end."""
     at, before = 0.0, 0.0
     recesses, fronts = rng.uniform(0.1, 0.4), rng.uniform(0.05, 0.4)
@@ -164,17 +189,17 @@ def _facade(length: float, rng: np.random.Generator) -> Iterator[tuple[float, fl
             end = length
         first_or_last = at == 0.0 or end == length
         depth = float(rng.uniform(0.2, 1.6)) if not first_or_last and rng.random() < recesses else 0.0
-        kind = PieceKind.GLASS if rng.random() < fronts else PieceKind.WALL
+        kind = YardKind.GLASS if rng.random() < fronts else YardKind.WALL
         if depth != before:
             for k in np.arange(min(depth, before), max(depth, before), _FACADE_M):
-                yield at - 0.5 * _FACADE_M, at + 0.5 * _FACADE_M, float(k), PieceKind.WALL
+                yield at - 0.5 * _FACADE_M, at + 0.5 * _FACADE_M, float(k), YardKind.WALL
         yield at, end, depth, kind
         at, before = end, depth
 
 
 def _wall_between(
     site: _Site,
-    kind: PieceKind,
+    kind: YardKind,
     start: tuple[float, float],
     end: tuple[float, float],
     heading_rad: float,
@@ -190,11 +215,11 @@ def _lawn(block: _Block, site: _Site) -> None:
     """Trees at random, a bench or two, bushes, and often a hedge around a part."""
     rng = site.rng
     for centre in _scattered(block, int(rng.integers(4, 15)), 2.5, rng):
-        site.disc(PieceKind.TRUNK, centre, float(rng.uniform(0.08, 0.35)))
+        site.disc(YardKind.TRUNK, centre, float(rng.uniform(0.08, 0.35)))
     for centre in _scattered(block, int(rng.integers(0, 6)), 3.0, rng):
         _bush(centre, site)
     for centre in _scattered(block, int(rng.integers(0, 3)), 3.0, rng):
-        site.stand(PieceKind.LOW_WALL, rectangle(_BENCH_M, rng.uniform(0.0, np.pi)) + centre)
+        site.stand(YardKind.LOW_WALL, rectangle(_BENCH_M, rng.uniform(0.0, np.pi)) + centre)
     for side in rng.permutation(4)[: rng.integers(0, 3)]:
         _hedge(*_side(block, int(side), 1.0), site)
 
@@ -214,14 +239,14 @@ def _parking(block: _Block, site: _Site) -> None:
                     _car(np.array([x, y]), 0.5 * np.pi, site)
         if between:
             for x in np.arange(west + 2.0, east - 1.5, 3.0 * _BAY_M[1]):
-                site.disc(PieceKind.TRUNK, np.array([x - 0.5 * _BAY_M[1], row + 0.5 * _BAY_M[0] + 0.4]), 0.12)
+                site.disc(YardKind.TRUNK, np.array([x - 0.5 * _BAY_M[1], row + 0.5 * _BAY_M[0] + 0.4]), 0.12)
         row += 2.0 * _BAY_M[0] + 0.8 + 6.0
 
 
 def _open(block: _Block, site: _Site) -> None:
     """Nothing but perhaps a few lamps."""
     for centre in _scattered(block, int(site.rng.integers(0, 3)), 6.0, site.rng):
-        site.disc(PieceKind.COLUMN, centre, 0.08)
+        site.disc(YardKind.COLUMN, centre, 0.08)
 
 
 def _beside_ways(block: _Block, site: _Site) -> None:
@@ -240,9 +265,9 @@ def _beside_ways(block: _Block, site: _Site) -> None:
                     _car(centre, heading, site)
         elif kind != "nothing":
             piece, spacing, spread, radius = {
-                "lamps": (PieceKind.COLUMN, 16.0, 1.0, 0.08),
-                "trees": (PieceKind.TRUNK, 6.5, 0.5, 0.2),
-                "bollards": (PieceKind.BOLLARD, 2.2, 0.05, 0.07),
+                "lamps": (YardKind.COLUMN, 16.0, 1.0, 0.08),
+                "trees": (YardKind.TRUNK, 6.5, 0.5, 0.2),
+                "bollards": (YardKind.BOLLARD, 2.2, 0.05, 0.07),
             }[str(kind)]
             for centre in _spaced(start, end, spacing * rng.uniform(0.8, 1.25), spread, rng):
                 site.disc(piece, centre, radius * float(rng.uniform(0.7, 1.5)))
@@ -255,13 +280,13 @@ def _clutter(centre: FloatArray, site: _Site) -> None:
     rng = site.rng
     kind = rng.choice(("sign", "bin", "cabinet", "bench", "bush", "nothing"), p=(0.15, 0.12, 0.08, 0.08, 0.07, 0.5))
     if kind == "sign":
-        site.disc(PieceKind.COLUMN, centre, 0.04)
+        site.disc(YardKind.COLUMN, centre, 0.04)
     elif kind == "bin":
-        site.disc(PieceKind.BOLLARD, centre, float(rng.uniform(0.2, 0.35)))
+        site.disc(YardKind.BOLLARD, centre, float(rng.uniform(0.2, 0.35)))
     elif kind == "cabinet":
-        site.stand(PieceKind.CABINET, rectangle((float(rng.uniform(0.6, 1.4)), 0.35), rng.uniform(0.0, np.pi)) + centre)
+        site.stand(YardKind.CABINET, rectangle((float(rng.uniform(0.6, 1.4)), 0.35), rng.uniform(0.0, np.pi)) + centre)
     elif kind == "bench":
-        site.stand(PieceKind.LOW_WALL, rectangle(_BENCH_M, rng.uniform(0.0, np.pi)) + centre)
+        site.stand(YardKind.LOW_WALL, rectangle(_BENCH_M, rng.uniform(0.0, np.pi)) + centre)
     elif kind == "bush":
         _bush(centre, site)
 
@@ -279,17 +304,17 @@ def _around(size_m: tuple[float, float], site: _Site) -> None:
         elif kind in ("fence", "low wall"):
             length = float(np.linalg.norm(end - start))
             outline = rectangle((length, 0.1 if kind == "fence" else 0.3), float(np.arctan2(*(end - start)[::-1])))
-            site.stand(PieceKind(str(kind)), outline + 0.5 * (start + end))
+            site.stand(YardKind(str(kind)), outline + 0.5 * (start + end))
         elif kind == "facade":
             heading = float(np.arctan2(*(start - end)[::-1]))
             _front(site, float(np.linalg.norm(end - start)), heading, 0.5 * (start + end), 0.0)
         elif kind == "trees":
             for centre in _spaced(start, end, 7.0, 1.5, rng):
-                site.disc(PieceKind.TRUNK, centre, float(rng.uniform(0.1, 0.35)))
+                site.disc(YardKind.TRUNK, centre, float(rng.uniform(0.1, 0.35)))
     for _ in range(int(rng.integers(10, 40))):
         point = rng.uniform(1.0, np.array(size_m) - 1.0)
         if np.any(point < _AROUND_M - 6.0) or np.any(point > np.array(size_m) - _AROUND_M + 6.0):
-            site.disc(PieceKind.TRUNK, point, float(rng.uniform(0.1, 0.35)))
+            site.disc(YardKind.TRUNK, point, float(rng.uniform(0.1, 0.35)))
 
 
 def _hedge(start: FloatArray, end: FloatArray, site: _Site) -> None:
@@ -298,14 +323,14 @@ def _hedge(start: FloatArray, end: FloatArray, site: _Site) -> None:
     radius = rng.uniform(0.35, 0.6)
     for centre in _spaced(start, end, 0.9 * radius, 0.12, rng):
         if rng.random() > 0.04:
-            site.disc(PieceKind.HEDGE, centre, radius * float(rng.uniform(0.75, 1.25)))
+            site.disc(YardKind.HEDGE, centre, radius * float(rng.uniform(0.75, 1.25)))
 
 
 def _bush(centre: FloatArray, site: _Site) -> None:
     """A few overlapping discs of leaves."""
     for _ in range(int(site.rng.integers(3, 8))):
         place = centre + site.rng.normal(0.0, 0.5, 2)
-        site.disc(PieceKind.HEDGE, place, float(site.rng.uniform(0.3, 0.8)))
+        site.disc(YardKind.HEDGE, place, float(site.rng.uniform(0.3, 0.8)))
 
 
 def _car(centre: FloatArray, heading_rad: float, site: _Site) -> None:
@@ -315,7 +340,7 @@ def _car(centre: FloatArray, heading_rad: float, site: _Site) -> None:
     quarter = np.array([half - (0.0, corner[1]), half - 0.3 * corner, half - (corner[0], 0.0)])
     ends = [quarter, quarter[::-1] * (-1.0, 1.0), -quarter, quarter[::-1] * (1.0, -1.0)]
     place = centre + rng.normal(0.0, (0.2, 0.2))
-    site.stand(PieceKind.CAR, np.concatenate(ends) @ rotation(heading_rad + rng.normal(0.0, 0.04)) + place)
+    site.stand(YardKind.CAR, np.concatenate(ends) @ rotation(heading_rad + rng.normal(0.0, 0.04)) + place)
 
 
 def _side(block: _Block, side: int, inside_m: float) -> tuple[FloatArray, FloatArray]:

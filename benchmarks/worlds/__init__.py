@@ -1,0 +1,1 @@
+"""Worlds that benchmarks simulate beside the buildings of fcslam."""
