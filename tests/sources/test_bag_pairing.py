@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import Beams, OdometryReading, ScanMessage
-from fcslam.sources.bags.pairing import MAX_GAP_S, OdometryPairing, PosedImage, PosedScan, pair_with_odometry
+from fcslam.sources.bags.pairing import MAX_GAP_S, OdometryPairing, PosedImage, PosedScan
 from fcslam.sources.faults import Fault
 
 
@@ -22,9 +22,17 @@ def reading(stamp, pose=None):
     return OdometryReading(stamp, pose or (2.0 * stamp, -stamp, 0.05 * stamp), "base", "odom")
 
 
+def paired(items):
+    """The items with their poses, as a pass over a bag gives them."""
+    pairing = OdometryPairing()
+    for number, item in items:
+        yield from pairing.add(number, item)
+    yield from pairing.flush()
+
+
 def run(items):
     """The scans that come out, in order; checks that nothing is lost and odometry keeps its order."""
-    out = list(pair_with_odometry(enumerate(items, start=1)))
+    out = list(paired(enumerate(items, start=1)))
     assert [number for number, _ in out] == list(range(1, len(items) + 1))
     return [entry for _, entry in out if isinstance(entry, PosedScan)]
 
@@ -166,5 +174,5 @@ def test_what_waits_is_bounded():
             yield k, scan(1e6 + k) if k % 2 else reading(0.1 * k)
 
     fed: list[int] = []
-    behind = [len(fed) - number for number, _ in pair_with_odometry(items()) if len(fed) < 5000]
+    behind = [len(fed) - number for number, _ in paired(items()) if len(fed) < 5000]
     assert max(behind) <= 1010

@@ -1,5 +1,6 @@
 """Robots of one bag: each is read as from a bag that has its messages alone."""
 
+import copy
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import fcslam
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan
 from fcslam.sources import BagOptions, open_fleet, open_source
+from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.inspection import inspect
 from tests.sources.bag_messages import BEAMS, drive, odom, pose_at, quaternion, save, scan, tf
 from tests.sources.test_bag_faults import refusal
@@ -89,9 +91,23 @@ def test_each_robot_of_a_bag_is_read_as_if_it_were_alone(tmp_path, fleet, suffix
         alone = open_source(save(tmp_path / f"{found.name}_alone{suffix}", own))
         assert same(found, alone)
         assert found.survey().notes == ()
-        chosen = open_source(tmp_path / f"fleet{suffix}:{found.stream.robot.name}")
+        chosen = open_source(tmp_path / f"fleet{suffix}:{found.robot.name}")
         assert chosen.name in (found.name, "")
         assert same(chosen, alone)
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_a_bag_of_two_robots_is_decoded_once(tmp_path, suffix):
+    """After the first pass, all others need no file: of the other robot, of a corrected bag, of copies."""
+    path = save(tmp_path / f"fleet{suffix}", [message for number in (0, 1) for message in robot(number, f"/r{number}")])
+    robots = open_fleet([(path, None)])
+    robots[0].survey()
+    path.unlink()
+    for found in robots:
+        later = found.corrected(BagCorrection(odometry_delay_s=0.02), ("late",))
+        for source in (found, copy.copy(found), later):
+            scans = [each for each in source.records() if isinstance(each, LaserScan)]
+            assert len(scans) == source.survey().scan_count == 20
 
 
 def fleet_bag(folder, kind="namespaces", name="fleet.mcap"):
@@ -118,7 +134,7 @@ def test_named_topics_are_those_of_their_robot(tmp_path):
     path = fleet_bag(tmp_path)
     for options in (BagOptions(("/robot2/scan",)), BagOptions(odom_topic="/robot2/odom")):
         (only,) = open_fleet([(path, None)], options)
-        assert only.stream.odometry.name == "/robot2/odom"
+        assert only.plan.odometry.name == "/robot2/odom"
         assert only.survey().lasers[0].T_base_laser[:2] == MOUNTINGS[1][:2]
 
 
@@ -216,7 +232,7 @@ def above(*links, odometry="odom"):
 )
 def test_the_odometry_is_what_moves_above_the_laser(tmp_path, links, odometry):
     source = open_source(save(tmp_path / "run.mcap", above(*links, odometry=odometry)))
-    assert source.stream.odometry.edge == (odometry, "base_link")
+    assert source.plan.odometry.edge == (odometry, "base_link")
     poses = np.array([each.T_odom_base for each in source.records() if isinstance(each, LaserScan)])
     expected = np.array([pose_at(0.2 * step + 0.05) for step in range(len(poses))])
     assert np.abs(poses[:, :2] - expected[:, :2]).max() < 0.002
@@ -224,9 +240,9 @@ def test_the_odometry_is_what_moves_above_the_laser(tmp_path, links, odometry):
 
 def test_a_pose_in_a_map_is_odometry_only_if_it_is_named(tmp_path):
     path = save(tmp_path / "run.mcap", above(odometry="map"))
-    assert open_source(path).stream.odometry is None
+    assert open_source(path).plan.odometry is None
     for options in (BagOptions(odom_frame="map"), BagOptions(odom_frame="map", base_frame="base_link")):
-        assert open_source(path, options).stream.odometry.edge == ("map", "base_link")
+        assert open_source(path, options).plan.odometry.edge == ("map", "base_link")
 
 
 def test_frames_that_are_not_there_are_refused_with_those_that_are(tmp_path):
@@ -241,16 +257,16 @@ def test_odometry_of_frames_that_are_not_the_robots_is_not_used(tmp_path):
     said = [*drive(40), *(odom(100.0 + 0.02 * k, (0.01 * k, 0, 0), "/camera/odom", child="camera") for k in range(400))]
     path = save(tmp_path / "run.mcap", [each for each in said if each.topic != "/none"])
     source = open_source(path)
-    assert source.stream.odometry.name == "/odom"
+    assert source.plan.odometry.name == "/odom"
     assert "/camera/odom is not used, as its namespace or frames are not those of" in " ".join(source.survey().notes)
-    assert open_source(path, BagOptions(odom_topic="/camera/odom")).stream.odometry.name == "/camera/odom"
+    assert open_source(path, BagOptions(odom_topic="/camera/odom")).plan.odometry.name == "/camera/odom"
 
 
 def test_odometry_of_a_robot_without_scans_is_not_used(tmp_path):
     own, other = robot(0, space="/robot1"), robot(1, space="/robot2", scans=40)
     path = save(tmp_path / "run.mcap", [*own, *(each for each in other if "scan" not in each.topic)])
     (found,) = open_fleet([(path, None)])
-    assert found.stream.odometry.name == "/robot1/odom"
+    assert found.plan.odometry.name == "/robot1/odom"
     assert same(found, open_source(save(tmp_path / "alone.mcap", own)))
 
 
@@ -281,7 +297,7 @@ def test_scans_and_odometry_of_a_camera_on_the_robot_are_no_robot(tmp_path):
     said += [odom(100.0 + 0.1 * k, pose_at(0.1 * k), "/camera/odom") for k in range(80)]
     said += [scan(100.05 + 0.2 * k, (1.0,) * 5, "/camera/scan", frame="camera") for k in range(39)]
     (source,) = open_fleet([(save(tmp_path / "run.mcap", said), None)])
-    assert [laser.name for laser in source.stream.lasers] == ["/scan"]
+    assert [laser.name for laser in source.plan.lasers] == ["/scan"]
 
 
 def test_all_robots_of_a_bag_are_mapped(tmp_path):

@@ -94,7 +94,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
 
 def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Found]") -> Calibrated:
     if len(contradictions) > 1:
-        named = zip(bag.stream.lasers, contradictions, strict=True)
+        named = zip(bag.plan.lasers, contradictions, strict=True)
         said = ((laser.name, found.facing or found.excess) for laser, found in named)
         lines = tuple(f"{laser}: {line}; not corrected" for laser, line in said if line is not None)
         return Calibrated(MotionCalibration(), BagCorrection(), lines)
@@ -218,7 +218,7 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
     if _is_wrong(distance := calibration.distance_scale) and not 1.0 / WHEELS < distance.value < WHEELS:
         calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
-    found = _corrected(calibration, assumed, _stated_share(bag.stream.stated_sweep, assumed_s))
+    found = _corrected(calibration, assumed, _stated_share(bag.plan.stated_sweep, assumed_s))
     sweep = found.correction.sweep
     if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
         found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
@@ -270,7 +270,7 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
         said = contradictions_of(source)
         return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
     found = calibrate_bag(source, config)
-    lines = tuple(f"{source.stream.path}: {line}" for line in found.lines)
+    lines = tuple(f"{source.path}: {line}" for line in found.lines)
     return source.corrected(found.correction, lines) if lines else source
 
 

@@ -6,13 +6,12 @@ whose odometry is silent from the start is mapped without.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import chain
 from math import inf
 
 from fcslam.errors import NetworkError
-from fcslam.records import Beams, GnssFix, SensorRecord
+from fcslam.records import GnssFix, SensorRecord
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import Calibration, ImageMessage, calibration_of, image_of
 from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
@@ -27,7 +26,6 @@ from fcslam.sources.bags.codec import (
     MessageCodec,
 )
 from fcslam.sources.bags.fixes import fix_of
-from fcslam.sources.bags.merging import ScanMerger
 from fcslam.sources.bags.messages import (
     UNKNOWN_RANGE_M,
     BeamsError,
@@ -39,15 +37,8 @@ from fcslam.sources.bags.messages import (
     transforms_of,
 )
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.pairing import (
-    Entry,
-    EntryGate,
-    Message,
-    OdometryPairing,
-    PosedImage,
-    PosedScan,
-    without_odometry,
-)
+from fcslam.sources.bags.pairing import Message, PosedImage, PosedScan
+from fcslam.sources.bags.reader import Numbered, ReadLaser, SensorReader
 from fcslam.sources.bags.rig import (
     MountingError,
     Rig,
@@ -59,7 +50,7 @@ from fcslam.sources.bags.rig import (
     tilt_note,
     usual_scan,
 )
-from fcslam.sources.bags.sectors import SectorJoiner, are_sectors, joined_turns
+from fcslam.sources.bags.sectors import are_sectors, joined_turns
 from fcslam.sources.bags.topics import info_beside
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransformError, TransformTree
 from fcslam.sources.faults import Audit, Fault
@@ -93,6 +84,28 @@ Notify = Callable[[str], None]
 """Takes one line for the user; what repeats a line is not said again."""
 
 
+class _Patience:
+    """Says when something is awaited for too long."""
+
+    def __init__(self, longest_s: float) -> None:
+        self._longest_s = longest_s
+        self._since_s: float | None = None
+
+    def forget(self) -> None:
+        """What was awaited came."""
+        self._since_s = None
+
+    def is_over(self, is_waiting: bool, now_s: float) -> bool:
+        """Whether the wait goes on for too long; then it begins again."""
+        if not is_waiting or self._since_s is None:
+            self._since_s = now_s if is_waiting else None
+            return False
+        if now_s <= self._since_s + self._longest_s:
+            return False
+        self._since_s = None
+        return True
+
+
 class LiveSensors:
     """Reads the messages of one robot, one at a time."""
 
@@ -124,18 +137,18 @@ class LiveSensors:
         """Coordinate frame of the scans on each topic."""
         self._awaited: dict[str, str] = {}
         """Topics whose messages cannot be scans before tf and a calibration are known, and a line that says it."""
-        self._joiners: dict[int, SectorJoiner] = {}
-        """Joiner of each laser whose messages are sectors of a turn."""
+        self._lasers: list[ReadLaser] = []
+        """How each laser is read, once that is known."""
         self._rig: Rig | None = None
+        self._reader: SensorReader | None = None
+        """Reads the messages once the rig is known."""
         self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()
         self._began: float | None = None
         self._misplaced = 0
         self._next_image_s = -inf
-        self._waiting_since: float | None = None
-        self._merging_since: float | None = None
-        self._beams: list[Beams] = []
-        """Usual beams of each laser, once they are known."""
+        self._odometry_patience = _Patience(ODOMETRY_PATIENCE_S)
+        self._laser_patience = _Patience(MERGING_PATIENCE_S)
 
     def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
         """Read the next message; yields the records that are complete at ``now_s`` of a clock that only grows.
@@ -165,10 +178,10 @@ class LiveSensors:
             self.audit.add(broken, self._counts[topic])
             return
         for item in items:
-            if self._rig is None:
+            if self._reader is None:
                 self._keep_early(self._counts[topic], item)
             else:
-                yield from self._read(self._counts[topic], item)
+                yield from self._read(self._reader, self._counts[topic], item)
         yield from self.wait(now_s)
 
     def wait(self, now_s: float) -> Iterator[SensorRecord]:
@@ -178,33 +191,29 @@ class LiveSensors:
             NetworkError: as in ``add``.
         """
         self._began = now_s if self._began is None else self._began
-        if self._rig is None:
+        if self._reader is None:
             self._rig = self._rig_now(now_s)
             if self._rig is None:
                 return
-            self._begin()
+            self._reader = self._new_reader()
             while self._early:
-                yield from self._read(*self._early.popleft())
-        yield from self._skip_silent(now_s)
-        if not self._pairing.waiting:
-            self._waiting_since = None
-        elif self._waiting_since is None:
-            self._waiting_since = now_s
-        elif now_s > self._waiting_since + ODOMETRY_PATIENCE_S:
-            self._waiting_since = None
-            for number, entry in self._pairing.flush():
-                yield from self._recorded(number, entry)
+                yield from self._read(self._reader, *self._early.popleft())
+        reader = self._reader
+        silent = reader.silent_lasers
+        if self._laser_patience.is_over(bool(silent), now_s):
+            for laser in silent:
+                self._notify(f"{self._topics.scans[laser]} is silent; the robot goes on with its other lasers")
+            yield from self._recorded(reader.skip_lasers())
+        if self._odometry_patience.is_over(reader.waits_for_odometry, now_s):
+            yield from self._recorded(reader.skip_odometry())
 
     def finish(self) -> Iterator[SensorRecord]:
         """Yield all that waits, as no more messages come."""
-        if self._rig is None:
-            return
-        turns = (turn for joiner in self._joiners.values() for turn in joiner.flush())
-        merged = chain.from_iterable(self._merger.add(0, turn) for turn in turns)
-        for number, item in chain(merged, self._merger.flush()):
-            yield from self._paired(number, item)
-        for number, entry in self._pairing.flush():
-            yield from self._recorded(number, entry)
+        if self._reader is not None:
+            yield from self._recorded(self._reader.finish())
+
+    def _new_reader(self) -> SensorReader:
+        return SensorReader(self._lasers, not self.is_without_odometry, self.audit)
 
     def _is_needless(self, kind: str, now_s: float) -> bool:
         """Whether a message need not be decoded, which would cost more time than all scans."""
@@ -235,11 +244,6 @@ class LiveSensors:
             images = [index for index, (_, each) in enumerate(self._early) if isinstance(each, ImageMessage)]
             if len(images) > _IMAGES_KEPT:
                 del self._early[images[0]]
-
-    def _begin(self) -> None:
-        """Begin to read scans; those before have no part in it."""
-        self._merger, self._pairing = ScanMerger(len(self._topics.scans)), OdometryPairing()
-        self._gate = EntryGate(self._beams, self.audit)
 
     def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:
         """Raises ValueError if the message is invalid."""
@@ -319,8 +323,8 @@ class LiveSensors:
         if not self._is_heard(is_late):
             return None
         self.base_frame = base_frame = self._known_base_frame()
-        self._joiners = {laser: SectorJoiner() for laser, scans in enumerate(self._first) if are_sectors(scans)}
-        turns = [joined_turns(scans) if laser in self._joiners else scans for laser, scans in enumerate(self._first)]
+        in_sectors = [are_sectors(scans) for scans in self._first]
+        turns = [joined_turns(scans) if is_in else scans for is_in, scans in zip(in_sectors, self._first, strict=True)]
         first = list(map(usual_scan, turns))
         try:
             mountings = self._mountings(first, base_frame)
@@ -341,7 +345,7 @@ class LiveSensors:
         for topic, mounted in zip(self._topics.scans, mountings, strict=True):
             if tilt := tilt_note(mounted):
                 self._notify(f"the laser of {topic} is {tilt}")
-        self._beams = [scan.beams for scan in first]
+        self._lasers = [ReadLaser(scan.beams, is_in) for scan, is_in in zip(first, in_sectors, strict=True)]
         farthest_m = [max(scan.range_max_m for scan in scans) for scans in turns]
         for scans in self._first:
             scans.clear()
@@ -394,18 +398,20 @@ class LiveSensors:
         except MountingError as error:
             raise NetworkError(str(error)) from error
 
-    def _read(self, number: int, item: Message) -> Iterator[SensorRecord]:
+    def _read(self, reader: SensorReader, number: int, item: Message) -> Iterator[SensorRecord]:
         if isinstance(item, OdometryReading) and self._edge not in (None, (item.odom_frame, item.base_frame)):
             return
-        self._watch_clock(item)
-        messages: Iterable[Message] = (item,)
         if isinstance(item, ScanMessage):
+            if self._has_stepped_back(item.stamp):
+                reader = self._reader = self._new_reader()
             self._widen_range(item)
-            if item.laser in self._joiners:
-                messages = self._joiners[item.laser].add(item)
-        for message in messages:
-            for merged, each in self._merger.add(number, message):
-                yield from self._paired(merged, each)
+        yield from self._recorded(reader.add(number, item))
+        if reader.images_ahead_s and not self._is_camera_ahead:
+            self._is_camera_ahead = True
+            self._notify(
+                f"the clock of {self._topics.camera} is about {reader.images_ahead_s:.1f} s ahead of that of "
+                "the odometry, so its images get an older pose or none; set both clocks by one"
+            )
 
     def _widen_range(self, scan: ScanMessage) -> None:
         """Give a laser whose range_max grows none of its own: that of each message counts."""
@@ -417,69 +423,38 @@ class LiveSensors:
             lasers[scan.laser] = replace(laser, max_range_m=UNKNOWN_RANGE_M)
             self._rig = rig._replace(lasers=tuple(lasers))
 
-    def _paired(self, number: int, message: Message) -> Iterator[SensorRecord]:
-        """Give the next message in order its odometry."""
-        if self.is_without_odometry:
-            for paired, entry in without_odometry([(number, message)]):
-                yield from self._recorded(paired, entry)
-            return
-        for paired, entry in self._pairing.add(number, message):
-            self._waiting_since = None
-            yield from self._recorded(paired, entry)
-        if self._pairing.images_ahead_s and not self._is_camera_ahead:
-            self._is_camera_ahead = True
-            self._notify(
-                f"the clock of {self._topics.camera} is about {self._pairing.images_ahead_s:.1f} s ahead of that of "
-                "the odometry, so its images get an older pose or none; set both clocks by one"
-            )
-
-    def _skip_silent(self, now_s: float) -> Iterator[SensorRecord]:
-        """Wait no longer for a laser that has stopped while another one goes on."""
-        awaited = self._merger.awaited
-        if not awaited:
-            self._merging_since = None
-        elif self._merging_since is None:
-            self._merging_since = now_s
-        elif now_s > self._merging_since + MERGING_PATIENCE_S:
-            self._merging_since = None
-            for laser in awaited:
-                self._notify(f"{self._topics.scans[laser]} is silent; the robot goes on with its other lasers")
-            for number, message in self._merger.give_up():
-                yield from self._paired(number, message)
-
-    def _watch_clock(self, item: Message) -> None:
-        """Start again if the clock stepped back and stays there, as when a bag is played again."""
-        if not isinstance(item, ScanMessage):
-            return
+    def _has_stepped_back(self, stamp: float) -> bool:
+        """Whether the clock of the scans stepped back and stays there, as when a bag is played again."""
         newest = self._newest_stamp
-        if newest is None or item.stamp >= newest - MAX_STEP_BACK_S:
+        if newest is None or stamp >= newest - MAX_STEP_BACK_S:
             self._misplaced = 0
-            self._newest_stamp = item.stamp if newest is None else max(newest, item.stamp)
-            return
+            self._newest_stamp = stamp if newest is None else max(newest, stamp)
+            return False
         self._misplaced += 1
-        if self._misplaced >= STEPS_BACK_FOR_RESTART:
-            self._notify(
-                f"the clock of the scans stepped back by {newest - item.stamp:.1f} s, as when a bag is played again; "
-                "the robot goes on from there"
-            )
-            self.restarts += 1
-            self._misplaced, self._newest_stamp = 0, item.stamp
-            self._begin()
+        if self._misplaced < STEPS_BACK_FOR_RESTART:
+            return False
+        self._notify(
+            f"the clock of the scans stepped back by {newest - stamp:.1f} s, as when a bag is played again; "
+            "the robot goes on from there"
+        )
+        self.restarts += 1
+        self._misplaced, self._newest_stamp = 0, stamp
+        return True
 
-    def _recorded(self, number: int, entry: Entry) -> Iterator[SensorRecord]:
-        rig = self._rig
-        assert rig is not None  # nothing is read before
-        if not self._gate.admits(number, entry):
-            if isinstance(entry, PosedScan) and entry.fault is Fault.NO_ODOMETRY:
-                self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
-            return
-        if isinstance(entry, PosedScan):
-            yield rig.scan(entry)
-        elif isinstance(entry, PosedImage) and rig.camera is not None:
-            try:
-                yield rig.image(entry)
-            except ValueError:
-                self.audit.add(Fault.BROKEN_IMAGE, number)
+    def _recorded(self, entries: Iterator[Numbered]) -> Iterator[SensorRecord]:
+        for number, entry in entries:
+            self._odometry_patience.forget()
+            rig = self._rig
+            assert rig is not None  # nothing is read before
+            if isinstance(entry, PosedScan):
+                yield rig.scan(entry)
+            elif isinstance(entry, PosedImage) and rig.camera is not None:
+                try:
+                    yield rig.image(entry)
+                except ValueError:
+                    self.audit.add(Fault.BROKEN_IMAGE, number)
+        if self.audit.faults()[Fault.NO_ODOMETRY].count:
+            self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
 
 
 def _missing_mounting(error: NoTransformError) -> str:

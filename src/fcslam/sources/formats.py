@@ -88,7 +88,7 @@ def open_fleet(
             continue
         source = open_source(path, options, name)
         for each in source.robots(name) if isinstance(source, RosBag) else [source]:
-            file, which = robot_in(path)[0], each.stream.robot.name if isinstance(each, RosBag) else ""
+            file, which = robot_in(path)[0], each.robot.name if isinstance(each, RosBag) else ""
             for other_file, other_which, other in given:
                 if which == other_which and _files(file) == _files(other_file):
                     raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")

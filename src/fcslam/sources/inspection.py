@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry
-from fcslam.sources.bags.census import CountedBag
+from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
@@ -104,7 +104,7 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
     """
     source = open_source(path, options)
     name = format_of(robot_in(path)[0]).name
-    bag = _bag_contents(source.stream.bag) if isinstance(source, RosBag) else None
+    bag = _bag_contents(source.bag) if isinstance(source, RosBag) else None
     try:
         robots = source.robots() if isinstance(source, RosBag) else []
         if len(robots) < 2:
@@ -113,7 +113,7 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
         return Inspection(path, name, bag, problem=str(error))
     found = []
     for robot in robots:
-        place = Path(f"{path}:{robot.stream.robot.name}")
+        place = Path(f"{path}:{robot.robot.name}")
         try:
             found.append(_inspected(robot, place, name, None))
         except SourceError as error:
@@ -138,7 +138,7 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
                 odometry += 1
             case CameraImage():
                 images += 1
-    origin = source.stream.odometry if isinstance(source, RosBag) else None
+    origin = source.plan.odometry if isinstance(source, RosBag) else None
     steps_s = np.diff(np.array(stamps))
     back_s = -steps_s[steps_s < 0.0]
     return Inspection(
@@ -162,7 +162,7 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
     )
 
 
-def _bag_contents(bag: CountedBag) -> BagContents:
+def _bag_contents(bag: DecodedBag) -> BagContents:
     """What is in all messages; those that cannot be decoded count as the others."""
     spans_ns: dict[Topic, tuple[int, int, int]] = {}
     for message in bag.messages(bag.topics):

@@ -1,15 +1,20 @@
 """The frames in a bag: of its scans, of its odometry and in tf, from one pass over it."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from heapq import merge
+from pathlib import Path
+from tempfile import gettempdir
+from typing import Any, Final, NamedTuple
 
+from fcslam.errors import SourceError
 from fcslam.records import Transform
-from fcslam.sources.bags.codec import ODOMETRY, SCANS
+from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY, SCANS
 from fcslam.sources.bags.container import BagFile, RawMessage, Topic, is_transforms
-from fcslam.sources.bags.messages import frame_of, header_of, odometry_of, transforms_of
+from fcslam.sources.bags.messages import OdometryReading, ScanMessage, header_of, odometry_of, scan_of, transforms_of
+from fcslam.sources.bags.tape import Content, Tape
 from fcslam.sources.bags.transforms import TransformTree, differ
 
 UNSET_SHARE: Final = 0.5
@@ -89,61 +94,141 @@ class Census:
                 tree.add(parent, child, transform)
         return tree
 
+    def has_recorded_clock(self, stamped: Stamped) -> bool:
+        """Whether the times of recording of these messages count, as nobody sets their stamps."""
+        clock = self.clocks.get(stamped)
+        return clock is not None and clock.is_unset and clock.is_recorded
+
+    def count(self, message: RawMessage, content: Any) -> Content | None:
+        """Count an object of rosbags and convert it; None for a point cloud. Raises ValueError if it is invalid."""
+        topic, now_ns = message.topic, message.bag_time_ns
+        clock = self.clocks.setdefault((topic, "", ""), Clock())
+        if topic.type in SCANS:
+            stamp, frame = header_of(content.header, now_ns)
+            self.scan_frames.setdefault(topic, Counter())[frame] += 1
+            clock.add(stamp, now_ns, (frame, getattr(content, "angle_min", 0.0)), message.payload[_STAMP_END:])
+            return scan_of(content, now_ns) if topic.type in LASER_SCANS else None
+        if topic.type == ODOMETRY:
+            reading = odometry_of(content, now_ns)
+            self.base_frames.setdefault(topic, Counter())[reading.base_frame] += 1
+            clock.add(reading.stamp, now_ns, reading.base_frame, reading.T_odom_base)
+            return reading
+        transforms = list(transforms_of(content, now_ns))
+        for stamp, parent, child, transform in transforms:
+            link = topic, parent, child
+            self.clocks.setdefault(link, Clock()).add(stamp, now_ns, "", transform)
+            seen = self.links.setdefault(link, [transform])
+            if len(seen) == 1 and differ(seen[0], transform):
+                seen.append(transform)
+        return transforms
+
+    def stamped(self, topic: Topic, time_ns: int, content: Content) -> Content:
+        """A message with its time of recording as its stamp, if nobody sets that."""
+        if isinstance(content, ScanMessage | OdometryReading):
+            return content._replace(stamp=time_ns / 10**9) if self.has_recorded_clock((topic, "", "")) else content
+        if isinstance(content, list):
+            return [
+                each._replace(stamp=time_ns / 10**9)
+                if self.has_recorded_clock((topic, each.parent, each.child))
+                else each
+                for each in content
+            ]
+        return content
+
+
+class BagMessage(NamedTuple):
+    """A decoded message of a bag."""
+
+    topic: Topic
+    number: int
+    """Counts the topic's messages from 1."""
+    bag_time_ns: int
+    """When it was recorded."""
+    decoded: Any
+    """Of laser scans, odometry and tf as in ``Content``; of other types an object of rosbags. An error if invalid."""
+
+    @property
+    def content(self) -> Any:
+        """What was decoded; raises ValueError if the message is invalid."""
+        if isinstance(self.decoded, ValueError):
+            raise self.decoded
+        return self.decoded
+
 
 @dataclass(frozen=True)
-class CountedBag(BagFile):
-    """A bag whose frames are counted once."""
+class DecodedBag(BagFile):
+    """A bag whose laser scans, odometry and transforms are decoded and counted once.
 
-    @cached_property
+    Point clouds and images are too large to be kept; they are decoded whenever they are read.
+    """
+
+    def __reduce__(self) -> "tuple[type[DecodedBag], tuple[Path]]":
+        return DecodedBag, (self.path,)  # a copy in another process decodes the bag again
+
+    @property
     def census(self) -> Census:
         """The frames of all scans, odometry and transforms; those of messages that are invalid are left out.
 
         Raises:
             SourceError: the bag cannot be read.
         """
+        return self._census_and_tape[0]
+
+    def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
+        """The messages of ``topics`` in the order of recording.
+
+        Raises:
+            SourceError: the bag cannot be read.
+        """
+        kept = [topic for topic in topics if _is_kept(topic)]
+        others = [topic for topic in topics if not _is_kept(topic)]
+        streams = [*[self._kept_messages(kept)] * bool(kept), *[self._other_messages(others)] * bool(others)]
+        return merge(*streams, key=lambda message: message.bag_time_ns)
+
+    def _kept_messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
+        census, tape = self._census_and_tape
+        topic_of = {self.topics.index(topic): topic for topic in topics}
+        counts = Counter[int]()
+        for at, time_ns, content in tape.read(topic_of):
+            counts[at] += 1
+            yield BagMessage(topic_of[at], counts[at], time_ns, census.stamped(topic_of[at], time_ns, content))
+
+    def _other_messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
+        for message in self.messages(topics):
+            content: Any
+            try:
+                content = self.decode(message)
+                if self.census.has_recorded_clock((message.topic, "", "")):
+                    content.header.stamp.sec = content.header.stamp.nanosec = 0
+            except ValueError as error:
+                content = error
+            yield BagMessage(*message[:3], content)
+
+    @cached_property
+    def _census_and_tape(self) -> tuple[Census, Tape]:
         census = Census()
         kinds = [topic for topic in self.topics if topic.type in (*SCANS, ODOMETRY) or is_transforms(topic)]
-        for message in self.messages(kinds):
-            try:
-                self._count(message, census)
-            except ValueError as error:
-                broken = census.broken.setdefault(message.topic, Broken(message.number, str(error)))
-                broken.count += 1
-        return census
-
-    def decode(self, message: RawMessage) -> Any:
-        """As in BagFile; stamps that nobody sets are 0, so the times of recording count."""
-        content = super().decode(message)
-        for stamped, header in _headers(message.topic, content):
-            clock = self.census.clocks.get(stamped)
-            if clock is not None and clock.is_unset and clock.is_recorded:
-                header.stamp.sec = header.stamp.nanosec = 0
-        return content
-
-    def _count(self, message: RawMessage, census: Census) -> None:
-        topic, content, now_ns = message.topic, super().decode(message), message.bag_time_ns
-        clock = census.clocks.setdefault((topic, "", ""), Clock())
-        if topic.type in SCANS:
-            stamp, frame = header_of(content.header, now_ns)
-            census.scan_frames.setdefault(topic, Counter())[frame] += 1
-            clock.add(stamp, now_ns, (frame, getattr(content, "angle_min", 0.0)), message.payload[_STAMP_END:])
-        elif topic.type == ODOMETRY:
-            reading = odometry_of(content, now_ns)
-            census.base_frames.setdefault(topic, Counter())[reading.base_frame] += 1
-            clock.add(reading.stamp, now_ns, reading.base_frame, reading.T_odom_base)
-        else:
-            for stamp, parent, child, transform in transforms_of(content, now_ns):
-                link = topic, parent, child
-                census.clocks.setdefault(link, Clock()).add(stamp, now_ns, "", transform)
-                seen = census.links.setdefault(link, [transform])
-                if len(seen) == 1 and differ(seen[0], transform):
-                    seen.append(transform)
+        kinds.sort(key=lambda topic: topic.type in SCANS)  # at equal times, odometry comes first
+        numbers = {topic: at for at, topic in enumerate(self.topics)}
+        try:
+            tape = Tape()
+            for message in self.messages(kinds):
+                content: Content | None
+                try:
+                    content = census.count(message, self.decode(message))
+                except ValueError as error:
+                    content = error
+                    census.broken.setdefault(message.topic, Broken(message.number, str(error))).count += 1
+                if content is not None and _is_kept(message.topic):
+                    tape.add(numbers[message.topic], message.bag_time_ns, content)
+            tape.finish()
+        except OSError as error:
+            raise SourceError(
+                f"{gettempdir()}: decoded messages of {self.path} cannot be kept there ({error}); free some space, or "
+                "name another folder by TMPDIR"
+            ) from error
+        return census, tape
 
 
-def _headers(topic: Topic, content: Any) -> Iterator[tuple[Stamped, Any]]:
-    """The headers of the stamps that are counted."""
-    if is_transforms(topic):
-        for each in content.transforms:
-            yield (topic, frame_of(each.header.frame_id), frame_of(each.child_frame_id)), each.header
-    elif topic.type in (*SCANS, ODOMETRY):
-        yield (topic, "", ""), content.header
+def _is_kept(topic: Topic) -> bool:
+    return topic.type in (*LASER_SCANS, ODOMETRY) or is_transforms(topic)

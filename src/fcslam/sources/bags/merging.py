@@ -1,7 +1,7 @@
 """Merges the scans of several lasers of one robot in time."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from fcslam.sources.bags.messages import ScanMessage
 from fcslam.sources.bags.pairing import Message
@@ -52,14 +52,3 @@ class ScanMerger:
 
     def _earliest(self) -> tuple[int, ScanMessage]:
         return min((queue for queue in self._queues if queue), key=lambda queue: queue[0][1].stamp).popleft()
-
-
-def merge_scans(items: Iterable[tuple[int, Message]], laser_count: int) -> Iterator[tuple[int, Message]]:
-    """Yield the items in their order, but the scans of ``laser_count`` lasers by their stamps.
-
-    The scans of each laser keep their order. The messages between scans do not wait.
-    """
-    merger = ScanMerger(laser_count)
-    for number, item in items:
-        yield from merger.add(number, item)
-    yield from merger.flush()

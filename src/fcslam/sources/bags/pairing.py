@@ -143,16 +143,6 @@ class OdometryPairing:
             yield _with_pose(self._queue.popleft(), self._readings)
 
 
-def pair_with_odometry(
-    items: Iterable[tuple[int, Message]],
-) -> Iterator[tuple[int, Entry]]:
-    """Yield the items in their order, each with its number; scans and images with their poses."""
-    pairing = OdometryPairing()
-    for number, item in items:
-        yield from pairing.add(number, item)
-    yield from pairing.flush()
-
-
 def without_odometry(items: Iterable[tuple[int, Message]]) -> Iterator[tuple[int, Entry]]:
     """Yield the scans and images in their order, without poses."""
     for number, item in items:

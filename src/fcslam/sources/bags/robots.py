@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.census import Census, CountedBag
+from fcslam.sources.bags.census import Census, DecodedBag
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCANS
 from fcslam.sources.bags.container import Topic, is_transforms
 from fcslam.sources.bags.options import BagOptions
@@ -27,7 +27,7 @@ _TRUTHS = ("ground_truth", "groundtruth")
 class BagRobot(NamedTuple):
     """The topics of a bag that belong to one robot, and its frames on topics that have several."""
 
-    bag: CountedBag
+    bag: DecodedBag
     name: str
     """A namespace or the prefix of frames, with a slash in front."""
     topics: tuple[Topic, ...]
@@ -67,7 +67,7 @@ class _Member:
         return self.tree.robot(frame) == self.tree.robot(self.frame) or _prefix(frame) == _prefix(self.frame) != ""
 
 
-def robots_of(bag: CountedBag, options: BagOptions) -> tuple[BagRobot, ...]:
+def robots_of(bag: DecodedBag, options: BagOptions) -> tuple[BagRobot, ...]:
     """The robots of a bag, or those that have the topics that ``options`` name; one or more, by name.
 
     Raises:
@@ -108,7 +108,7 @@ def _is_apart(member: _Member, robot: _Member) -> bool:
     return bool(robot.space and member.space) and not set(member.transforms) & set(robot.transforms)
 
 
-def robot_of(bag: CountedBag, options: BagOptions) -> BagRobot:
+def robot_of(bag: DecodedBag, options: BagOptions) -> BagRobot:
     """The only robot of a bag, or the one that ``options`` name.
 
     Raises:
@@ -190,7 +190,7 @@ def _spaces(scans: Sequence[Topic], marks: Sequence[Topic]) -> dict[Topic, str]:
     return space_of
 
 
-def _only_robot(bag: CountedBag, members: Sequence[_Member], options: BagOptions) -> BagRobot:
+def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions) -> BagRobot:
     """The robot that has all topics of a bag, but odometry of other frames or namespaces if it has its own."""
     heard = [topic for topic in bag.topics if topic.message_count]
     sensors = [topic for topic in heard if topic.type in (*SCANS, COMPRESSED_IMAGE, IMAGE)]
@@ -222,7 +222,7 @@ def _only_robot(bag: CountedBag, members: Sequence[_Member], options: BagOptions
     return BagRobot(bag, name, topics, tuple(sorted(transforms)), scan_frames, base_frames, notes)
 
 
-def _lost_scans(bag: CountedBag, robots: Sequence[_Member], members: Sequence[_Member]) -> tuple[str, ...]:
+def _lost_scans(bag: DecodedBag, robots: Sequence[_Member], members: Sequence[_Member]) -> tuple[str, ...]:
     """Notes on scans that are of none of several robots.
 
     Raises:

@@ -1,12 +1,11 @@
-"""Reads a ROS bag: chooses its topics, surveys it once, then streams its records.
+"""Reads a ROS bag: plans what is read of it, surveys it once, then streams its records.
 
-Scans come in the order of recording, with the odometry at their own header stamps (``pairing``). ``gate`` decides which
-scans are consistent; damaged messages are skipped and counted. A robot that stands still is accepted, because a topic
-shows that there is odometry.
+Scans come in the order of recording, with the odometry at their own header stamps. Damaged messages are skipped and
+counted. A robot that stands still is accepted, because a topic shows that there is odometry.
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -16,11 +15,14 @@ from typing import NamedTuple
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord, frozen
+from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
-from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, OdometryReading
+from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
+from fcslam.sources.bags.plan import BagPlan, RecordedLaser, candidates_of, plan_of
+from fcslam.sources.bags.reader import Numbered, ReadLaser, SensorReader
 from fcslam.sources.bags.rig import (
     MountingError,
     Rig,
@@ -31,15 +33,14 @@ from fcslam.sources.bags.rig import (
     sensor_mounting,
     tilt_note,
 )
-from fcslam.sources.bags.robots import BagRobot, robots_of, slashed
-from fcslam.sources.bags.stream import BagStream, RecordedLaser
+from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
 from fcslam.sources.bags.topics import agree_on_topics
-from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError
 from fcslam.sources.contradictions import Alternation, ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_units
-from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample
+from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample, CloudBand
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -57,6 +58,8 @@ class _Reading(NamedTuple):
 
     survey: Survey
     rig: Rig
+    band: CloudBand
+    """The points of clouds that count."""
     placeholders: tuple[tuple[float, ...], ...]
     """Values that are no ranges, of each laser."""
     base_frame: str
@@ -75,12 +78,32 @@ class RosBag:
     ) -> None:
         """``notes`` say what was chosen for this bag before; ``robot`` is one of several in it."""
         self.name = name
+        self.path = path
         self._notes = notes
         self._options = options or BagOptions()
         """The options by which it is read."""
-        self._check_options(path)
-        self.stream = BagStream(path, self._options, robot)
+        self._check_options()
+        self.bag = DecodedBag(path) if robot is None else robot.bag
+        self._given_robot = robot
         self._audit = _audit()
+
+    @cached_property
+    def robot(self) -> BagRobot:
+        """The robot whose topics are read.
+
+        Raises:
+            SourceError: the bag cannot be read, or has several robots.
+        """
+        return self._given_robot or robot_of(self.bag, self._options)
+
+    @cached_property
+    def plan(self) -> BagPlan:
+        """What is read, and how.
+
+        Raises:
+            SourceError: the bag cannot be read, or what it needs is missing or contradictory.
+        """
+        return plan_of(self.robot, self._options)
 
     @property
     def faults(self) -> Faults:
@@ -93,7 +116,7 @@ class RosBag:
         if scans == WHOLE:
             return whole
         audit, track = _audit(), PathSummary()
-        for _, entry in self._entries(scans, audit):
+        for _, entry in scan_window(self._entries(audit, self._reading.band), scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 track.add(entry.scan.stamp, entry.T_odom_base)
         return Survey(
@@ -111,7 +134,8 @@ class RosBag:
         fixes = deque(found)
         for kind, fault in faults.counts.items():
             audit.add(kind, fault.first_line, fault.count)
-        for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
+        entries = self._entries(audit, self._reading.band, with_images=rig.camera is not None)
+        for number, entry in scan_window(entries, scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
                 while fixes and fixes[0].stamp <= record.stamp:
@@ -133,11 +157,10 @@ class RosBag:
     @cached_property
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
         """The fixes of satellite navigation in the order of their stamps, a second apart, and faults of the others."""
-        stream, audit, found = self.stream, _audit(), list[GnssFix]()
-        topics = fix_topics(stream.robot)[:1]
-        for message in stream.bag.messages(topics) if topics else ():
+        audit, found = _audit(), list[GnssFix]()
+        for message in self.bag.read(fix_topics(self.robot)[:1]):
             try:
-                fix = fix_of(stream.bag.decode(message), message.bag_time_ns, stream.tree, self._reading.base_frame)
+                fix = fix_of(message.content, message.bag_time_ns, self.plan.tree, self._reading.base_frame)
             except ValueError:
                 fix = Fault.BROKEN_MESSAGE
             if isinstance(fix, Fault):
@@ -150,27 +173,54 @@ class RosBag:
                 apart.append(fix)
         return tuple(apart), audit.faults()
 
-    def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
-        entries = self.stream.entries(audit, with_images=with_images)
-        return scan_window(entries, scans, lambda entry: isinstance(entry, PosedScan), audit)
+    def _entries(
+        self, audit: Audit, band: CloudBand, errors: dict[str, str] | None = None, with_images: bool = False
+    ) -> Iterator[Numbered]:
+        """The consistent entries of a pass; ``errors`` gets the first fault of each topic."""
+        plan, errors = self.plan, {} if errors is None else errors
+        lasers = [ReadLaser(laser.first.beams, laser.is_in_sectors) for laser in plan.lasers]
+        reader = SensorReader(lasers, plan.odometry is not None, audit)
+        for message in self.bag.read(plan.read_topics(with_images)):
+            try:
+                items = plan.items(message, band, self._options.correction)
+            except BeamsError:
+                audit.add(Fault.BAD_BEAMS, message.number)
+                continue
+            except ValueError as error:
+                errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
+                is_image = message.topic == plan.topics.camera
+                audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
+                continue
+            for item in items:
+                yield from reader.add(message.number, item)
+        yield from reader.finish()
+
+    def _count_broken_transforms(self, audit: Audit, errors: dict[str, str]) -> None:
+        """Count the transforms that no pass over the scans reads."""
+        read = () if self.plan.odometry is None else self.plan.odometry.topics
+        for topic, broken in self.bag.census.broken.items():
+            if topic in self.plan.topics.transforms and topic not in read:
+                errors.setdefault(topic.name, f"message {broken.first} of it: {broken.error}")
+                audit.add(Fault.BROKEN_MESSAGE, broken.first, broken.count)
 
     @cached_property
     def _reading(self) -> _Reading:
         """Summary from one pass over the whole bag; rejects a bag that cannot be mapped."""
-        audit, tree = _audit(), self.stream.tree
+        audit, errors, plan = _audit(), dict[str, str](), self.plan
+        tree, lasers, band = plan.tree, plan.lasers, self._options.cloud_band
         scans, odometry = PathSummary(), PathSummary()
-        samples = [RangeSample() for _ in self.stream.lasers]
-        bodies = [BodySample() for _ in self.stream.lasers]
-        alternations = [Alternation() for _ in self.stream.lasers]
-        farthest_m = [laser.first.range_max_m for laser in self.stream.lasers]
+        samples = [RangeSample() for _ in lasers]
+        bodies = [BodySample() for _ in lasers]
+        alternations = [Alternation() for _ in lasers]
+        farthest_m = [laser.first.range_max_m for laser in lasers]
         base_frame = self._options.base_frame or ""
-        self.stream.count_broken_transforms(audit)
-        for _, entry in self.stream.entries(audit):
+        self._count_broken_transforms(audit, errors)
+        for _, entry in self._entries(audit, band, errors):
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
                 farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
                 alternations[laser].add(entry.scan.raw_ranges_m)
-                if self.stream.lasers[laser].topic.type not in LASER_SCANS:
+                if lasers[laser].topic.type not in LASER_SCANS:
                     bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
                 if (sample := samples[laser]).wants(entry.T_odom_base):
                     scan = entry.scan
@@ -179,76 +229,69 @@ class RosBag:
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
-        for recorded, found in zip(self.stream.lasers, alternations, strict=True):
+        for recorded, found in zip(lasers, alternations, strict=True):
             if found.is_certain:
                 raise SourceError(
-                    f"{self.stream.path}: the scans of {recorded.name} alternate between two views at "
+                    f"{self.path}: the scans of {recorded.name} alternate between two views at "
                     f"{found.alternating} of {found.count} scans, as of two lasers or robots publishing on one topic; "
                     "give each robot its own namespace, and each laser its own topic or frame, and record again"
                 )
-        self._refuse(audit.faults(), scans, odometry)
-        which = [f" of {laser.name}" for laser in self.stream.lasers]
-        for sample, its, recorded in zip(samples, which, self.stream.lasers, strict=True):
+        self._refuse(audit.faults(), scans, odometry, errors)
+        which = [f" of {laser.name}" for laser in lasers]
+        for sample, its, recorded in zip(samples, which, lasers, strict=True):
             is_scan = recorded.topic.type in LASER_SCANS
-            sample.check(self.stream.path, its, _OF_SCANS if is_scan else _OF_CLOUDS)
+            sample.check(self.path, its, _OF_SCANS if is_scan else _OF_CLOUDS)
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
-        mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(tree, base_frame)]
-        body_notes = self._leave_out_body(bodies, mountings)
-        camera, camera_notes = self._camera(tree, base_frame)
+        mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(base_frame, errors)]
+        radius_m = max(body.radius_m(its.T_base_laser) for body, its in zip(bodies, mountings, strict=True))
+        body_notes = []
+        if radius_m > band.body_radius_m:
+            band = band._replace(body_radius_m=radius_m + SAME_SURFACE_M)
+            body_notes = [
+                f"{self.path}: points up to {radius_m:.2f} m from the base belong to the robot and are left out"
+            ]
+        camera, camera_notes = self._camera(base_frame)
         of_several = which if len(which) > 1 else [""]
         tilts = (
-            f"{self.stream.path}: the laser{its} is {tilt}"
+            f"{self.path}: the laser{its} is {tilt}"
             for its, mounted in zip(of_several, mountings, strict=True)
             if (tilt := tilt_note(mounted))
         )
-        placed = dict.fromkeys(
-            () if self.has_given_pose else (tree.placed(each.first.frame) for each in self.stream.lasers)
-        )
+        placed = dict.fromkeys(() if self.has_given_pose else (tree.placed(each.first.frame) for each in lasers))
         several_parents = (
-            f"{self.stream.path}: {frames}; the pose below '{base_frame}' is used" for frames in placed if frames
+            f"{self.path}: {frames}; the pose below '{base_frame}' is used" for frames in placed if frames
         )
         unlimited = (
-            f"{self.stream.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
-            for laser, its_m in zip(self.stream.lasers, farthest_m, strict=True)
+            f"{self.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
+            for laser, its_m in zip(lasers, farthest_m, strict=True)
             if its_m == UNKNOWN_RANGE_M
         )
         notes = (
             *self._notes,
-            *self.stream.bag.notes,
+            *self.bag.notes,
             *unlimited,
-            *chain.from_iterable(
-                laser.notes(self.stream.path, self._options.cloud_band) for laser in self.stream.lasers
-            ),
-            *self.stream.mounting_notes,
+            *chain.from_iterable(laser.notes(self.path, self._options.cloud_band) for laser in lasers),
+            *plan.scans.notes,
             *body_notes,
             *chain.from_iterable(
-                placeholder_note(self.stream.path, values, its) for values, its in zip(placeholders, which, strict=True)
+                placeholder_note(self.path, values, its) for values, its in zip(placeholders, which, strict=True)
             ),
-            *self.stream.robot.notes,
-            *self.stream.topics.notes,
-            *self.stream.odometry_notes,
+            *self.robot.notes,
+            *plan.topics.notes,
+            *plan.odometry_notes,
             *self._clock_notes(),
             *self._zigzag_notes(odometry),
             *tilts,
             *several_parents,
             *camera_notes,
         )
-        rig = rig_of([laser.first for laser in self.stream.lasers], farthest_m, mountings, camera)
+        rig = rig_of([laser.first for laser in lasers], farthest_m, mountings, camera)
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
-        return _Reading(survey, rig, placeholders, base_frame)
+        return _Reading(survey, rig, band, placeholders, base_frame)
 
-    def _leave_out_body(self, bodies: list[BodySample], mountings: list[Mounting]) -> list[str]:
-        """Leave out the points of clouds up to the farthest one that is of the robot, with a note."""
-        band = self._options.cloud_band
-        radius_m = max(body.radius_m(its.T_base_laser) for body, its in zip(bodies, mountings, strict=True))
-        if radius_m <= band.body_radius_m:
-            return []
-        self.stream.cloud_band = band._replace(body_radius_m=radius_m + SAME_SURFACE_M)
-        return [f"{self.stream.path}: points up to {radius_m:.2f} m from the base belong to the robot and are left out"]
-
-    def _check_options(self, path: Path) -> None:
-        topics, poses = self._options.scan_topics, self._options.laser_poses
+    def _check_options(self) -> None:
+        path, topics, poses = self.path, self._options.scan_topics, self._options.laser_poses
         for topic in topics:
             if topics.count(topic) > 1:
                 raise SourceError(f"{path}: --sensors scan-topic={topic} is given twice; give each laser's topic once")
@@ -257,9 +300,9 @@ class RosBag:
                 f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {_EACH_LASER}"
             )
 
-    def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
-        path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
-        clocks = self.stream.clocks
+    def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
+        path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers
+        clocks = self.plan.clocks
         lost = [(name, clock) for name, clock in clocks.items() if clock.is_unset and not clock.is_recorded]
         if 0 < len(lost) < len(clocks):  # all with the same stamps keep their order
             name, clock = lost[0]
@@ -268,7 +311,7 @@ class RosBag:
                 "its time of recording, so nothing says when they were made; let the driver set the stamps, with their "
                 "nanoseconds, and record again"
             )
-        check_consistency(path, faults, scans.count, odometry.count, self._first_errors())
+        check_consistency(path, faults, scans.count, odometry.count, _in_brackets(errors))
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
             raise SourceError(
@@ -279,13 +322,12 @@ class RosBag:
                 "odom-topic=none"
             )
         check_units(path, scans)
-        jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.stream.odometry
+        jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.plan.odometry
         if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
             raise SourceError(
                 f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
                 "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
             )
-
         if source is not None and (spins := odometry.spins) is not None:
             raise SourceError(
                 f"{path}: {source.name} {spins}, as if in degrees, or of two robots; publish a quaternion made from "
@@ -294,38 +336,33 @@ class RosBag:
 
     def _clock_notes(self) -> list[str]:
         return [
-            f"{self.stream.path}: {clock.repeats} messages of {name} repeat the stamp of the one "
+            f"{self.path}: {clock.repeats} messages of {name} repeat the stamp of the one "
             "before, so their times of recording are used; let the driver set the stamps, with their nanoseconds"
-            for name, clock in self.stream.clocks.items()
+            for name, clock in self.plan.clocks.items()
             if clock.is_unset and clock.is_recorded
         ]
 
     def _zigzag_notes(self, odometry: PathSummary) -> list[str]:
-        source, zigzag = self.stream.odometry, odometry.zigzag
+        source, zigzag = self.plan.odometry, odometry.zigzag
         if source is None or zigzag is None:
             return []
         return [
-            f"{self.stream.path}: {source.name} {zigzag}; stop one of them, or choose another odometry by --sensors "
+            f"{self.path}: {source.name} {zigzag}; stop one of them, or choose another odometry by --sensors "
             "odom-topic, or none to map without"
         ]
 
-    def _first_errors(self) -> str:
-        """The faults of the first invalid message of each topic, in brackets."""
-        errors = [f"{topic}, {error}" for topic, error in self.stream.first_errors.items()]
-        return f" ({'; '.join(errors)})" * bool(errors)
-
-    def _mountings(self, tree: TransformTree, base_frame: str) -> list[Mounting]:
-        lasers, poses = self.stream.lasers, self._options.laser_poses
+    def _mountings(self, base_frame: str, errors: Mapping[str, str]) -> list[Mounting]:
+        lasers, poses = self.plan.lasers, self._options.laser_poses
         if poses and len(poses) != len(lasers):
             named = ", ".join(laser.name for laser in lasers)
-            raise SourceError(f"{self.stream.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
+            raise SourceError(f"{self.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
         if poses:
             return [given_mounting(pose, laser.topic.type) for pose, laser in zip(poses, lasers, strict=True)]
         try:
             check_frames((laser.topic.name, laser.first.frame) for laser in lasers)
-            return [self._mounting(laser, tree, base_frame) for laser in lasers]
+            return [self._mounting(laser, base_frame, errors) for laser in lasers]
         except MountingError as error:
-            raise SourceError(f"{self.stream.path}: {error}") from error
+            raise SourceError(f"{self.path}: {error}") from error
 
     @property
     def is_upside_down(self) -> bool:
@@ -343,7 +380,7 @@ class RosBag:
             correction = replace(correction, mounting=(0.0, 0.0, 0.0), upside_down=False)
         correction = replace(correction, floors=correction.floors or self._options.correction.floors)
         options = replace(self._options, correction=correction)
-        return RosBag(self.stream.path, self.name, options, (*self._notes, *notes), self.stream.robot)
+        return RosBag(self.path, self.name, options, (*self._notes, *notes), self.robot)
 
     def robots(self, name: str | None = None) -> "list[RosBag]":
         """The robots of the bag, or the one that is chosen, named as in it; ``name`` stands for the bag.
@@ -351,7 +388,7 @@ class RosBag:
         Raises:
             SourceError: the bag cannot be read, or does not say which robot some topic is of.
         """
-        robots = robots_of(self.stream.bag, self._options)
+        robots = robots_of(self.bag, self._options)
         if self._options.robot is not None or len(robots) == 1:
             return [self]
         return [self._of(robot, name) for robot in robots]
@@ -365,25 +402,25 @@ class RosBag:
             topics = tuple(options.scan_topics[k] for k in lasers)
             options = replace(options, scan_topics=topics, laser_poses=poses)
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
-        return RosBag(self.stream.path, called, options, self._notes, robot)
+        return RosBag(self.path, called, options, self._notes, robot)
 
-    def _mounting(self, laser: RecordedLaser, tree: TransformTree, base_frame: str) -> Mounting:
+    def _mounting(self, laser: RecordedLaser, base_frame: str, errors: Mapping[str, str]) -> Mounting:
         try:
-            return sensor_mounting(tree, base_frame, laser.first.frame, laser.topic.type, laser.name)
+            return sensor_mounting(self.plan.tree, base_frame, laser.first.frame, laser.topic.type, laser.name)
         except NoTransformError as error:
             raise SourceError(
-                f"{self.stream.path}: tf has {error}{self._first_errors()}, so the pose of the laser of {laser.name} "
+                f"{self.path}: tf has {error}{_in_brackets(errors)}, so the pose of the laser of {laser.name} "
                 "is unknown; give it with --sensors laser-pose=X,Y,THETA (metres, "
-                f"radians){' for each laser' * (len(self.stream.lasers) > 1)}; "
+                f"radians){' for each laser' * (len(self.plan.lasers) > 1)}; "
                 "if it is in another part of this recording, give both joined by a comma"
             ) from error
 
-    def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
+    def _camera(self, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
         """The camera with its calibration and mounting; without them it is ignored, with a note."""
-        path, topic = self.stream.path, self.stream.topics.camera
+        path, topic = self.path, self.plan.topics.camera
         if topic is None:
             return None, ()
-        camera, note = mounted_camera(self.stream.calibration, tree, base_frame)
+        camera, note = mounted_camera(self.plan.calibration, self.plan.tree, base_frame)
         return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
 
 
@@ -393,13 +430,20 @@ def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]
     Raises:
         SourceError: a bag cannot be read.
     """
-    agreed, notes = agree_on_topics([bag.stream.candidates for bag in bags], options or BagOptions())
-    return [
-        RosBag(bag.stream.path, bag.name, agreed, () if k else notes, bag.stream.robot) for k, bag in enumerate(bags)
-    ]
+    agreed, notes = agree_on_topics([candidates_of(bag.robot) for bag in bags], options or BagOptions())
+    return [RosBag(bag.path, bag.name, agreed, () if k else notes, bag.robot) for k, bag in enumerate(bags)]
 
 
 def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
     x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
     mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
     return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
+
+
+def _is_scan(entry: Entry) -> bool:
+    return isinstance(entry, PosedScan)
+
+
+def _in_brackets(errors: Mapping[str, str]) -> str:
+    """The faults of the first invalid message of each topic."""
+    return f" ({'; '.join(f'{topic}, {error}' for topic, error in errors.items())})" * bool(errors)

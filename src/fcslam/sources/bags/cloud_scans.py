@@ -1,0 +1,124 @@
+"""Scans from the point clouds and depth images of a bag: where their sensors sit is found once."""
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from math import acos, degrees
+from typing import TypeVar
+
+from fcslam.errors import SourceError
+from fcslam.sources.bags.camera import Calibration, calibration_of
+from fcslam.sources.bags.census import BagMessage
+from fcslam.sources.bags.clouds import CloudMessage, cloud_mounting, cloud_of, given_cloud_mounting
+from fcslam.sources.bags.codec import IMAGE, LASER_SCANS
+from fcslam.sources.bags.container import Topic
+from fcslam.sources.bags.messages import ScanMessage
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.robots import BagRobot
+from fcslam.sources.bags.topics import calibration_beside
+from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_fixed
+from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, directions_in, leaning
+
+_CLOUDS_FOR_FLOOR, _CLOUDS_TRIED = 20, 200
+"""Clouds that show the floor and the directions of the sensor, spread over the first ones."""
+
+Found = TypeVar("Found")
+
+
+def valid(messages: Iterable[BagMessage], convert: Callable[[BagMessage], Found]) -> Iterator[Found]:
+    """The messages that can be converted."""
+    for message in messages:
+        try:
+            found = convert(message)
+        except ValueError:
+            continue
+        yield found
+
+
+def calibration_in(robot: BagRobot, topic: Topic | None) -> Calibration | None:
+    """The first valid calibration of a camera; None without one."""
+    messages = robot.bag.read([topic] if topic else [])
+    return next(valid(messages, lambda message: calibration_of(message.content)), None)
+
+
+class BagScans:
+    """Turns the messages of a robot's lasers and clouds into scans."""
+
+    def __init__(
+        self,
+        robot: BagRobot,
+        scans: tuple[Topic, ...],
+        options: BagOptions,
+        tree: TransformTree,
+        base_frame_of: Callable[[str], str],
+    ) -> None:
+        """``base_frame_of`` gives the frame of the robot's base for the frame of a sensor."""
+        self.notes: list[str] = []
+        """What is wrong with the mountings."""
+        self._robot, self._scans, self._options, self._tree = robot, scans, options, tree
+        self._base_frame_of = base_frame_of
+        self._calibrations: dict[Topic, Calibration | None] = {}
+        """Of depth images."""
+        self._mountings: dict[tuple[Topic, str], CloudMounting] = {}
+        """By topic and frame."""
+
+    def of(self, topic: Topic) -> Iterator[ScanMessage]:
+        """The valid scans of a topic."""
+        return valid(self._robot.bag.read([topic]), lambda message: self.scan(message, self._options.cloud_band))
+
+    def scan(self, message: BagMessage, band: CloudBand) -> ScanMessage:
+        """The scan of a message; raises ValueError if it is invalid.
+
+        Raises:
+            SourceError: tf lacks the mounting of a cloud.
+        """
+        topic, content = message.topic, message.content
+        if topic.type in LASER_SCANS:
+            scan: ScanMessage = content
+            return scan
+        cloud = self._cloud(message)
+        if (topic, cloud.frame) not in self._mountings:
+            mounting = self._levelled(topic, cloud.frame, self._mounting(topic, cloud.frame))
+            directions = directions_in(self._some_clouds(topic, cloud.frame), mounting)
+            self._mountings[topic, cloud.frame] = mounting._replace(directions=directions)
+        return cloud.scan(self._mountings[topic, cloud.frame], band)
+
+    def _cloud(self, message: BagMessage) -> CloudMessage:
+        topic = message.topic
+        if topic not in self._calibrations:
+            info = calibration_beside(topic, self._robot) if topic.type == IMAGE else None
+            self._calibrations[topic] = calibration_in(self._robot, info)
+        return cloud_of(message.content, topic.type, message.bag_time_ns, self._calibrations[topic])
+
+    def _mounting(self, topic: Topic, frame: str) -> CloudMounting:
+        path = self._robot.bag.path
+        if self._options.laser_poses:
+            return given_cloud_mounting(self._options.laser_poses[self._scans.index(topic)], frame)
+        try:
+            return cloud_mounting(self._tree.fixed(self._base_frame_of(frame), frame))
+        except NoTransformError as error:
+            if is_fixed(frame):
+                raise SourceError(
+                    f"{path}: the points of {topic.name} are in '{frame}', in which the robot drives, so another "
+                    "node has moved them; record the clouds of the sensor's driver, or choose them by --sensors "
+                    "scan-topic"
+                ) from error
+            raise SourceError(
+                f"{path}: tf has {error}, so the pose of the sensor of {topic.name} is unknown; give it "
+                "with --sensors laser-pose=X,Y,THETA (metres, radians)"
+            ) from error
+
+    def _levelled(self, topic: Topic, frame: str, mounting: CloudMounting) -> CloudMounting:
+        """The mounting, corrected with a note if the floor leans in most clouds."""
+        found = leaning(self._some_clouds(topic, frame), mounting)
+        if found is None:
+            return mounting
+        self.notes.append(
+            f"{self._robot.bag.path}: the floor in {topic.name} leans by {degrees(acos(found[2, 2])):.0f} deg against "
+            f"the mounting of '{frame}'; corrected: correct it in tf"
+        )
+        return mounting._replace(rotation=found @ mounting.rotation)
+
+    def _some_clouds(self, topic: Topic, frame: str) -> Iterator[PointCloud]:
+        step = max(1, min(topic.message_count, _CLOUDS_TRIED) // _CLOUDS_FOR_FLOOR)
+        clouds = valid(islice(self._robot.bag.read([topic]), 0, _CLOUDS_TRIED, step), self._cloud)
+        return (found.cloud for found in clouds if found.frame == frame)

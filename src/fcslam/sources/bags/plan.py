@@ -1,0 +1,355 @@
+"""Decides once, before a bag is read, which of its topics and frames are read, and how."""
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import chain, islice
+from math import degrees, tau
+from pathlib import Path
+from statistics import quantiles
+from typing import NamedTuple
+
+from fcslam.config import one_line
+from fcslam.errors import SourceError
+from fcslam.records import Sweep
+from fcslam.sources.bags.camera import Calibration, ImageMessage, image_of
+from fcslam.sources.bags.census import BagMessage, Clock
+from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
+from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY, SCANS
+from fcslam.sources.bags.container import Topic
+from fcslam.sources.bags.messages import OdometryReading, ScanMessage, odometry_in
+from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
+from fcslam.sources.bags.pairing import Message
+from fcslam.sources.bags.rig import usual_scan
+from fcslam.sources.bags.robots import BagRobot, listed, usual
+from fcslam.sources.bags.sectors import are_sectors, cloud_sector_rad, joined_turns
+from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
+from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
+from fcslam.sources.contradictions import CHANGED, changed_share
+from fcslam.sources.gate import SCANS_THAT_VOTE
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
+from fcslam.sources.point_clouds import CloudBand
+from fcslam.sources.pose import Pose
+
+_IMAGES_TRIED = 5
+_STRIDE = 5
+"""Of the scans that show whether a robot moves, every such one is compared."""
+_READINGS_TRIED = 20
+_FEWEST_LAGS = 4
+_LARGEST_DELAY_S = 2.0
+"""Messages of one clock are recorded within this time of each other's delay."""
+
+
+class RecordedLaser(NamedTuple):
+    """One laser of a bag, by its first scans."""
+
+    topic: Topic
+    first: ScanMessage
+    """The first scan with its usual beams."""
+    frame: str | None = None
+    """Frame of its scans, on a topic with several; None: any."""
+    is_in_sectors: bool = False
+    """Whether its messages are sectors of a turn."""
+
+    @property
+    def name(self) -> str:
+        """The topic, and the frame if it has several."""
+        return self.topic.name if self.frame is None else f"{self.topic.name} in '{self.frame}'"
+
+    def notes(self, path: Path, band: CloudBand) -> Iterator[str]:
+        """How its messages become scans, if they are none."""
+        if self.is_in_sectors:
+            yield f"{path}: the scans of {self.name} are sectors of a turn, those of each turn are joined"
+        if self.topic.type not in LASER_SCANS:
+            yield (
+                f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
+                "above the floor (--sensors cloud-band chooses)"
+            )
+        if self.topic.type in SCANS and self.topic.type not in LASER_SCANS and self.first.sweep is None:
+            yield (
+                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during "
+                "a cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
+            )
+
+
+class OdometryInput(NamedTuple):
+    """Where the odometry of a bag comes from."""
+
+    topics: tuple[Topic, ...]
+    edge: Link | None
+    """Parent and child frame in tf; None: the topic holds messages of odometry."""
+    base_frame: str | None = None
+    """Frame of the base, on a topic with several; None: any."""
+
+    @property
+    def name(self) -> str:
+        """The name of the topic, or the frames in tf."""
+        return self.topics[0].name if self.edge is None else f"tf from {self.edge[0]} to {self.edge[1]}"
+
+    def readings(self, message: BagMessage) -> list[OdometryReading]:
+        """The readings in a message of its topics; raises ValueError if it is invalid."""
+        content = message.content
+        if self.edge is None:
+            return [content] if self.base_frame in (None, content.base_frame) else []
+        return [odometry_in(each) for each in content if (each.parent, each.child) == self.edge]
+
+
+class BagPlan(NamedTuple):
+    """What is read from a bag for one robot, and how."""
+
+    topics: Topics
+    tree: TransformTree
+    scans: BagScans
+    lasers: tuple[RecordedLaser, ...]
+    """In the order of their topics."""
+    odometry: OdometryInput | None
+    """The chosen topic, else tf; one that says nothing is none."""
+    odometry_ahead_s: float
+    """The clock of the odometry against that of the scans."""
+    clocks: Mapping[str, Clock]
+    """The stamps of the lasers and of the odometry, by the names of these."""
+    calibration: Calibration | None
+    """Of the camera; None without a camera or a readable calibration."""
+    odometry_notes: tuple[str, ...]
+
+    @property
+    def stated_sweep(self) -> Sweep | None:
+        """Times of the beams by a message of the first laser; None if it states none."""
+        first = self.lasers[0].first
+        return first.sweep if first.ranges_at_stamp is None else None
+
+    def read_topics(self, with_images: bool) -> list[Topic]:
+        """The topics of a pass over the bag."""
+        camera = (self.topics.camera,) if with_images and self.topics.camera is not None else ()
+        odometry = () if self.odometry is None else self.odometry.topics
+        return list(dict.fromkeys((*odometry, *self.topics.scans, *camera)))
+
+    def items(self, message: BagMessage, band: CloudBand, correction: BagCorrection) -> list[Message]:
+        """The scans, readings and images in a message; raises ValueError if it is invalid."""
+        if message.topic in self.topics.scans:
+            scan = self.scans.scan(message, band)
+            if correction.sweep is not None and scan.ranges_at_stamp is None:
+                first_s, last_s = correction.sweep
+                scan = scan._replace(sweep=Sweep(first_s, last_s) if first_s != last_s else None)
+            return [
+                scan._replace(laser=number)
+                for number, laser in enumerate(self.lasers)
+                if laser.topic == message.topic and laser.frame in (None, scan.frame)
+            ]
+        if message.topic == self.topics.camera:
+            return [image_of(message.content, message.topic.type, message.bag_time_ns)]
+        late_s = self.odometry_ahead_s + correction.odometry_delay_s
+        readings = self.odometry.readings(message) if self.odometry else []
+        return [reading._replace(stamp=reading.stamp - late_s) for reading in readings]
+
+
+def candidates_of(robot: BagRobot) -> Candidates:
+    """The topics of a robot that can be read."""
+    found = find_candidates(robot, partial(_view_rad, robot), partial(_has_images, robot))
+    return found._replace(measured=[topic for topic in found.measured if not _odometry_error(robot, topic)])
+
+
+def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
+    """Plan how a robot of a bag is read.
+
+    Raises:
+        SourceError: a topic is missing, none of a laser's scans can be read, or it is not clear which odometry or
+            which transforms are the robot's.
+    """
+    topics = choose_topics(robot, options, partial(_view_rad, robot), partial(_has_images, robot))
+    tree = robot.bag.census.tree(robot.transforms)
+    scans = BagScans(
+        robot, topics.scans, options, tree, lambda frame: _base_frame_of(frame, robot, options, topics, tree)
+    )
+    lasers = tuple(
+        _laser(robot, scans, topic, frame)
+        for topic in topics.scans
+        for frame in robot.scan_frames.get(topic.name, (None,))
+    )
+    notes: list[str] = []
+    odometry = _odometry(robot, options, topics, tree, scans, lasers[0].first.frame, notes)
+    ahead_s = 0.0 if odometry is None else _clock_ahead_s(robot, options, topics, scans, odometry)
+    if odometry is not None and ahead_s:
+        notes.append(
+            f"{robot.bag.path}: the clock of {odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the "
+            "times of recording; corrected"
+        )
+    read = {(topic, "", ""): topic.name for topic in topics.scans}
+    if odometry is not None:
+        read |= {(topic, *(odometry.edge or ("", ""))): odometry.name for topic in odometry.topics}
+    counted = robot.bag.census.clocks
+    clocks = {name: counted[stamped] for stamped, name in read.items() if stamped in counted}
+    calibration = calibration_in(robot, topics.camera_info)
+    return BagPlan(topics, tree, scans, lasers, odometry, ahead_s, clocks, calibration, tuple(notes))
+
+
+def _laser(robot: BagRobot, scans: BagScans, topic: Topic, frame: str | None) -> RecordedLaser:
+    path = robot.bag.path
+    first = list(islice((scan for scan in scans.of(topic) if frame in (None, scan.frame)), SCANS_THAT_VOTE))
+    if not first:
+        raise SourceError(
+            f"{path}: none of the {topic.message_count} scans in {topic.name} can be read"
+            f"{_first_error(robot, scans, topic)}; correct the laser's driver, or copy the bag again"
+        )
+    sector_rad = None if topic.type in LASER_SCANS else cloud_sector_rad(first)
+    if sector_rad is not None:
+        raise SourceError(
+            f"{path}: each cloud of {topic.name} is a sector of about {degrees(sector_rad):.0f} deg; let the driver "
+            "publish whole turns, or record its laser scans"
+        )
+    is_in_sectors = are_sectors(first)
+    return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), frame, is_in_sectors)
+
+
+def _first_error(robot: BagRobot, scans: BagScans, topic: Topic) -> str:
+    """The fault of the first scan of a topic, in brackets."""
+    for message in islice(robot.bag.read([topic]), 1):
+        try:
+            scans.scan(message, CloudBand())
+        except ValueError as error:
+            return f" ({error})"
+    return ""
+
+
+def _odometry(
+    robot: BagRobot,
+    options: BagOptions,
+    topics: Topics,
+    tree: TransformTree,
+    scans: BagScans,
+    frame: str,
+    notes: list[str],
+) -> OdometryInput | None:
+    if options.odom_topic == NO_ODOMETRY:
+        return None
+    for candidate in _odometry_candidates(robot, options, topics, tree, frame):
+        error = "" if candidate.edge is not None else _odometry_error(robot, candidate.topics[0])
+        fault = f"cannot be read ({error})" if error else fault_of_odometry(_poses_of(robot, candidate))
+        if fault is None or not (error or _scans_change(scans, topics.scans[0])):
+            return candidate
+        notes.append(f"{robot.bag.path}: {candidate.name} {fault}, so it is not used")
+    notes.append(f"{robot.bag.path}: {WITHOUT_ODOMETRY}")
+    return None
+
+
+def _odometry_candidates(
+    robot: BagRobot, options: BagOptions, topics: Topics, tree: TransformTree, frame: str
+) -> Iterator[OdometryInput]:
+    """The chosen topic of odometry, then tf; ``frame`` is that of the first laser.
+
+    Raises:
+        SourceError: there is no odometry of the frames that the user names, or it is not clear which is the base.
+    """
+    link = tree.odometry_link(frame, options.odom_frame, options.base_frame)
+    measured = [topic for topic in topics.odometry if topic.type == ODOMETRY]
+    if options.odom_topic is None and options.odom_frame is not None:
+        measured = []
+    for topic in measured:
+        yield OdometryInput((topic,), None, _base_frame(robot, options, topic))
+    if measured and options.odom_topic is not None:
+        return
+    if link is not None:
+        named = tuple(topic for topic in topics.odometry if topic.type != ODOMETRY)
+        yield OdometryInput(named or topics.transforms, link)
+    elif options.odom_frame or (options.base_frame and not measured):
+        known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in tree.links)
+        raise SourceError(
+            f"{robot.bag.path}: tf has no transform from {options.odom_frame or 'a frame'} to "
+            f"{options.base_frame or 'a frame above the laser'}; give --sensors odom-frame and base-frame; "
+            f"tf has {known or 'no transforms'}"
+        )
+
+
+def _base_frame(robot: BagRobot, options: BagOptions, topic: Topic) -> str | None:
+    """The frame of the base on a topic of odometry that has several.
+
+    Raises:
+        SourceError: tf does not say which of them is of the robot.
+    """
+    frames = [frame for frame in usual(robot.bag.census.base_frames.get(topic, {})) if frame]
+    chosen = options.base_frame or robot.base_frames.get(topic.name)
+    if len(frames) < 2:
+        return None
+    if chosen in frames:
+        return chosen
+    raise SourceError(
+        f"{robot.bag.path}: {topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one "
+        "the laser is on; choose one by --sensors base-frame"
+    )
+
+
+def _base_frame_of(frame: str, robot: BagRobot, options: BagOptions, topics: Topics, tree: TransformTree) -> str:
+    """The base of the robot with ``frame``, before its lasers are known."""
+    bases = [options.base_frame]
+    for topic in (topic for topic in topics.odometry if topic.type == ODOMETRY):
+        bases.append(_base_frame(robot, options, topic))
+        readings = valid(islice(robot.bag.read([topic]), _READINGS_TRIED), lambda message: message.content)
+        bases += [reading.base_frame for reading in readings]
+    link = tree.odometry_link(frame, options.odom_frame)
+    usual_ones = [each for each in USUAL_BASES if each in tree]
+    return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
+
+
+def _poses_of(robot: BagRobot, odometry: OdometryInput) -> Iterator[Pose]:
+    readings = valid(robot.bag.read(odometry.topics), odometry.readings)
+    return (reading.T_odom_base for reading in chain.from_iterable(readings))
+
+
+def _scans_change(scans: BagScans, topic: Topic) -> bool:
+    """Whether the scans show that the robot moves: some scan measures something else than the first."""
+    found = scans.of(topic)
+    first = next(found, None)
+    return first is not None and any(
+        changed_share(first.raw_ranges_m, scan.raw_ranges_m) > CHANGED for scan in islice(found, None, None, _STRIDE)
+    )
+
+
+def _clock_ahead_s(
+    robot: BagRobot, options: BagOptions, topics: Topics, scans: BagScans, odometry: OdometryInput
+) -> float:
+    """The clock of the odometry against that of the scans by the times of recording; 0 if they are alike."""
+
+    def scan_ends(message: BagMessage) -> list[float]:
+        return [scans.scan(message, options.cloud_band).end]
+
+    def reading_ends(message: BagMessage) -> list[float]:
+        return [reading.stamp for reading in odometry.readings(message)]
+
+    found = []
+    for read, ends_of in ((topics.scans[:1], scan_ends), (odometry.topics, reading_ends)):
+        lags_s = []
+        for message in islice(robot.bag.read(read), _READINGS_TRIED):
+            ends = next(valid([message], ends_of), [])
+            lags_s += [message.bag_time_ns / 1e9 - end_s for end_s in ends]
+        if len(lags_s) < _FEWEST_LAGS:
+            return 0.0
+        low_s, middle_s, high_s = quantiles(lags_s, n=4)
+        if high_s - low_s > _LARGEST_DELAY_S:
+            return 0.0
+        found.append(middle_s)
+    ahead_s = found[0] - found[1]
+    return 0.0 if abs(ahead_s) < _LARGEST_DELAY_S else ahead_s
+
+
+def _odometry_error(robot: BagRobot, topic: Topic) -> str:
+    """The fault of the first message of a topic of odometry; empty if one of the first ones is valid."""
+    first = [message.decoded for message in islice(robot.bag.read([topic]), _READINGS_TRIED)]
+    is_bad = topic.type == ODOMETRY and first and all(isinstance(each, ValueError) for each in first)
+    return str(first[0]) if is_bad else ""
+
+
+def _has_images(robot: BagRobot, topic: Topic) -> bool:
+    """Whether one of the first messages is a readable image; depth images are not."""
+
+    def image(message: BagMessage) -> ImageMessage:
+        return image_of(message.content, topic.type, message.bag_time_ns)
+
+    return next(valid(islice(robot.bag.read([topic]), _IMAGES_TRIED), image), None) is not None
+
+
+def _view_rad(robot: BagRobot, topic: Topic) -> float:
+    """The field of view of the first valid scan of a topic; 0 without one; a full turn of a point cloud."""
+    if topic.type not in LASER_SCANS:
+        return tau
+    scans = valid(robot.bag.read([topic]), lambda message: message.content)
+    scan = next(scans, None)
+    return 0.0 if scan is None else scan.beams.span_rad
