@@ -39,6 +39,7 @@ ROOMS = [
     "cloud",
     "anchoring",
     "mission",
+    "warmup",
     "api",
     "service",
     "live",
@@ -199,6 +200,18 @@ def printed(program: list[str], folder: Path) -> str:
     """What the lines of a program print in a fresh interpreter."""
     command = [sys.executable, "-c", "\n".join(program)]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+
+
+def test_one_module_starts_processes():
+    starts = {"multiprocessing", "multiprocessing.process", "subprocess", "ProcessPoolExecutor", "fork", "Popen"}
+    found = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        and {getattr(node, "module", None), *(alias.name for alias in node.names)} & starts
+    }
+    assert found == {"processes.py"}
 
 
 @pytest.mark.slow

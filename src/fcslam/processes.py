@@ -1,19 +1,31 @@
-"""Processes that end with the process that started them, however that ends: workers, and tasks beside it."""
+"""Child processes, all of which end with the process that started them, however that ends.
+
+There are four kinds: a ``Child`` is a module of fcslam that runs as a program and reports events; ``run_module`` waits
+for one; a ``worker_pool`` calls functions; ``start_copy`` runs a task in a copy of this process, and a ``Stream`` also
+gets what the task sends. Only this module starts processes.
+"""
 
 import ctypes
 import errno
+import json
+import logging
 import multiprocessing
 import os
+import pickle
+import queue
 import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, Protocol
+from typing import Any, Final, Generic, Protocol, TypeVar
 
-from fcslam.errors import InputError
+from fcslam.errors import FcslamError, InputError
 
 NICENESS = 10
 """Increment of the niceness of a task in a copy of this process: what the process itself does goes first."""
@@ -24,6 +36,171 @@ _NO_SEMAPHORES = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 _ALLOCATOR: Final = {_M_TRIM_THRESHOLD: 1 << 17, _M_MMAP_THRESHOLD: 1 << 17, _M_ARENA_MAX: 2}
 """Options of glibc's ``mallopt``: the default sizes in bytes, which then do not adapt, and the number of heaps."""
+
+_log = logging.getLogger(__name__)
+Item = TypeVar("Item")
+
+
+def module_command(module: str, *arguments: str) -> list[str]:
+    """The command that runs a module of fcslam."""
+    return [sys.executable, "-m", module, *arguments]
+
+
+class Child:
+    """A program beside this one. Its stdin ends with this process; on stdout it writes events (``emit_event``)."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        # Unbuffered: what a dead child did not read must not turn up when the pipe is closed.
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+        self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        assert self._stdin is not None
+        os.set_blocking(self._stdin.fileno(), False)
+
+    @property
+    def pid(self) -> int | None:
+        """None after its end."""
+        return self._process.pid if self._process.poll() is None else None
+
+    def send(self, line: str = "") -> None:
+        """Write a line to its stdin, unless it has ended or does not read."""
+        assert self._stdin is not None
+        with suppress(OSError, ValueError):
+            self._stdin.write(f"{line}\n".encode())
+
+    def events(self) -> Iterator[tuple[str, Any]]:
+        """Its events with their contents, until it ends."""
+        assert self._stdout is not None
+        with self._stdout as lines:
+            for line in lines:
+                try:
+                    message = json.loads(line)
+                    event = str(message["event"]), message["content"]
+                except (ValueError, TypeError, KeyError):
+                    _log.error("unreadable event of a process: %.200r", line)
+                else:
+                    yield event
+
+    def wait(self) -> int:
+        """Wait for its end; returns its exit code."""
+        assert self._stdin is not None
+        with suppress(OSError):
+            self._stdin.close()
+        return self._process.wait()
+
+    def stop(self, patience_s: float | None = None) -> None:
+        """End its stdin and send SIGTERM, which it may ignore until its current step is done.
+
+        ``patience_s``: wait for its end, and kill it if it takes longer.
+        """
+        assert self._stdin is not None
+        with suppress(OSError):
+            self._stdin.close()
+        self._process.terminate()
+        if patience_s is not None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(patience_s)
+            self._process.kill()
+            self.wait()
+
+
+def emit_event(event: str, content: Any) -> None:
+    """Report an event to the process that started this ``Child``."""
+    sys.stdout.write(json.dumps({"event": event, "content": content}) + "\n")
+    sys.stdout.flush()
+
+
+def run_module(module: str, *arguments: str, timeout_s: float) -> tuple[int, str]:
+    """Run a module to its end; returns its exit code and what it wrote to stdout.
+
+    Raises:
+        TimeoutError: it does not end in time, and is killed.
+    """
+    command = module_command(module, *arguments)
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise TimeoutError(f"{module} did not end within {timeout_s:.0f} s") from error
+    return ended.returncode, ended.stdout
+
+
+def worker_pool(niceness: int = 0, is_copy: bool = False) -> Executor:
+    """An executor with one worker, another process, which ignores SIGTERM: service managers send it to both.
+
+    Args:
+        niceness: increment of the worker's niceness.
+        is_copy: the worker is a copy of this process when it begins its first task, where copies are safe.
+
+    Raises:
+        InputError: the host gives processes no semaphores.
+    """
+    context = _copying() if is_copy else multiprocessing.get_context("spawn")
+    with _needing_semaphores():
+        return ProcessPoolExecutor(1, context, _begin_worker, (niceness,))
+
+
+def semaphore(count: int) -> Any:
+    """A semaphore that this process shares with its copies.
+
+    Raises:
+        InputError: the host gives processes no semaphores.
+    """
+    with _needing_semaphores():
+        return _copying().BoundedSemaphore(count)
+
+
+def start_copy(task: Callable[[], None], niceness: int = NICENESS) -> "Background":
+    """Run a task in a copy of this process. It sees everything as it is now, and nothing that it changes is seen here.
+
+    Threads do not exist in the copy; OpenCV must have one thread (``cv2.setNumThreads``), or the copy waits for others.
+    """
+    process: BaseProcess = multiprocessing.get_context("fork").Process(
+        target=_run_copy, args=(task, niceness), daemon=True
+    )
+    process.start()
+    return process
+
+
+class Stream(Generic[Item]):
+    """The items that a task in a copy of this process sends. What is not read yet waits in the copy."""
+
+    def __init__(self, name: str, task: Callable[[Callable[[Item], None]], None]) -> None:
+        """Start ``task``, which is called with what sends an item; ``name`` is that of its process in errors."""
+        self._name, context = name, _copying()
+        self._receiving, sending = context.Pipe(duplex=False)
+        self._process: BaseProcess = context.Process(target=_run_stream, args=(task, sending), daemon=True)
+        self._process.start()
+        sending.close()
+
+    def __iter__(self) -> Iterator[Item]:
+        """The items; an error of the task is raised here.
+
+        Raises:
+            FcslamError: the process ended too early.
+        """
+        while True:
+            try:
+                item, error, place = pickle.loads(self._receiving.recv_bytes())
+            except (EOFError, OSError):
+                break
+            if error is not None:
+                raise error from _RemoteError(place)
+            yield item
+        self._process.join()
+        if self._process.exitcode:
+            raise FcslamError(
+                f"{self._name}: its process ended with code {self._process.exitcode}; if memory ran out, use fewer "
+                "cores (taskset) or map fewer robots together"
+            )
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        self._process.join()
+        self._receiving.close()
+
+
+class _RemoteError(Exception):
+    """The traceback of an error in another process."""
 
 
 class Background(Protocol):
@@ -110,32 +287,13 @@ def _glibc(name: str, *values: int) -> None:
         function(*values)
 
 
-def start_method() -> Any:
-    """The context of quick workers: copies of this process, which has loaded all code, where such copies are safe."""
+def _copying() -> Any:
+    """The context of copies of this process, which has loaded all code, where such copies are safe."""
     return multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
-def worker_pool(start: Callable[[], None], is_copy: bool = False) -> ProcessPoolExecutor:
-    """An executor with one worker, another process that calls ``start`` first.
-
-    Args:
-        start: called in the worker.
-        is_copy: the worker is a copy of this process when it begins its first task, where copies are safe.
-
-    Raises:
-        InputError: the host gives processes no semaphores.
-    """
-    with needing_semaphores():
-        return ProcessPoolExecutor(1, start_method() if is_copy else multiprocessing.get_context("spawn"), start)
-
-
 @contextmanager
-def needing_semaphores() -> Iterator[None]:
-    """Create queues and semaphores of processes in this block.
-
-    Raises:
-        InputError: the host has none, such as a container without a writable /dev/shm.
-    """
+def _needing_semaphores() -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -147,31 +305,47 @@ def needing_semaphores() -> Iterator[None]:
         ) from error
 
 
-def obey_parent() -> None:
-    """Make this process a worker: Ctrl-C, which reaches all processes, is its parent's, and it ends with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _begin_worker(niceness: int) -> None:
+    _exit_with_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.nice(niceness)
 
 
-def start_copy(task: Callable[[], None]) -> Background:
-    """Run a task in a copy of this process. It sees everything as it is now, and nothing that it changes is seen here.
-
-    Threads do not exist in the copy; OpenCV must have one thread (``cv2.setNumThreads``), or the copy waits for others.
-    """
-    process: BaseProcess = multiprocessing.get_context("fork").Process(target=_in_copy, args=(task,), daemon=True)
-    process.start()
-    return process
-
-
-def _in_copy(task: Callable[[], None]) -> None:
+def _run_copy(task: Callable[[], None], niceness: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    obey_parent()
-    os.nice(NICENESS)
+    _exit_with_parent()
+    os.nice(niceness)
     task()
 
 
-def _end_with_parent() -> None:
-    """A parent that is killed cannot end its workers."""
+def _run_stream(task: Callable[[Callable[[Item], None]], None], sending: Connection) -> None:
+    _exit_with_parent()
+    waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+
+    def put(item: Item | None, error: Exception | None = None, place: str = "") -> None:
+        waiting.put(pickle.dumps((item, error, place), pickle.HIGHEST_PROTOCOL))  # which keeps arrays read-only
+
+    def send() -> None:
+        while (content := waiting.get()) is not None:
+            sending.send_bytes(content)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        task(put)
+    except Exception as error:
+        put(None, error, traceback.format_exc())
+    waiting.put(None)
+    sender.join()
+
+
+def _exit_with_parent() -> None:
+    """End with the parent, also if it is killed. Ctrl-C reaches all processes, and the parent handles it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_await_parent, daemon=True).start()
+
+
+def _await_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -7,12 +7,12 @@ import time
 import pytest
 
 from fcslam.cloud.stage_times import StageTotal
-from fcslam.service import supervisor as module
+from fcslam.processes import Child
 from fcslam.service.supervisor import Supervisor
 
 pytestmark = pytest.mark.slow
 
-SAYS = 'import sys; print(\'{"event": "live", "number": 7}\', flush=True);'
+SAYS = 'import sys; print(\'{"event": "live", "content": 7}\', flush=True);'
 STAYS = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
 """As a worker that is ready."""
 WAITS = (
@@ -23,15 +23,14 @@ WAITS = (
 
 
 @pytest.fixture
-def supervised(tmp_path, monkeypatch):
+def supervised(tmp_path):
     """Starts a supervisor over workers that run the given code."""
-    monkeypatch.setattr(module, "LONGEST_PAUSE_S", 0.01)
     started = []
 
     def start(code, command=None):
         told = []
-        chosen = command or (sys.executable, "-c", code)
-        supervisor = Supervisor(tmp_path, lambda *event: told.append(event), chosen)
+        chosen = command or (sys.executable, "-c", code, str(tmp_path))
+        supervisor = Supervisor("a test", lambda: Child(chosen), lambda *event: told.append(event), 0.01)
         started.append(supervisor)
         return supervisor, told
 
@@ -75,8 +74,8 @@ def test_what_nobody_understands_is_left_out(supervised):
 
 
 def test_the_stages_of_the_present_worker_are_kept(supervised):
-    lines = [("runs of solve", 3), ("ms of solve", 1500), ("runs of solve", 4)]
-    says = "".join(f"print(json.dumps(dict(event={event!r}, number={number})));" for event, number in lines)
+    totals = [{"solve": (3, 1.0)}, {"solve": (4, 1.5)}]
+    says = "".join(f"print(json.dumps(dict(event='stages', content={total})));" for total in totals)
     supervisor, told = supervised("import json;" + says + SAYS + "sys.stdin.read()")
     wait(lambda: told)
     assert told == [("live", 7)], "nobody else is told"
@@ -87,7 +86,7 @@ def test_a_worker_that_cannot_be_started_is_tried_again(supervised, tmp_path):
     command = tmp_path / "worker"
     _, told = supervised("", (str(command),))
     time.sleep(0.05)
-    command.write_text('#!/bin/sh\necho \'{"event": "live", "number": 7}\'\n')
+    command.write_text('#!/bin/sh\necho \'{"event": "live", "content": 7}\'\n')
     command.chmod(0o755)
     wait(lambda: told)
 
@@ -106,7 +105,7 @@ def test_a_ring_while_a_worker_ends_or_after_it_is_not_heard(supervised, tmp_pat
 
 
 def test_a_worker_is_ready_when_it_says_so_and_no_longer_when_it_is_gone(supervised, tmp_path):
-    ready = 'print(\'{"event": "progress", "number": 12}\\n{"event": "ready", "number": 0}\', flush=True);'
+    ready = 'print(\'{"event": "progress", "content": 12}\\n{"event": "ready", "content": null}\', flush=True);'
     supervisor, told = supervised(SAYS + WAITS + ready + "sys.stdin.buffer.read()")
     wait(lambda: told)
     assert not supervisor.is_ready

@@ -68,8 +68,8 @@ def serve(
     from fcslam.service.http.app import create_app
     from fcslam.service.http.authentication import Authenticator, read_tokens
     from fcslam.service.shared.missions import NAMED
-    from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
+    from fcslam.warmup import warm_up_decoding
 
     tokens, certificate, key = find_files(credentials)
     check_tls(certificate, key, client_ca)

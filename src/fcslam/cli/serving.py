@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import ssl
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import load
 from fcslam.errors import FcslamError, ServiceError
 from fcslam.learning.federated.settings import DETECTOR, RELEASE, FleetLearningSettings
+from fcslam.processes import Child, module_command
 from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.authentication import Authenticator, read_tokens
 from fcslam.service.http.events import EventStream, EventStreams
@@ -35,7 +35,7 @@ from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.missions import SharedMissions
 from fcslam.service.shared.registry import KnownMission
 from fcslam.service.shared.schema import prepare
-from fcslam.service.shared.spares import Spares
+from fcslam.service.shared.standby import StandbyWorkers
 from fcslam.service.supervisor import WORKER, RunningWorker, Supervisor
 from fcslam.storage.postgres import Postgres, is_server, take_password
 from fcslam.wire.http_transport import is_loopback
@@ -71,10 +71,10 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
         StoreError: the mission cannot be opened.
     """
     events = EventStream()
-    command = (*WORKER, "--workers", workers)
 
     def launch(folder: MissionFolder) -> RunningWorker:
-        return Supervisor(folder.path, events.publish, command)
+        command = module_command(WORKER, str(folder.path), "--workers", workers)
+        return Supervisor(folder.name, lambda: Child(command), events.publish)
 
     missions = Missions(data, config, time.monotonic, time.time, launch)
     return ServiceState(
@@ -102,15 +102,24 @@ def shared_state(
     with ExitStack() as opened:
         server = opened.enter_context(closing(Postgres(url, name)))
         prepare(server)
-        spares = opened.enter_context(closing(Spares()))
+        standby = opened.enter_context(closing(StandbyWorkers()))
         audit = opened.enter_context(closing(AuditTable(server, name)))
 
         def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
             folder = MissionFolder(data / "missions" / mission.name)
             folder.path.mkdir(parents=True, exist_ok=True)
-            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), "--workers", workers)
+            arguments = [
+                str(folder.path),
+                "--store",
+                url,
+                "--lease",
+                str(lease.mission),
+                str(lease.fence),
+                "--workers",
+                workers,
+            ]
             # Events of all instances, this one included, come from the store.
-            return Supervisor(folder.path, lambda *_: None, options, spares.start)
+            return Supervisor(folder.name, lambda: standby.start(arguments), lambda *_: None)
 
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)
@@ -203,7 +212,7 @@ def learning_process(settings: FleetLearningSettings, state: ServiceState, outpu
     Gives the Unix socket of the process, in a folder that only this user can open. Its rounds are in ``output``.
     """
 
-    def announce(event: str, _number: int) -> None:
+    def announce(event: str, _content: object) -> None:
         if event != RELEASE:
             return
         try:
@@ -215,9 +224,10 @@ def learning_process(settings: FleetLearningSettings, state: ServiceState, outpu
 
     with tempfile.TemporaryDirectory(prefix="fcslam-") as folder:
         listener = Path(folder) / "learning"
-        command = [sys.executable, "-m", "fcslam.learning.federated.fleet_learning", "--listener", str(listener)]
-        command += ["--settings", settings.model_dump_json(), "--output", str(output)]
-        learner = Supervisor(state.missions.root, announce, command)
+        data, chosen = str(state.missions.root), settings.model_dump_json()
+        options = ["--listener", str(listener), "--settings", chosen, "--output", str(output)]
+        command = module_command("fcslam.learning.federated.fleet_learning", *options, data)
+        learner = Supervisor("learning", lambda: Child(command), announce)
         typer.echo(f"robots learn here; rounds are in {output}")
         try:
             yield listener

@@ -21,7 +21,7 @@ FIRST_SCANS_S, EVERYTHING_S = 10, 45
 
 def warm_up() -> None:
     """Compile the code of robots and cloud now, on all cores, so that the first run starts at once."""
-    from fcslam.service.warmup import WARM_UPS, compiling
+    from fcslam.warmup import WARM_UPS, compiling
 
     console = notices()
     if tell_uncached(console):
@@ -31,8 +31,9 @@ def warm_up() -> None:
         for run in WARM_UPS:
             run()
     else:
-        with compiling(cores() + 1, WARM_UPS):  # this process waits most of the time
-            pass
+        with compiling(cores() + 1) as copies:  # this process waits most of the time
+            for copy in copies:
+                copy.join()
     print_line(console, "the code is compiled")
 
 
@@ -57,7 +58,7 @@ def tell_uncached(console: "Console") -> bool:
 @contextmanager
 def compiled(console: "Console") -> Iterator[None]:
     """Wait until the code for the first scans is compiled and say why; the rest is compiled meanwhile."""
-    from fcslam.service.warmup import compiling, is_cold, warm_up_matching
+    from fcslam.warmup import compiling, is_cold
 
     if tell_uncached(console) or not is_cold():
         yield
@@ -65,7 +66,7 @@ def compiled(console: "Console") -> Iterator[None]:
     processes = cores()
     first = "" if processes == 1 else f"about {FIRST_SCANS_S} s until the first scan, "
     print_line(console, f"compiling, first run only: {first}about {EVERYTHING_S} s until full speed")
-    with compiling(processes, (warm_up_matching,)):
+    with compiling(processes):
         yield
 
 
@@ -76,8 +77,7 @@ def copied_process(config: "RobotConfig") -> "Iterator[Executor]":
     Both share the memory of the tracker's code, unless that is not compiled yet: nobody waits for a compiler here.
     """
     from fcslam.robot.backend_runner import copied_worker
-    from fcslam.robot.warmup import warm_up_tracking
-    from fcslam.service.warmup import is_cold
+    from fcslam.warmup import is_cold, warm_up_tracking
 
     if not is_cold():
         warm_up_tracking(config)

@@ -11,7 +11,7 @@ from typing import Final
 
 from fcslam.errors import InputError
 from fcslam.lidar.pair_verification import VerificationPool, VerifyPairs, verify_here
-from fcslam.processes import obey_parent, worker_pool
+from fcslam.processes import worker_pool
 
 MOST_PROCESSES: Final = 256
 _CLUSTER: Final = re.compile(r"(tcp|tls)://[^/\s]+:\d{1,5}")
@@ -55,7 +55,7 @@ def verifying(workers: str, must_connect: bool = True) -> Iterator[VerifyPairs]:
             cluster = stack.enter_context(DaskCluster(workers, must_connect))
             yield VerificationPool(cluster.executors)
         elif (others := int(workers) - 1) > 0:
-            pools = [stack.enter_context(worker_pool(obey_parent)) for _ in range(others)]
+            pools = [stack.enter_context(worker_pool()) for _ in range(others)]
             yield VerificationPool(lambda: pools)
         else:
             yield verify_here

@@ -6,7 +6,6 @@ is that process. ONNX Runtime evaluates constant parts of a graph while it loads
 """
 
 import resource
-import subprocess
 import sys
 from functools import cache
 from math import prod
@@ -18,6 +17,7 @@ from google.protobuf.message import DecodeError
 
 from fcslam.config import one_line
 from fcslam.errors import FeatureError
+from fcslam.processes import run_module
 from fcslam.untrusted import read_bytes
 
 MOST_FILE_BYTES: Final = 1 << 26
@@ -132,14 +132,13 @@ def _reason(graph: Any, attributes: list[Any], tensors: list[Any]) -> str:
 
 
 def _try(path: Path) -> None:
-    command = [sys.executable, "-m", "fcslam.features.network_check", str(path)]
     try:
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=_TRIAL_S, check=False)
-    except subprocess.TimeoutExpired as error:
+        code, refusal = run_module("fcslam.features.network_check", str(path), timeout_s=_TRIAL_S)
+    except TimeoutError as error:
         raise FeatureError(f"{path}: the network does not run within {_TRIAL_S:.0f} s; give other weights") from error
-    if ended.returncode == 1 and ended.stdout:
-        raise FeatureError(ended.stdout)
-    if ended.returncode:
+    if code == 1 and refusal:
+        raise FeatureError(refusal)
+    if code:
         limits = f"{TRIAL_MEMORY_BYTES / 1e6:.0f} MB and {TRIAL_CPU_S} s"
         raise FeatureError(f"{path}: the network does not run within the limits of {limits}; give other weights")
 

@@ -20,7 +20,7 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
 from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.track import ScanTrack
-from fcslam.robot.warmup import made_up_scans
+from fcslam.warmup import made_up_scans
 from fcslam.wire.messages import Hello, Packet
 
 MOST_DRAWN = 20_000

@@ -25,9 +25,9 @@ from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, StrPath, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate
-from fcslam.robot.warmup import warm_up_tracking
 from fcslam.robot.worker_localizer import WorkerLocalizer
 from fcslam.runs import RobotTrajectory, Run, prepare_output
+from fcslam.warmup import warm_up_tracking
 from fcslam.wire.messages import Packet
 
 _NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)

@@ -49,8 +49,8 @@ from fcslam.robot.keyframe_folder import KEYFRAMES
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import CONNECTING
 from fcslam.robot.uplink import Uplink
-from fcslam.robot.warmup import warm_up_tracking
 from fcslam.runs import RobotTrajectory, Run, prepare_output
+from fcslam.warmup import warm_up_tracking
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server, addresses

@@ -3,21 +3,17 @@
 Either way a robot gives the same packets, as it knows no other robot. The back end of a single robot runs beside it.
 """
 
-import pickle
-import queue
-import traceback
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import cycle
-from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError, InputError
-from fcslam.processes import needing_semaphores, obey_parent, start_method, trim_memory
+from fcslam.processes import Stream, semaphore, trim_memory
 from fcslam.records import Keyscan, LaserScan, Odometry
 from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -33,8 +29,6 @@ INPUTS_PER_BLOCK: Final = 8
 """Inputs that go together to a back end beside the robot."""
 MOST_WAITING: Final = 64
 """Inputs that wait for a back end beside the robot; with more, the robot waits."""
-_POLL_S: Final = 1.0
-"""Interval at which the cloud's process looks whether one that owes it something still runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,23 +81,15 @@ def side_by_side(processes: int) -> Drive:
             with _with_backend_beside(sources[0], config) as robot:
                 yield [robot]
             return
-        context = start_method()
-        with needing_semaphores():
-            channel = context.Queue()
-            turns = context.BoundedSemaphore(processes)
-        workers = [
-            context.Process(target=_work, args=(number, source, config, channel, turns), daemon=True)
-            for number, source in enumerate(sources)
-        ]
-        for worker in workers:
-            worker.start()
+        turns = semaphore(processes)
+        streams: list[Stream[Leg]] = []
         try:
-            inbox = _Inbox(channel, workers)
-            yield [inbox.legs(number) for number in range(len(sources))]
+            for source in sources:
+                streams.append(Stream(source.name, partial(_work, source, config, turns)))
+            yield [iter(stream) for stream in streams]
         finally:
-            for worker in workers:
-                worker.terminate()
-                worker.join()
+            for stream in streams:
+                stream.stop()
 
     return drive
 
@@ -171,71 +157,13 @@ def track_of(poses: ScanTrack) -> Track:
     return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)
 
 
-class _Inbox:
-    """Sorts what all robots send through one channel."""
-
-    def __init__(self, channel: Any, workers: Sequence[BaseProcess]) -> None:
-        self._channel = channel
-        self._workers = workers
-        self._waiting: list[deque[Leg | _Failure]] = [deque() for _ in workers]
-
-    def legs(self, number: int) -> Iterator[Leg]:
-        """The legs of one robot, up to its last one."""
-        waiting = self._waiting[number]
-        while True:
-            while not waiting:
-                self._receive(number)
-            leg = waiting.popleft()
-            if isinstance(leg, _Failure):
-                raise leg.error from _WorkerError(leg.traceback)
-            yield leg
-            if leg.faults is not None:
-                return
-
-    def _receive(self, number: int) -> None:
-        """Wait for something from any robot, or for the end of the process of robot ``number``."""
-        worker = self._workers[number]
-        was_alive = worker.is_alive()
-        try:
-            sender, leg = pickle.loads(self._channel.get(timeout=_POLL_S))
-        except queue.Empty:
-            if not was_alive:
-                raise FcslamError(
-                    f"the process of a robot ended with code {worker.exitcode}; if memory ran out, use fewer cores "
-                    "(taskset) or map fewer robots together"
-                ) from None
-        else:
-            self._waiting[sender].append(leg)
-
-
-@dataclass(frozen=True, slots=True)
-class _Failure:
-    """An error that ended a robot."""
-
-    error: Exception
-    traceback: str
-
-
-class _WorkerError(Exception):
-    """The traceback of an error in another process."""
-
-
-def _work(number: int, source: Source, config: RobotConfig, channel: Any, turns: Any) -> None:
+def _work(source: Source, config: RobotConfig, turns: Any, send: Callable[[Leg], None]) -> None:
     """Drive one robot when it is its turn, in a process of its own.
 
     The first leg needs no turn: the cloud applies packets in the order of time, so it waits until each robot has begun.
     """
-    obey_parent()
-    try:
-        drive = legs(source, RobotFrontend(source.name, config))
-        channel.put(_packed(number, next(drive)))
-        with turns:
-            for leg in drive:
-                channel.put(_packed(number, leg))
-    except Exception as error:
-        channel.put(_packed(number, _Failure(error, traceback.format_exc())))
-
-
-def _packed(number: int, leg: Leg | _Failure) -> bytes:
-    """With the newest protocol, which keeps arrays read-only."""
-    return pickle.dumps((number, leg), pickle.HIGHEST_PROTOCOL)
+    drive = legs(source, RobotFrontend(source.name, config))
+    send(next(drive))
+    with turns:
+        for leg in drive:
+            send(leg)

@@ -17,7 +17,7 @@ from fcslam.errors import FcslamError
 from fcslam.mission.mission import MissionCloud
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
-from fcslam.processes import RecurringTask, Start, obey_parent, start_copy, start_method
+from fcslam.processes import RecurringTask, Start, start_copy
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.worker import LIVE_EVERY_S, LIVE_LOOK_S
 
@@ -69,8 +69,7 @@ def live_page(listening: socket, name: str) -> Iterator[LiveMap]:
     cv2.setNumThreads(1)  # a copy of this process would wait for threads that it does not have
     with TemporaryDirectory() as place:
         folder = MissionFolder(Path(place))
-        server = start_method().Process(target=_serve, args=(listening, folder.live, name), daemon=True)
-        server.start()
+        server = start_copy(lambda: _serve(listening, folder.live, name), niceness=0)
         live = LiveMap(folder, time.monotonic, start_copy)
         try:
             yield live
@@ -81,6 +80,5 @@ def live_page(listening: socket, name: str) -> Iterator[LiveMap]:
 
 
 def _serve(listening: socket, place: Path, name: str) -> None:
-    obey_parent()
     with ShownRun(place, name) as shown:
         run_viewer(viewer_app(ReadOnly(shown)), listening)

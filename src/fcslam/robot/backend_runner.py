@@ -6,15 +6,14 @@ order.
 """
 
 import os
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from fcslam.errors import FeatureError
-from fcslam.processes import obey_parent, worker_pool
+from fcslam.processes import worker_pool
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionConfig
 from fcslam.wire.messages import Body
 
@@ -128,17 +127,17 @@ def _hand_out(results: "Future[list[Any]]", tasks: Sequence[_BlockTask]) -> None
                 task.set_exception(error)
 
 
-def worker_process() -> ProcessPoolExecutor:
+def worker_process() -> Executor:
     """An executor with one worker, another process with a lower priority than this one.
 
     Raises:
         InputError: the host gives processes no semaphores.
     """
-    return worker_pool(_start_worker)
+    return worker_pool(YIELD_TO_TRACKER)
 
 
 @contextmanager
-def copied_worker() -> Iterator[ProcessPoolExecutor]:
+def copied_worker() -> Iterator[Executor]:
     """A ``worker_process`` that shares the memory of the code loaded so far, until the end of this block.
 
     It is a copy of this process, made at once: begin this block before threads start, such as those of ROS. Objects
@@ -147,7 +146,7 @@ def copied_worker() -> Iterator[ProcessPoolExecutor]:
     Raises:
         InputError: the host gives processes no semaphores.
     """
-    executor = worker_pool(_start_worker, is_copy=True)
+    executor = worker_pool(YIELD_TO_TRACKER, is_copy=True)
     try:
         executor.submit(os.getpid).result()
         yield executor
@@ -178,9 +177,3 @@ def _begin(robot: str, config: SessionConfig, keyframes: Path | None) -> None:
 
 def _process(robot: str, input: BackendInput) -> list[Body]:
     return _backends[robot].process(input)
-
-
-def _start_worker() -> None:
-    obey_parent()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # service managers stop both; the robot ends this one
-    os.nice(YIELD_TO_TRACKER)

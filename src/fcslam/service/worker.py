@@ -5,7 +5,7 @@ live run folder, and the run folders that users request. From time to time it al
 the next worker continues from that state, or from turn 0, and reports nothing new before it has caught up.
 
     python -m fcslam.service.worker [--workers ...] [--store ... --lease MISSION FENCE] MISSION_FOLDER
-    python -m fcslam.service.worker --spare
+    python -m fcslam.service.worker --standby
 
 A spare worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
 work; the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for
@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 from hashlib import blake2b
 from importlib import import_module
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import cv2
 
@@ -47,7 +47,7 @@ from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.processes import RecurringTask, Start, start_copy, trim_memory
+from fcslam.processes import RecurringTask, Start, emit_event, start_copy, trim_memory
 from fcslam.records import Edit
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
@@ -55,10 +55,10 @@ from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, SharedFiles
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
-from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS, tell
-from fcslam.service.warmup import warm_up_fleet
+from fcslam.service.supervisor import PROGRESS, READY, STAGES, STANDBY
 from fcslam.storage.postgres import Postgres
 from fcslam.storage.state_file import code_version, read_state, write_state
+from fcslam.warmup import warm_up_fleet
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode
@@ -95,8 +95,8 @@ LATE = "fcslam.lidar.uniqueness", "fcslam.maps.certificate"
 
 _log = logging.getLogger(__name__)
 
-Tell = Callable[[str, int], None]
-"""Receives each event with its number."""
+EmitEvent = Callable[[str, Any], None]
+"""Receives each event with its content."""
 
 Share = Callable[[str, Path], None]
 """Receives the name and the place of each file or run folder that the worker wrote, for other instances."""
@@ -110,14 +110,14 @@ class Worker:
         folder: MissionFolder,
         store: MissionStore,
         clock: Callable[[], float],
-        tell: Tell,
+        emit_event: EmitEvent,
         start: Start,
         verify_pairs: VerifyPairs = verify_here,
         share: Share = lambda *_: None,
     ) -> None:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
-        self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
+        self._folder, self._store, self._clock, self._emit_event = folder, store, clock, emit_event
         self._verify_pairs, self._share = verify_pairs, share
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
@@ -149,7 +149,7 @@ class Worker:
         self._reported, self._report_at = self._resumed_at, -math.inf
         self._finalize_at = -math.inf
         self._written, self._write_at = self._applied, clock() + SNAPSHOT_EVERY_S
-        tell(PROGRESS, self._applied)
+        emit_event(PROGRESS, self._applied)
 
     def step(self) -> bool:
         """Do one piece of work; False if nothing is left to do."""
@@ -201,7 +201,7 @@ class Worker:
         self._fleet, self._log = Fleet(self._config.fleet, self._config.seed, self._verify_pairs), PacketLog()
         self._arrivals, self._read_hash = 0, b""
         self._times.clear()
-        self._tell(PROGRESS, 0)
+        self._emit_event(PROGRESS, 0)
 
     @property
     def _applied(self) -> int:
@@ -221,14 +221,9 @@ class Worker:
         self._crashes.end()
         self._report()
         if self._applied > applied:
-            self._tell(PROGRESS, self._applied)
-            self._tell_stages()
+            self._emit_event(PROGRESS, self._applied)
+            self._emit_event(STAGES, self._fleet.stages.totals)
         return self._arrivals > arrivals or self._applied > applied
-
-    def _tell_stages(self) -> None:
-        for stage, total in self._fleet.stages.totals.items():
-            self._tell(f"{STAGE_RUNS}{stage}", total.runs)
-            self._tell(f"{STAGE_MS}{stage}", round(1e3 * total.seconds))
 
     def _report(self) -> bool:
         """Store how many packets took effect, and new corrections, if the last time is long enough ago."""
@@ -383,7 +378,7 @@ class Worker:
             self._store.answer(asked.number, name)
         self._crashes.end()
         self._joint_maps.shown = self._live.shown = -1
-        self._tell("finalized", asked.number)
+        self._emit_event("finalized", asked.number)
 
     def _result(self) -> FleetResult:
         """The result of all packets that took effect."""
@@ -424,7 +419,7 @@ class Worker:
         except StoreError as error:
             return self._postpone(output, str(error))
         if output is self._live:
-            self._tell("live", output.begun)
+            self._emit_event("live", output.begun)
         return True
 
     def _postpone(self, output: "_Output", reason: str) -> bool:
@@ -518,7 +513,7 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
-    if arguments == [SPARE] and not (arguments := _told_arguments()):
+    if arguments == [STANDBY] and not (arguments := _sent_arguments()):
         return 0
     given = _parsed(arguments)
     folder = MissionFolder(given.folder)
@@ -526,8 +521,8 @@ def main(arguments: Sequence[str]) -> int:
     alone, mission = _alone(folder), _mission(folder, given.store, given.lease)
     with verifying(given.workers, must_connect=False) as verify_pairs, mission as (store, share):
         try:
-            worker = Worker(folder, store, time.monotonic, tell, start_copy, verify_pairs, share)
-            tell(READY, 0)
+            worker = Worker(folder, store, time.monotonic, emit_event, start_copy, verify_pairs, share)
+            emit_event(READY, None)
             while True:
                 wait_s = 0.0 if worker.step() else min(worker.wait_s(), look_s)
                 if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
@@ -541,8 +536,8 @@ def main(arguments: Sequence[str]) -> int:
         return 0
 
 
-def _told_arguments() -> list[str]:
-    """The arguments of a spare worker, a line of JSON that comes when there is a mission for it; empty: none came."""
+def _sent_arguments() -> list[str]:
+    """The arguments of a standby worker, a line of JSON that comes when there is a mission for it; empty: none came."""
     line = b""
     while not line.endswith(b"\n"):
         byte = os.read(sys.stdin.fileno(), 1)

@@ -13,9 +13,9 @@ import pytest
 import uvicorn
 
 from fcslam.service.credentials import make_credentials
-from fcslam.service.http import protocol, strangers
+from fcslam.service.http import protocol, unauthenticated
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
-from fcslam.service.http.strangers import Strangers
+from fcslam.service.http.unauthenticated import UnauthenticatedLimit
 from tests.service.http.desk import A
 
 API = "/api/v1"
@@ -47,28 +47,28 @@ def test_requests_without_a_token_are_limited_and_those_with_one_are_not(desk):
         began = time.monotonic()
         assert desk.ask("GET", f"{API}/robots/a/state", "a").status_code == 200
         assert connection.recv(1 << 20).count(b"HTTP/1.1") < many
-        assert time.monotonic() - began < many / strangers.PER_S, "the robot does not wait for the strangers"
+        assert time.monotonic() - began < many / unauthenticated.PER_S, "the robot does not wait for them"
 
 
-def test_strangers_wait_for_each_other_and_addresses_take_turns():
+def test_requests_without_a_token_wait_for_each_other_and_addresses_take_turns():
     answered = []
 
     async def app(scope, receive, send):
         answered.append(scope["client"][0])
 
     async def ask():
-        gate = Strangers(app, lambda scope: scope["client"][0] == "robot")
+        gate = UnauthenticatedLimit(app, lambda scope: scope["client"][0] == "robot")
         many = [("crowd", n) for n in range(60)] + [("other", 0), ("robot", 0)]
         await asyncio.gather(*(gate({"type": "http", "client": who, "state": {}}, None, None) for who in many))
 
     asyncio.run(ask())
-    assert answered.index("robot") <= strangers.AT_ONCE
-    assert answered.index("other") <= strangers.AT_ONCE + 3
+    assert answered.index("robot") <= unauthenticated.AT_ONCE
+    assert answered.index("other") <= unauthenticated.AT_ONCE + 3
     assert len(answered) == 62
 
 
-def test_too_many_waiting_strangers_are_refused(monkeypatch):
-    monkeypatch.setattr(strangers, "MOST_WAITING", 2)
+def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
+    monkeypatch.setattr(unauthenticated, "MOST_WAITING", 2)
     told = []
 
     async def app(scope, receive, send):
@@ -78,12 +78,12 @@ def test_too_many_waiting_strangers_are_refused(monkeypatch):
         told.append(message.get("status"))
 
     async def ask():
-        gate = Strangers(app, lambda _: False)
+        gate = UnauthenticatedLimit(app, lambda _: False)
         crowd = (gate({"type": "http", "client": ("x", 1), "state": {}}, None, send) for _ in range(30))
         await asyncio.gather(*crowd)
 
     asyncio.run(ask())
-    assert told.count(429) == 30 - int(strangers.AT_ONCE) - 2
+    assert told.count(429) == 30 - int(unauthenticated.AT_ONCE) - 2
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,8 +23,9 @@ from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
 from fcslam.learning.trainer import ExecutionOptions
+from fcslam.processes import emit_event
 from fcslam.service.http.authentication import Authenticator
-from fcslam.service.supervisor import READY, tell
+from fcslam.service.supervisor import READY
 from fcslam.storage.files import write_file
 
 NICENESS: Final = 10
@@ -32,10 +33,8 @@ START: Final = "start.onnx"
 """The detector from which training started, in the output folder."""
 _log = logging.getLogger("fcslam.learning")
 
-Tell = Callable[[str, int], None]
 
-
-def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket, tell: Tell) -> None:
+def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket) -> None:
     """Learn until all rounds are done, and live on.
 
     Raises:
@@ -59,8 +58,8 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
     options = ExecutionOptions(device="cpu", threads=1)
     everybody = Authenticator(None)  # the service has asked for the token
     with open_port(listener, None, everybody, say_once) as grid:
-        tell(READY, 0)
-        progress = ProgressCallbacks(rounds=report, released=lambda _weights: tell(RELEASE, 0))
+        emit_event(READY, None)
+        progress = ProgressCallbacks(rounds=report, released=lambda _weights: emit_event(RELEASE, None))
         run_job(job, options, progress, grid, waiting(say_once))
         _log.info("all %d rounds are done", settings.federated.rounds)
         threading.Event().wait()
@@ -108,7 +107,7 @@ def main(arguments: Sequence[str]) -> int:
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(given.listener))
             listener.listen()
-            run(given.data, given.output, given.settings, listener, tell)
+            run(given.data, given.output, given.settings, listener)
     except FcslamError as error:
         _log.error("%s", error)
         return 2

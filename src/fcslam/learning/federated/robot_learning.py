@@ -1,12 +1,11 @@
 """The process in which a robot learns beside its mapping: ``python -m fcslam.learning.federated.robot_learning``.
 
-It works only while the robot is idle, as its parent says on stdin: `idle` or `busy`; it ends with stdin. On
-stdout it writes a line of JSON for each notice. It reads the keyframes that the robot keeps on its disk, joins the
-rounds of the fleet, and sends weights and reports on pairs of keyframes. Images never leave it.
+It works only while the robot is idle, as its parent says on stdin: `idle` or `busy`. It ends with stdin. Its notices
+are events for the parent. It reads the keyframes that the robot keeps on its disk, joins the rounds of the fleet, and
+sends weights and reports on pairs of keyframes. Images never leave it.
 """
 
 import argparse
-import json
 import os
 import signal
 import sys
@@ -24,8 +23,10 @@ from fcslam.learning.code_training import CodeInputs
 from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
+from fcslam.learning.federated.learning_process import NOTICE
 from fcslam.learning.federated.own_examples import own_examples
 from fcslam.learning.federated.settings import RobotLearningSettings
+from fcslam.processes import emit_event
 from fcslam.wire.keys import Credentials, read_credentials
 
 NICENESS: Final = 19
@@ -85,9 +86,10 @@ class LearningRobot:
     def _look(self) -> None:
         revisits, held_out = own_examples(self._folder, self._settings)
         self._client.revisits, self._client.held_out, self._client.inputs = revisits, held_out, CodeInputs()
-        tell(
+        emit_event(
+            NOTICE,
             f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
-            f"{len(held_out.revisits)} pairs held out"
+            f"{len(held_out.revisits)} pairs held out",
         )
 
 
@@ -104,7 +106,7 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: Learni
         nonlocal told
         if line != told:
             told = line
-            tell(line)
+            emit_event(NOTICE, line)
 
     while True:
         idle.wait()
@@ -115,12 +117,6 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: Learni
             continue
         except LearningEndError as end:
             return str(end)
-
-
-def tell(line: str) -> None:
-    """Write a notice for the parent."""
-    sys.stdout.write(json.dumps({"notice": line}) + "\n")
-    sys.stdout.flush()
 
 
 def _listen(idle: threading.Event) -> None:
@@ -155,9 +151,9 @@ def main(arguments: Sequence[str]) -> int:
         robot = LearningRobot(given.keyframes, client, given.settings, idle)
         client.on_step = robot.pause
         link = partial(RobotLink, given.server, given.name, shown)
-        tell(f"learning ends: {learn(link, client, robot, idle)}")
+        emit_event(NOTICE, f"learning ends: {learn(link, client, robot, idle)}")
     except (FcslamError, OSError) as error:
-        tell(f"learning ends: {error}")
+        emit_event(NOTICE, f"learning ends: {error}")
     return 0
 
 

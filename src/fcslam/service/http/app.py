@@ -24,7 +24,7 @@ from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.robots import detector_router, robot_router
 from fcslam.service.http.state import ACTOR, ServiceState
-from fcslam.service.http.strangers import Strangers
+from fcslam.service.http.unauthenticated import UnauthenticatedLimit
 from fcslam.service.http.viewers import fleet_router, map_router
 
 PREFIX = "/api/v1"
@@ -88,7 +88,7 @@ def create_app(
     if local_names:
         app.add_middleware(LocalNames)
     app.add_middleware(_Watch, state=state)
-    app.add_middleware(Strangers, is_known=state.is_known)
+    app.add_middleware(UnauthenticatedLimit, is_known=state.is_known)
     if named is not None:
         app.add_middleware(NamedMissions, named=named)
     return app

@@ -16,7 +16,7 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from fcslam.service.http.strangers import WAITING
+from fcslam.service.http.unauthenticated import WAITING
 
 MOST_CONNECTIONS = 4096
 """Connections without a request in progress; of more, one of the address that has most is closed."""
@@ -172,7 +172,7 @@ class GuardedProtocol(H11Protocol):
 
     @property
     def may_be_closed(self) -> bool:
-        """Whether the connection is idle, or its request waits among those of strangers."""
+        """Whether the connection is idle, or its request waits among those without a known token."""
         return self.is_idle or WAITING in self.cycle.scope["state"]
 
     def pause_writing(self) -> None:

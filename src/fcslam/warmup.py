@@ -4,11 +4,13 @@ Compiling takes half a minute on a machine that has never done it, loading a sec
 that. Made-up robots cross a made-up room; nothing of it reaches any mission.
 """
 
+import gc
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
 import numpy as np
 
@@ -21,13 +23,15 @@ from fcslam.lidar import correlative, matching
 from fcslam.lidar import field as field_code
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.field import SurfelField, field_of
+from fcslam.lidar.frontend import LidarFrontend
+from fcslam.lidar.lost import FEWEST_SCANS, is_lost
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.processes import obey_parent, start_method
+from fcslam.processes import Background, start_copy
 from fcslam.records import (
     CODE_BYTES,
     PLACE_CHANNELS,
@@ -37,17 +41,19 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     KeyscanId,
+    LaserModel,
+    LaserScan,
     Place,
+    Ranges,
     Sweep,
     frozen,
 )
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.own_places import OwnPlaces
-from fcslam.robot.warmup import MADE_UP_LASER, ROUND, made_up_ranges, made_up_scans
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import decode, encode, measure
-from fcslam.wire.quantisation import dequantise
+from fcslam.wire.quantisation import dequantise, rounded
 
 _STEP_M, _STEPS, _PLACE_EVERY, _AROUND = 0.4, 31, 3, 3
 _EMPTY_SCAN = PointScan(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(2))
@@ -56,6 +62,25 @@ _DETECTOR = "made-up-1"
 _MOTION = np.diag((1e4, 1e4, 1e5))
 _CLOSURE_AFTER = 15
 """Keyscans between the ends of a robot's own closure."""
+MADE_UP_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
+_WALLS = np.array(
+    [
+        (0.0, 0.0, 16.0, 0.0),
+        (16.0, 0.0, 16.0, 9.0),
+        (16.0, 9.0, 0.0, 9.0),
+        (0.0, 9.0, 0.0, 0.0),
+        (4.0, 0.0, 4.0, 1.5),
+        (7.0, 9.0, 8.5, 7.0),
+        (12.0, 0.0, 12.5, 2.0),
+        (13.0, 6.5, 16.0, 6.0),
+    ]
+)
+"""x, y of both ends, metres, in a made-up room."""
+_OTHER_WALLS = 0.95 * _WALLS
+"""In a similar room: a scan of one is near surfaces of the other."""
+ROUND = 60
+"""Made-up scans of one round through the room."""
+_STEPS = 30
 
 
 def warm_up_scanning() -> None:
@@ -94,6 +119,23 @@ def warm_up_recognition() -> None:
     places.motions(0, 1)
 
 
+def warm_up_tracking(config: RobotConfig) -> None:
+    """Compile, or load from the cache, all code that the pose of a scan may need.
+
+    A made-up robot drives around in a room and is put down in another one, so it is lost and searches. Garbage
+    collection would take longer than a scan, so it excludes all objects that are in memory then.
+    """
+    frontend = LidarFrontend("warm-up", config.lidar)
+    scans = list(made_up_scans(_STEPS, sweep=Sweep(0.0, 0.1)))
+    for scan in scans:
+        frontend.process(scan)
+    elsewhere = list(made_up_scans(FEWEST_SCANS, _OTHER_WALLS, Sweep(0.0, 0.1)))
+    is_lost(elsewhere, frontend)
+    point_scan(scans[0].ranges_m, scans[0].laser)  # of a laser that states no beam times
+    gc.collect()
+    gc.freeze()
+
+
 def warm_up_decoding() -> None:
     """Compile what the intake needs: decoding."""
     for data in _packets():
@@ -128,38 +170,33 @@ def is_cold() -> bool:
 
 
 @contextmanager
-def compiling(processes: int, needed: Sequence[Callable[[], None]]) -> Iterator[None]:
-    """Run all warm-ups on several cores; begins as soon as those that are ``needed`` are done.
+def compiling(processes: int) -> Iterator[Sequence[Background]]:
+    """Run all warm-ups on several cores; begins as soon as the first two scans need no compiler.
 
-    The first one runs in this process. The others run in processes beside it, which fill the cache and end with the
+    The first one runs in this process. The others run in copies of it, which are given, fill the cache and end with the
     context. Without a cache nothing does: no process can hand over what it compiled. With one process nothing runs
     beside this one, which compiles the rest when it needs it.
     """
-    here, *beside = WARM_UPS
-    context = start_method()
-    turns = context.BoundedSemaphore(max(1, processes - 1))
-    workers = {
-        run: context.Process(target=_compile, args=(run, turns), daemon=True)
-        for run in (beside if processes > 1 and not uncached() else ())
-    }
-    for worker in workers.values():
-        worker.start()
+    here, matching, *others = WARM_UPS
+    copies: list[Background] = []
+    count = 0 if uncached() else min(processes - 1, len(others))
     try:
+        if count:
+            copies.append(start_copy(partial(_compile, [matching]), niceness=0))
         here()
-        for run in needed:
-            if run in workers:
-                workers[run].join()
-        yield
+        if count:
+            copies[0].join()
+            copies += [start_copy(partial(_compile, others[k::count]), niceness=0) for k in range(count)]
+        yield copies
     finally:
-        for worker in workers.values():
-            worker.terminate()
-            worker.join()
+        for copy in copies:
+            copy.terminate()
+            copy.join()
 
 
-def _compile(run: Callable[[], None], turns: Any) -> None:
-    obey_parent()
+def _compile(runs: Sequence[Callable[[], None]]) -> None:
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115  who needs the code compiles it and reports why it fails
-    with turns:
+    for run in runs:
         run()
 
 
@@ -206,3 +243,29 @@ def _place(
         frozen(keypoints[:, : KEYPOINT_AXES[channel]], np.float32),
         frozen(codes[seen], np.uint8),
     )
+
+
+def made_up_scans(count: int, walls: FloatArray = _WALLS, sweep: Sweep | None = None) -> Iterator[LaserScan]:
+    """Scans of a robot that drives around in a room with ``walls``, shape (W, 4), about 0.5 m at a time."""
+    turn = 2.0 * np.pi / ROUND
+    for k in range(count):
+        x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)
+        heading = float(np.arctan2(2.0 * np.cos(k * turn), -5.0 * np.sin(k * turn)))
+        pose = np.array((x, y, heading))
+        yield LaserScan(float(k), made_up_ranges(pose, walls), MADE_UP_LASER, frozen(pose), sweep)
+
+
+def made_up_ranges(pose: FloatArray, walls: FloatArray = _WALLS) -> Ranges:
+    """Distance to the nearest wall along every beam, as it is sent, shape (B,)."""
+    angles = pose[2] + MADE_UP_LASER.angles_rad()
+    beams = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, np.newaxis]
+    starts, along = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        facing = _cross(beams, along)
+        distance, share = _cross(starts, along) / facing, _cross(starts, beams) / facing
+    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
+    return rounded(np.where(hit, distance, np.inf).min(axis=1), MADE_UP_LASER.max_range_m)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

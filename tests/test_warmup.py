@@ -1,8 +1,9 @@
-"""After the warm-ups nothing is left to be compiled, whatever robots see and send."""
+"""After the warm-ups nothing is left to be compiled, whatever robots see and send, even if they are lost."""
 
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +15,7 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from fcslam.mission.driving import one_by_one
 from fcslam.robot.frontend import RobotConfig
-from fcslam.service.warmup import WARM_UPS, is_cold, warm_up_decoding, warm_up_fleet
+from fcslam.warmup import WARM_UPS, is_cold, warm_up_decoding, warm_up_fleet
 from fcslam.sources import open_source
 
 def compiled():
@@ -74,3 +75,40 @@ def test_after_the_warm_ups_fleet_and_robots_find_all_their_code_compiled(tmp_pa
     assert between > 0, "the fleet gives the matcher and the verification something to do"
     assert legs > 3
     assert (of_decoding, of_fleet, of_robots) == ({}, {}, {})
+
+
+TRACKING = """
+import gc, json, sys
+from numba.core.dispatcher import Dispatcher
+from fcslam.records import Channel
+from fcslam.robot.backend_runner import WorkerBackend
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.warmup import warm_up_tracking
+from tests.robot.kidnapping import kidnapping
+from tests.robot.test_backend_runner import Held
+
+def compiled():
+    return {
+        f"{name}.{attribute}": sorted(map(str, value.signatures))
+        for name, module in sys.modules.items() if name.startswith("fcslam.")
+        for attribute, value in vars(module).items() if isinstance(value, Dispatcher)
+    }
+
+config, executor = RobotConfig(channels=(Channel.LIDAR,)), Held()
+robot = RobotFrontend("r", config, WorkerBackend("r", config, executor))
+executor.holds = True  # only the front end works
+scans, _ = kidnapping()
+cold = compiled()
+warm_up_tracking(config)
+warm = compiled()
+for scan in scans:
+    robot.process(scan)
+print(json.dumps([cold != warm, gc.get_freeze_count() > 0, len(robot.tracks), warm == compiled()]))
+"""
+
+
+@pytest.mark.slow
+def test_after_the_warm_up_a_robot_finds_all_its_code_compiled():
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", TRACKING], cwd=root, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == [True, True, 2, True]

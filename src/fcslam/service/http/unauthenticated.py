@@ -20,8 +20,8 @@ WAITING = "waiting"
 """Key in the state of a request that waits: its connection may be closed to make room."""
 
 
-class Strangers:
-    """Lets the requests of strangers through at a limited rate; others pass at once."""
+class UnauthenticatedLimit:
+    """Lets the requests without a known token through at a limited rate; others pass at once."""
 
     def __init__(self, app: ASGIApp, is_known: Callable[[Scope], bool]) -> None:
         self._app, self._is_known = app, is_known
