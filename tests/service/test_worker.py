@@ -178,7 +178,7 @@ def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
 
 def counted(cloud, monkeypatch):
     """The packets that fleets apply from now on."""
-    fleet, applied = type(cloud.worker._fleet), []
+    fleet, applied = type(cloud.worker._host.fleet), []
     apply = fleet.apply
 
     def counting(self, packet):
@@ -303,7 +303,7 @@ def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_g
 def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkeypatch):
     packets = stream("a", POSES, start_s=0.0)
     cloud.put(packets)
-    fleet = type(cloud.worker._fleet)
+    fleet = type(cloud.worker._host.fleet)
     apply = fleet.apply
 
     def fragile(self, packet):
@@ -356,7 +356,7 @@ def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch)
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(type(cloud.worker._fleet), "apply", hungry)
+        patched.setattr(type(cloud.worker._host.fleet), "apply", hungry)
         with pytest.raises(MemoryError):
             cloud.work()
     assert cloud.store.refusals("a") == []
@@ -372,7 +372,7 @@ def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_
     reference.store.refuse(packets[bad].robot, 0, packets[bad].sequence, "beforehand")
     expected = content(reference.finalize())
     reference.store.close()
-    fleet = type(cloud.worker._fleet)
+    fleet = type(cloud.worker._host.fleet)
     apply = fleet.apply
 
     def hungry(self, packet):
@@ -396,7 +396,7 @@ def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_
 def test_workers_that_end_elsewhere_refuse_nothing(cloud, monkeypatch):
     """Killed at a packet, then at another one, and so on: no packet is to blame."""
     cloud.put(two_robots())
-    fleet, ends = type(cloud.worker._fleet), iter([20, 30, 20, 30, 40])
+    fleet, ends = type(cloud.worker._host.fleet), iter([20, 30, 20, 30, 40])
     apply, left = fleet.apply, [next(ends)]
 
     def fragile(self, packet):
@@ -449,7 +449,7 @@ def test_a_packet_refused_while_it_waits_is_not_applied_after_a_restart(cloud):
     cloud.restart()
     cloud.put(packets[-2:-1])
     applied = []
-    cloud.worker._fleet.apply = applied.append
+    cloud.worker._host.fleet.apply = applied.append
     cloud.work()
     assert cloud.store.applied() == len(packets)
     assert [packet.sequence for packet in applied] == [packets[-2].sequence]

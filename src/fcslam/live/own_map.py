@@ -12,14 +12,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from fcslam.cloud.report import Track, fuse_members
-from fcslam.cloud.result import FleetResult, MappedRobot
+from fcslam.cloud.host import FleetHost
+from fcslam.cloud.report import Track
 from fcslam.errors import FcslamError
-from fcslam.geometry import se2
-from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.mission import MissionCloud, MissionConfig
-from fcslam.records import ClosureStatus, Correction, FloatArray, frozen
+from fcslam.records import Correction, FloatArray
 from fcslam.runs import Run
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import SizedPacket, decode, measure
@@ -76,7 +74,8 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(_draw, session, T_map_own)
+        drawn: OccupancyMap = self._answer(_call_host, FleetHost.draw, session, T_map_own)
+        return drawn
 
     def poses(self, session: str) -> FloatArray:
         """``T_own_base`` of the session's keyscans so far, shape (K, 3), metres and radians.
@@ -84,7 +83,7 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(_poses, session)
+        return self._answer(_call_host, FleetHost.poses, session)
 
     def closures(self, session: str, T_map_own: FloatArray) -> FloatArray:
         """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``.
@@ -92,7 +91,7 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(_closures, session, T_map_own)
+        return self._answer(_call_host, FleetHost.closures, session, T_map_own)
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
         """The result of all packets so far; arguments as in ``MissionCloud.run``.
@@ -100,11 +99,11 @@ class OwnMap:
         Raises:
             FcslamError: the worker has ended.
         """
-        return self._answer(_run, tracks, scans, recorded_s)
+        return self._answer(MissionCloud.run, tracks, scans, recorded_s)
 
     def _submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:
         try:
-            return self._executor.submit(function, self._robot, *arguments)
+            return self._executor.submit(_call, self._robot, function, arguments)
         except RuntimeError as error:  # the worker has ended, or the executor was shut down
             failed: Future[Answer] = Future()
             failed.set_exception(error)
@@ -147,54 +146,27 @@ def _open(robot: str, config: MissionConfig) -> None:
     _clouds[robot] = MissionCloud(config)
 
 
-def _restore(robot: str, earlier: Sequence[bytes]) -> list[tuple[int, Correction]]:
+def _call(robot: str, function: Callable[..., Answer], arguments: Sequence[object]) -> Answer:
+    return function(_clouds[robot], *arguments)
+
+
+def _call_host(cloud: MissionCloud, function: Callable[..., Answer], *arguments: object) -> Answer:
+    return function(cloud.host, *arguments)
+
+
+def _restore(cloud: MissionCloud, earlier: Sequence[bytes]) -> list[tuple[int, Correction]]:
     for data in earlier:
-        _clouds[robot].apply(SizedPacket(decode(data), data))
+        cloud.apply(SizedPacket(decode(data), data))
     return []
 
 
-def _apply(robot: str, packets: Sequence[Packet], first_epoch: int) -> list[tuple[int, Correction]]:
+def _apply(cloud: MissionCloud, packets: Sequence[Packet], first_epoch: int) -> list[tuple[int, Correction]]:
     """Apply packets, whose epochs are parts; returns the corrections with their parts."""
     numbered = (_in_epoch(packet, first_epoch + packet.epoch) for packet in packets)
-    replies = [reply for packet in numbered for reply in _clouds[robot].apply(measure(packet))]
+    replies = [reply for packet in numbered for reply in cloud.apply(measure(packet))]
     return [(reply.epoch - first_epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]
 
 
 def _in_epoch(packet: Packet, epoch: int) -> Packet:
     body = replace(packet.body, epoch=epoch) if isinstance(packet.body, Hello) else packet.body
     return replace(packet, epoch=epoch, body=body)
-
-
-def _in_map_of(session: str, result: FleetResult) -> dict[str, MappedRobot]:
-    """The sessions in the map of one session, by name; empty before its first keyscan."""
-    index = next((mapped.map_index for mapped in result.robots if mapped.robot == session), None)
-    return {mapped.robot: mapped for mapped in result.robots if mapped.map_index == index}
-
-
-def _draw(robot: str, session: str, T_map_own: FloatArray) -> OccupancyMap:
-    cloud = _clouds[robot]
-    members = [
-        replace(mapped, T_map_base=frozen(se2.compose(T_map_own, mapped.T_map_base)))
-        for mapped in _in_map_of(session, cloud.fleet.estimate()).values()
-    ]
-    return fuse_members(members, cloud.config.map) if members else fuse((), np.empty((0, 3)), {}, cloud.config.map)
-
-
-def _closures(robot: str, session: str, T_map_own: FloatArray) -> FloatArray:
-    result = _clouds[robot].fleet.estimate()
-    members = _in_map_of(session, result)
-    ends = [
-        [members[end.robot].T_map_base[end.number] for end in (closure.i, closure.j)]
-        for closure in result.closures
-        if closure.status is ClosureStatus.ACCEPTED and {closure.i.robot, closure.j.robot} <= members.keys()
-    ]
-    return se2.compose(T_map_own, np.array(ends).reshape(-1, 2, 3))[..., :2]
-
-
-def _poses(robot: str, session: str) -> FloatArray:
-    mapped = (mapped.T_map_base for mapped in _clouds[robot].fleet.estimate().robots if mapped.robot == session)
-    return next(mapped, np.empty((0, 3)))
-
-
-def _run(robot: str, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
-    return _clouds[robot].run(tracks, scans, recorded_s)

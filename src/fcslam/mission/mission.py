@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 from fcslam.anchoring.anchors import Anchored, Anchors, anchored
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
-from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
@@ -172,20 +171,18 @@ class MissionCloud:
     def __init__(self, config: MissionConfig, beginning: Beginning = Beginning()) -> None:
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
         self.config, self._beginning, onto = config, beginning, beginning.onto
-        self._cloud = Cloud(config.fleet, config.seed, beginning.verify_pairs)
+        self.host = self._new_host()
+        """The fleet."""
         self._traffic = Counter()
         self._packets: list[StoredPacket] = []
         self._refused = onto.refused
         numbers = itertools.count(len(onto.edits) + 1)
-        self._edits = (*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in beginning.vetoes))
-        self._cloud.fleet.edit(in_force(self._edits))
+        self.host.follow([*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in beginning.vetoes)])
         for packet in onto.refused:
-            self._cloud.refuse(packet.robot, packet.epoch, packet.sequence)
+            self.host.refuse(packet.robot, packet.epoch, packet.sequence)
 
-    @property
-    def fleet(self) -> Fleet:
-        """The fleet, for vetoes and counts."""
-        return self._cloud.fleet
+    def _new_host(self) -> Cloud:
+        return Cloud(self.config.fleet, self.config.seed, self._beginning.verify_pairs, self.config.map)
 
     def resume(self, first: SizedPacket | None) -> bool:
         """Take over the state after all packets of the earlier mission, so that they need not be applied again.
@@ -199,19 +196,12 @@ class MissionCloud:
         onto = self._beginning.onto
         packets = sorted(onto.stored, key=lambda packet: packet.order)
         is_later = not packets or first is None or first.packet.order > packets[-1].order
-        if onto.state is None or not is_later or self._edits != onto.edits or self.config.cloud != onto.config:
+        if onto.state is None or not is_later or self.host.edits != onto.edits or self.config.cloud != onto.config:
             return False
         try:
-            config, state = self.config, onto.state["cloud"]
             numbered = {PacketNumber(session_name(p.robot, p.epoch), p.sequence): p for p in packets}
-            cloud = Cloud.restored(
-                config.fleet,
-                config.seed,
-                state,
-                {number: packet.time for number, packet in numbered.items()},
-                lambda number: decode(numbered[number].data),
-                self._beginning.verify_pairs,
-            )
+            times, host = {number: packet.time for number, packet in numbered.items()}, self._new_host()
+            host.take_over(onto.state["cloud"], onto.edits, times, lambda number: decode(numbered[number].data))
             traffic = {
                 Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
                 for robot, kind, channel, count, size in onto.state["traffic"]
@@ -219,7 +209,7 @@ class MissionCloud:
         except Exception as error:  # a mission must never depend on the state of an earlier one
             _log.warning("all packets take effect again, as the state of the mission cannot be used: %s", error)
             return False
-        self._cloud, self._packets, self._traffic = cloud, packets, Counter(Ledger(traffic, Traffic()))
+        self.host, self._packets, self._traffic = host, packets, Counter(Ledger(traffic, Traffic()))
         return True
 
     def apply(self, sent: SizedPacket) -> list[Packet]:
@@ -229,7 +219,7 @@ class MissionCloud:
             FcslamError: the cloud refuses it.
         """
         try:
-            replies = self._cloud.apply(sent.packet)
+            replies = self.host.apply(sent.packet)
         except PacketError as error:
             raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
         self._packets.append(as_stored(sent))
@@ -239,7 +229,7 @@ class MissionCloud:
 
     def run_so_far(self) -> Run:
         """The map so far, as the service shows it live: without new decisions, and of the keyscans alone."""
-        result = self.fleet.estimate()
+        result = self.host.fleet.estimate()
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = traffic_metrics(self._traffic.ledger(), tracks)
         return run_of(
@@ -255,14 +245,14 @@ class MissionCloud:
             recorded_s: length of the recordings together, seconds.
         """
         trim_memory()  # the robots have ended, and each step below needs much for a moment
-        result = self._cloud.finalize()
+        result = self.host.finalize()
         trim_memory()
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
         mapped = {robot.robot for robot in result.robots}
         tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
-        mission = mission_bytes(self.config.cloud, self._edits, self._packets, self._refused, tracks)
+        mission = mission_bytes(self.config.cloud, self.host.edits, self._packets, self._refused, tracks)
         placing = self._placed(result)
         run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
         run = replace(run, map_files={**run.map_files, **placing.files})
@@ -272,14 +262,14 @@ class MissionCloud:
         anchors, is_fixed = self._beginning.anchors, any(robot.fixes for robot in result.robots)
         if anchors == Anchors() and not is_fixed and not result.sightings:
             return Anchored(result)
-        by_hand = {change.session for change in in_force(self._edits) if isinstance(change, Placement)}
+        by_hand = {change.session for change in in_force(self.host.edits) if isinstance(change, Placement)}
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
         return anchored(result, anchors, placed, lambda members: fuse_members(members, self.config.map))
 
     def _state(self) -> State:
         ledger = self._traffic.ledger()
         traffic = [[*label, total.count, total.bytes] for label, total in ledger.accepted.items()]
-        return {"cloud": self._cloud.state(), "traffic": traffic}
+        return {"cloud": self.host.state(), "traffic": traffic}
 
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
@@ -341,7 +331,7 @@ class _Meter:
 
     def report(self, fusing: bool = False) -> None:
         """Report the progress now."""
-        closures = self._cloud.fleet.closure_counts()
+        closures = self._cloud.host.fleet.closure_counts()
         self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing, self._faults.copy()))
 
 

@@ -7,7 +7,7 @@ the next worker continues from that state, or from turn 0, and reports nothing n
     python -m fcslam.service.worker [--workers ...] [--store ... --lease MISSION FENCE] MISSION_FOLDER
     python -m fcslam.service.worker --standby
 
-A spare worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
+A standby worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
 work; the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for
 every change of the live run folder and for every answered request.
 """
@@ -34,9 +34,8 @@ from typing import IO, Any
 
 import cv2
 
-from fcslam.cloud.edits import in_force, needs_new_fleet
-from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.packet_log import PacketLog, PacketNumber
+from fcslam.cloud.host import FleetHost
+from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.replies import SessionCorrection
 from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
@@ -46,9 +45,8 @@ from fcslam.cluster.verifying import verifying
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.mission.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
+from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, MissionStore, StoredPacket
 from fcslam.processes import RecurringTask, Start, emit_event, start_copy, trim_memory
-from fcslam.records import Edit
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
@@ -118,16 +116,13 @@ class Worker:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._emit_event = folder, store, clock, emit_event
-        self._verify_pairs, self._share = verify_pairs, share
+        self._share = share
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
-        self._fleet = Fleet(self._config.fleet, self._config.seed, verify_pairs)
-        self._log = PacketLog()
+        self._host = FleetHost(self._config, self._read, verify_pairs)
         self._arrivals = 0
         """How many packets were read."""
-        self._edits: list[Edit] = []
-        """The edits that were read."""
         self._read_hash = b""
         """Hash of all packets that were read, in their order."""
         self._resumed_at = store.applied()
@@ -178,11 +173,14 @@ class Worker:
         edits = self._store.edits(self._newest_edit)
         if not edits:
             return False
-        before, now = in_force(self._edits), in_force([*self._edits, *edits])
-        self._edits += edits
-        if needs_new_fleet(before, now):
-            self._start_over()
-        self._fleet.edit(now)
+        applied = self._applied
+        if self._host.follow(edits):  # as a worker without a snapshot does: all packets are applied again
+            self._resumed_at = max(self._resumed_at, applied)
+            self._written = 0
+            self._ready.clear()
+            self._arrivals, self._read_hash = 0, b""
+            self._times.clear()
+            self._emit_event(PROGRESS, 0)
         self._joint_maps.shown = self._live.shown = -1
         self._live.task.due_s = self._clock()  # who edits the map waits for it
         self._reported = min(self._reported, max(self._applied, self._resumed_at) - 1)
@@ -191,22 +189,12 @@ class Worker:
     @property
     def _newest_edit(self) -> int:
         """Number of the last edit that was read."""
-        return self._edits[-1].number if self._edits else 0
-
-    def _start_over(self) -> None:
-        """Apply all packets again, as a worker without a snapshot does: edits may change what they did."""
-        self._resumed_at = max(self._resumed_at, self._applied)
-        self._written = 0
-        self._ready.clear()
-        self._fleet, self._log = Fleet(self._config.fleet, self._config.seed, self._verify_pairs), PacketLog()
-        self._arrivals, self._read_hash = 0, b""
-        self._times.clear()
-        self._emit_event(PROGRESS, 0)
+        return self._host.edits[-1].number if self._host.edits else 0
 
     @property
     def _applied(self) -> int:
         """How many packets took effect or were refused."""
-        return self._log.released - len(self._ready)
+        return self._host.log.released - len(self._ready)
 
     def _take_packets(self) -> bool:
         """Apply packets for about ``AT_ONCE_S``; False if no packet waits."""
@@ -222,7 +210,7 @@ class Worker:
         self._report()
         if self._applied > applied:
             self._emit_event(PROGRESS, self._applied)
-            self._emit_event(STAGES, self._fleet.stages.totals)
+            self._emit_event(STAGES, self._host.fleet.stages.totals)
         return self._arrivals > arrivals or self._applied > applied
 
     def _report(self) -> bool:
@@ -245,13 +233,12 @@ class Worker:
         arrived = {(packet.robot, packet.epoch, packet.sequence): packet for _, packet in read}
         for self._arrivals, packet in read:
             self._read_hash = _chained(self._read_hash, packet.data)
-            session = session_name(packet.robot, packet.epoch)
-            number = PacketNumber(session, packet.sequence)
+            number = _number(packet)
             if packet.refusal is None:
-                self._log.add(number, packet.time)
+                self._host.log.add(number, packet.time)
             else:
-                self._log.refuse(number)
-            for _, sequence in self._log.ready(session):
+                self._host.log.refuse(number)
+            for _, sequence in self._host.log.ready(number.session):
                 key = (packet.robot, packet.epoch, sequence)
                 self._ready.append(arrived.get(key) or self._store.packet(*key))
 
@@ -261,8 +248,7 @@ class Worker:
         if self._ready or self._written == self._applied or began < self._write_at:
             return False
         state = {
-            "fleet": self._fleet.state(),
-            "log": self._log.state(),
+            "host": self._host.state(),
             "arrivals": self._arrivals,
             "edits": self._newest_edit,
             "hash": self._read_hash.hex(),
@@ -291,15 +277,11 @@ class Worker:
             edits = [edit for edit in self._store.edits() if edit.number <= state["edits"]]
             if read_hash.hex() != state["hash"] or state["edits"] > (edits[-1].number if edits else 0):
                 raise InputError(f"{self._folder.snapshot}: belongs to other packets")
-            fleet = Fleet.restored(
-                self._config.fleet, self._config.seed, state["fleet"], self._read, self._verify_pairs
-            )
-            log = PacketLog.restored(state["log"])
+            self._host.restore(state["host"], edits)
         except Exception as error:  # a mission must never depend on its snapshot
             _log.warning("%s; the worker applies all packets again", str(error) or type(error).__name__)
             return
-        self._fleet, self._log = fleet, log
-        self._arrivals, self._edits, self._read_hash = state["arrivals"], edits, read_hash
+        self._arrivals, self._read_hash = state["arrivals"], read_hash
         self._times = {(robot, epoch): time_s for robot, epoch, time_s in state["times"]}
         self._heard = {(robot, epoch): time_s for robot, epoch, time_s in state["heard"]}
 
@@ -309,7 +291,7 @@ class Worker:
     def _apply(self, packet: StoredPacket) -> None:
         """One packet takes effect, or is refused and from now on counts as refused."""
         if packet.refusal is not None:  # by a worker before, since it arrived
-            self._log.refuse(PacketNumber(session_name(packet.robot, packet.epoch), packet.sequence))
+            self._host.log.refuse(_number(packet))
             return
         task = f"packet {packet.sequence} of {session_name(packet.robot, packet.epoch)}"
         if self._crashes.is_fatal(task):
@@ -317,8 +299,8 @@ class Worker:
             return
         self._crashes.begin(task)
         try:
-            with self._fleet.stages.measure("apply"):
-                self._fleet.apply(decode(packet.data))
+            with self._host.fleet.stages.measure("apply"):
+                self._host.apply_next(_number(packet), decode(packet.data))
         except PacketError as error:
             self._refuse(packet, str(error))
         except MemoryError:
@@ -334,10 +316,10 @@ class Worker:
 
     def _refuse(self, packet: StoredPacket, reason: str) -> None:
         self._store.refuse(packet.robot, packet.epoch, packet.sequence, reason)
-        self._log.refuse(PacketNumber(session_name(packet.robot, packet.epoch), packet.sequence))
+        self._host.log.refuse(_number(packet))
 
     def _corrections(self) -> list[SessionCorrection]:
-        by_session = {correction.robot: correction for correction in self._fleet.corrections()}
+        by_session = {correction.robot: correction for correction in self._host.fleet.corrections()}
         return [
             SessionCorrection(robot, epoch, time_s, by_session[name])
             for (robot, epoch), time_s in self._times.items()
@@ -383,12 +365,7 @@ class Worker:
     def _result(self) -> FleetResult:
         """The result of all packets that took effect."""
         envelopes = self._store.envelopes(self._arrivals)
-        arrived = (
-            (envelope.time, PacketNumber(session_name(envelope.robot, envelope.epoch), envelope.sequence))
-            for envelope in envelopes
-            if not envelope.is_refused
-        )
-        return self._fleet.finalize(self._log, arrived, self._read)
+        return self._host.conclude((one.time, _number(one)) for one in envelopes if not one.is_refused)
 
     def _read(self, number: PacketNumber) -> Packet:
         return decode(self._store.packet(*robot_and_epoch(number.session), number.sequence).data)
@@ -402,7 +379,7 @@ class Worker:
         if not is_new or not output.task.is_due:
             return False
         try:
-            if self._fleet.read_ahead(AT_ONCE):  # after a restart, with a look at what else there is to do in between
+            if self._host.fleet.read_ahead(AT_ONCE):  # after a restart, in small steps
                 return True
             write = output.writer()
             output.task.begin(lambda: _written(output.name, write))
@@ -431,13 +408,13 @@ class Worker:
         """What writes the joint maps as they are now. A copy of this process must not use the store."""
         known = self._concluded
         is_final = known is not None and known[0] == (self._applied, self._newest_edit)
-        result = known[1] if known is not None and is_final else self._fleet.estimate()
+        result = known[1] if known is not None and is_final else self._host.fleet.estimate()
         heard_s, place = dict(self._heard), self._folder.joint_maps
         return lambda: write_joint_maps(place, joint_maps_of(result, heard_s, self._config.map))
 
     def _live_writer(self) -> Callable[[], None]:
         """As ``_joint_maps_writer``, for the live run folder."""
-        result, traffic = self._fleet.estimate(), self._store.traffic()
+        result, traffic = self._host.fleet.estimate(), self._store.traffic()
         maps = {robot.robot: robot.map_index for robot in result.robots}
         is_known = (self._folder.live / f"{QUALITY}.json").exists()
         certifies = not is_known or self._clock() >= self._certify_at or maps != self._certified
@@ -456,7 +433,7 @@ class Worker:
         self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True, with_certificates: bool = True
     ) -> Run:
         counts: Counter[str] = Counter()  # over all floors
-        for state in self._fleet.vocabularies():
+        for state in self._host.fleet.vocabularies():
             counts[f"words_{state.channel}_{state.detector_version}"] += state.words
         words = [Metric(name, count, "1") for name, count in counts.items()]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
@@ -486,6 +463,10 @@ class _Output:
     """How many packets it shows, or will when it is written; -1: it is to be written anew."""
     begun: int = -1
     """How many packets the newest copy writes."""
+
+
+def _number(packet: StoredPacket | Envelope) -> PacketNumber:
+    return PacketNumber(session_name(packet.robot, packet.epoch), packet.sequence)
 
 
 def _written(name: str, write: Callable[[], None]) -> None:
