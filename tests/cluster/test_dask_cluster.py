@@ -31,6 +31,7 @@ from tests.cluster.clusters import Cluster, needs_dask, wait_for
 pytestmark = [needs_dask, pytest.mark.slow]
 
 CONFIG = VerificationConfig()
+DIFFERENT = "whose sources or libraries differ from fcslam 0.1.0 here; install the same ones there"
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +124,9 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
         old = cluster.start_worker("old", preload="import fcslam; fcslam.__version__ = '0.0.9'")
         refused = wait_for(lambda: refusal(cluster))
         assert refused.startswith(f"{cluster.address}: worker 'old' (tcp://127.0.0.1:")
-        assert refused.endswith(") has fcslam 0.0.9, and this is 0.1.0; install the same version there")
+        assert refused.endswith(
+            ") has fcslam 0.0.9, whose sources or libraries differ from fcslam 0.1.0 here; install the same ones there"
+        )
         old.kill()
 
         cluster.start_worker("good")
@@ -134,9 +137,7 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
             )
             (warning,) = wait_for(warnings_of)
             assert warning.startswith("worker 'changed' (tcp://127.0.0.1:")
-            assert warning.endswith(
-                "has an fcslam 0.1.0 of other sources or with other libraries; install the same ones there"
-            )
+            assert warning.endswith(f"has fcslam 0.1.0, {DIFFERENT}")
             assert len(verify._processes()) == 1
             assert written(verify(pairs, CONFIG)) == expected
         assert len(warnings_of()) == 1

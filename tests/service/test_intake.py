@@ -15,7 +15,7 @@ from fcslam.mission import mission_store
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Correction, Removal, Undo, Veto, frozen
 from fcslam.service import intake as module
-from fcslam.service.intake import LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
+from fcslam.service.intake import AGENT_LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
@@ -177,9 +177,9 @@ def test_a_second_agent_waits_until_the_first_is_silent_long_enough(desk):
     desk.take(robot="b", agent="y")  # another robot is another matter
     with pytest.raises(LeaseError, match="another agent"):
         desk.take(DATA[1], agent="y")
-    desk.now += LEASE_S - 1.0
+    desk.now += AGENT_LEASE_S - 1.0
     desk.take(DATA[1], agent="x")
-    desk.now += LEASE_S - 1.0
+    desk.now += AGENT_LEASE_S - 1.0
     with pytest.raises(LeaseError):
         desk.take(DATA[2], agent="y")
     desk.now += 1.0

@@ -23,7 +23,7 @@ from fcslam.learning.federated.settings import DETECTOR, RELEASE, FleetLearningS
 from fcslam.processes import Child, module_command
 from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.authentication import Authenticator, read_tokens
-from fcslam.service.http.events import EventStream, EventStreams
+from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 from fcslam.service.http.state import ServiceState
@@ -122,7 +122,7 @@ def shared_state(
             return Supervisor(folder.name, lambda: standby.start(arguments), lambda *_: None)
 
         missions: SharedMissions
-        events = EventStreams(lambda: missions.open_mission.name)
+        events = EventStream(lambda: missions.open_mission.name)
         hooks = Hooks(launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM))
         missions = SharedMissions(data, config, server, name, missions_here, robots_here, hooks)
         missions.closing = opened.pop_all().close

@@ -12,7 +12,6 @@ import threading
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Executor, Future
 from functools import cache
-from importlib.metadata import version
 from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -43,12 +42,7 @@ class DaskCluster:
     """A connection to a cluster; a context."""
 
     def __init__(self, address: str, must_connect: bool = True) -> None:
-        """Connect to a scheduler, and check all workers.
-
-        Raises:
-            InputError: there is no Dask. With ``must_connect`` also: there is no cluster, it has no worker, or one of
-                them is refused.
-        """
+        """Connect to a scheduler, and check all workers."""
         try:
             import distributed  # noqa: F401
         except ImportError as error:
@@ -169,11 +163,7 @@ class DaskCluster:
         await client
 
     async def _look(self, must_fit: bool) -> None:
-        """Follow which workers there are.
-
-        Raises:
-            InputError: with ``must_fit``, a worker is refused.
-        """
+        """Follow which workers there are."""
         identity = await asyncio.wait_for(self._client.scheduler.identity(n_workers=-1), ANSWER_S)
         names = {address: str(about["name"]) for address, about in identity["workers"].items()}
         self._refused &= names.keys()
@@ -192,27 +182,23 @@ class DaskCluster:
 
     async def _refusal(self, address: str) -> str | None:
         """Why a worker may not verify closures; None: it may."""
-        try:
-            there = await self._ask(address, version, "fcslam")
-        except Exception as error:
-            return f"has no fcslam ({_text(error)}); install fcslam {fcslam.__version__} there"
-        other = f"has fcslam {there}, and this is {fcslam.__version__}; install the same version there"
-        try:
-            identity = CodeIdentity(*await self._ask(address, identify))
-        except Exception as error:
-            return other if there != fcslam.__version__ else f"cannot verify closures ({_text(error)})"
         here = identify()
-        if identity.version != here.version:
-            return f"has fcslam {identity.version}, and this is {here.version}; install the same version there"
-        if identity.code != here.code:
-            return f"has an fcslam {here.version} of other sources or with other libraries; install the same ones there"
-        if identity.proof != here.proof:
+        try:
+            there = CodeIdentity(*await self._ask(address, identify))
+        except Exception as error:
+            return f"cannot verify closures ({_text(error)}); install fcslam {here.version} there"
+        if there[:2] != here[:2]:
+            return (
+                f"has fcslam {there.version}, whose sources or libraries differ from fcslam {here.version} here; "
+                "install the same ones there"
+            )
+        if there.proof != here.proof:
             return "computes other digits, as its processor differs; the map would depend on who verifies"
         return None
 
-    async def _ask(self, address: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    async def _ask(self, address: str, function: Callable[[], Any]) -> Any:
         """The result of a function on one worker, beside its tasks."""
-        asked = self._client.run(function, *arguments, workers=[address])
+        asked = self._client.run(function, workers=[address])
         return (await asyncio.wait_for(asked, CHECK_S))[address]
 
     async def _disconnect(self) -> None:

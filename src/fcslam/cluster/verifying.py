@@ -23,11 +23,7 @@ def is_cluster(workers: str) -> bool:
 
 
 def check_workers(workers: str) -> None:
-    """Check that this can be a choice.
-
-    Raises:
-        InputError: it cannot.
-    """
+    """Check that this can be a choice."""
     if not (is_cluster(workers) or (workers.isdecimal() and 1 <= int(workers) <= MOST_PROCESSES)):
         raise InputError(
             f"--workers: '{workers}' is neither a number from 1 to {MOST_PROCESSES} nor the address of a Dask "
@@ -42,10 +38,6 @@ def verifying(workers: str, must_connect: bool = True) -> Iterator[VerifyPairs]:
     Args:
         workers: the choice.
         must_connect: whether a cluster must be there now; otherwise this process verifies until it is.
-
-    Raises:
-        InputError: the choice is not valid, the cluster is not there or refused, or the host gives processes no
-            semaphores.
     """
     check_workers(workers)
     with ExitStack() as stack:

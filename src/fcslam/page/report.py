@@ -46,11 +46,7 @@ SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="sty
 
 
 def report_html(mission: ViewedMission) -> str:
-    """The page of a finished run, with all that it shows.
-
-    Raises:
-        EvaluationError: something of the run is broken.
-    """
+    """The page of a finished run, with all that it shows."""
     maps = {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
     zooms = {k: _zoom(occupancy, MOST_TILES // len(maps)) for k, occupancy in maps.items()}
     try:
@@ -93,7 +89,6 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
 
 
 def _pictures(mission: ViewedMission, maps: Mapping[int, OccupancyMap], zooms: Mapping[int, int]) -> dict[str, str]:
-    """The tiles of all maps in base64, by path."""
     folder = mission.run_folder
     return {
         f"maps/{k}/tiles/{zoom}/{column}/{row}.png": base64.b64encode(
@@ -122,7 +117,6 @@ def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
 
 
 def _json(content: StrictModel | Iterable[StrictModel]) -> str:
-    """As the service writes it."""
     whole = (
         content.model_dump(mode="json")
         if isinstance(content, StrictModel)
@@ -147,7 +141,6 @@ def _tiles(occupancy: OccupancyMap, deepest: int) -> Iterator[tuple[int, int, in
 
 
 def _covered(occupancy: OccupancyMap, zoom: int) -> tuple[range, range]:
-    """Columns and rows of the tiles that show part of a map."""
     side_m, (height, width) = WORLD_M / 2**zoom, occupancy.cells.shape
     x, y = occupancy.origin_xy
     columns, rows = (
@@ -158,7 +151,6 @@ def _covered(occupancy: OccupancyMap, zoom: int) -> tuple[range, range]:
 
 
 def _page(responses: dict[str, Any]) -> str:
-    """The page with script, style and responses in it."""
     html, style, script = _asset("index.html"), _asset("page.css"), "".join(map(_inlined, MODULES))
     data = json.dumps(responses).replace("<", "\\u003c")  # what would end the element, whoever named a robot so
     policy = (

@@ -19,11 +19,7 @@ class ShownRun:
     """A ``ViewedMission`` that nobody can change. Any thread may call; its end removes its copies of mission files."""
 
     def __init__(self, place: Path, name: str) -> None:
-        """Show the run folder at ``place``, or the one that a link there names; there may be none yet.
-
-        Raises:
-            StoreError: its mission file is damaged or of another version.
-        """
+        """Show the run folder at ``place``, or the one that a link there names; there may be none yet."""
         self.name, self._place = name, place
         self._lock, self._copies = threading.Lock(), ExitStack()
         self._opened: dict[tuple[int, int] | None, tuple[MissionStore, Mapping[tuple[str, int], int]]] = {}

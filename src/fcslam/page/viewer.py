@@ -68,7 +68,6 @@ def viewer_app(state: ReadOnly) -> FastAPI:
 
 
 async def _follow(state: ReadOnly) -> None:
-    """Tell of every new run folder."""
     shown = _newest(state)
     for number in itertools.count(1):
         while shown == (newest := _newest(state)):
@@ -78,7 +77,6 @@ async def _follow(state: ReadOnly) -> None:
 
 
 def _newest(state: ReadOnly) -> tuple[int, int] | None:
-    """The identity of the run folder as it is now."""
     folder = state.mission.run_folder
     with suppress(FileNotFoundError):  # another one is about to replace it
         return None if folder is None else identity(folder)

@@ -49,19 +49,11 @@ class AuditLog(ABC):
 
     @abstractmethod
     def append(self, line: bytes) -> None:
-        """Append a line.
-
-        Raises:
-            OSError: it is lost.
-        """
+        """Append a line."""
 
     @abstractmethod
     def lines(self, limit: int) -> list[bytes]:
-        """At most ``limit`` newest lines, the oldest of them first.
-
-        Raises:
-            OSError: the log cannot be read.
-        """
+        """At most ``limit`` newest lines, the oldest of them first."""
 
     def record(self, who: str, address: str, action: str, status: int, content: Mapping[str, Any]) -> None:
         """Append what somebody did. A disk that is full loses the line, which the service's own log then says."""

@@ -15,11 +15,7 @@ class CrashLog:
     """A small file that outlives the worker, not a loss of power: a task costs no wait for the disk."""
 
     def __init__(self, path: Path) -> None:
-        """Read what the worker before was at.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+        """Read what the worker before was at."""
         self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         self._suspect, self._crashes = "", 0
         """The task at which the worker before died, and how many workers in a row did."""

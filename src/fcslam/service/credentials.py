@@ -51,10 +51,6 @@ Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Role], now: datetime.datetime) -> None:
     """Make what is missing: the authority and tokens that are there stay; certificates of the robots in ``names``, and
     with ``hosts`` that of the cloud, are replaced.
-
-    Raises:
-        OutputError: the folder cannot be used, what is in it cannot be read, or a token has no entry.
-        ConfigError: the tokens file in it is broken.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -82,9 +78,6 @@ def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
     """Make what a cluster needs for TLS, in the folder ``cluster``; its authority stays if it is there.
 
     Whoever has a certificate of this authority can run programs on the whole cluster, so it signs no robot's.
-
-    Raises:
-        OutputError: the folder cannot be used, or what is in it cannot be read.
     """
     cluster = folder / "cluster"
     try:
@@ -96,7 +89,6 @@ def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
 
 
 def _authority(folder: Path, now: datetime.datetime) -> Authority:
-    """The authority of the folder, made if the folder has no authority."""
     if (folder / "ca.key").exists():
         found = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
         if not isinstance(found, ec.EllipticCurvePrivateKey):
@@ -159,7 +151,6 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
-    """Write the tokens that are missing, and their hashes."""
     path = folder / "tokens.yaml"
     entries = list(read_tokens(path)) if path.exists() else []
     known = {entry.name for entry in entries}

@@ -44,11 +44,7 @@ class DetectorStore:
             return dict(self._announced)
 
     def announce(self, content: bytes) -> DetectorFile:
-        """Add a network and announce it to the robots.
-
-        Raises:
-            FeatureError: it is not a network that this fcslam runs.
-        """
+        """Add a network and announce it to the robots."""
         self._root.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self._root, prefix=STAGING) as folder:
             staging = Path(folder) / "network.onnx"

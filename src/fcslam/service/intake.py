@@ -19,7 +19,7 @@ from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import UPLINK, PacketKind
 from fcslam.wire.packets import decode, encode, read_label, read_number
 
-LEASE_S = 30.0
+AGENT_LEASE_S = 30.0
 """How long after its last request an agent keeps its robot to itself."""
 LONGEST_QUEUE = 50_000
 """Largest number of packets that arrived and did not take effect yet; the service takes no more until some did."""
@@ -84,16 +84,12 @@ class Agents:
         """Agent of each robot, and when its last request came."""
 
     def hold(self, robot: str, agent: str) -> None:
-        """Let an agent speak for a robot.
-
-        Raises:
-            LeaseError: another one does.
-        """
+        """Let an agent speak for a robot."""
         now = self._clock()
         with self._lock:
             holder, heard = self._held.get(robot, (agent, now))
-            if holder != agent and now < heard + LEASE_S:
-                raise held_by_another(robot, heard + LEASE_S - now)
+            if holder != agent and now < heard + AGENT_LEASE_S:
+                raise held_by_another(robot, heard + AGENT_LEASE_S - now)
             self._held[robot] = agent, now
 
     def note(self, robot: str, agent: str) -> None:

@@ -94,11 +94,7 @@ def joint_maps_of(result: FleetResult, heard_s: Mapping[tuple[str, int], float],
 
 
 def write_joint_maps(path: Path, maps: JointMaps) -> None:
-    """Write the joint maps as one file, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the joint maps as one file, whole or not at all."""
     content = io.BytesIO()
     described = {
         k: {"resolution": grid.resolution_m, "origin": grid.origin_xy, "frame": maps.frames[k]}
@@ -119,11 +115,7 @@ def write_joint_maps(path: Path, maps: JointMaps) -> None:
 
 
 def read_joint_maps(path: Path) -> JointMaps:
-    """Read what ``write_joint_maps`` wrote.
-
-    Raises:
-        StoreError: it is broken or gone.
-    """
+    """Read what ``write_joint_maps`` wrote."""
     try:
         with zipfile.ZipFile(path) as archive:
             head = json.loads(archive.read("joint.json"))
@@ -179,11 +171,7 @@ class ServedJointMaps:
         """When they were made, until when they count, and by frame: a map may change its number, or its frame."""
 
     def follow(self, path: Path) -> JointMaps:
-        """The joint maps in a file as they are now; those without content before there is one.
-
-        Raises:
-            StoreError: the file is broken.
-        """
+        """The joint maps in a file as they are now; those without content before there is one."""
         with self._lock:
             if not path.exists():
                 self._identity, self._maps = None, JointMaps((), {}, {})

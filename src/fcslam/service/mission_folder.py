@@ -36,11 +36,7 @@ class MissionFolder:
 
     @classmethod
     def of(cls, root: Path, name: str) -> Self:
-        """Files of a mission below the folder ``root``, there or not.
-
-        Raises:
-            PacketError: ``name`` is not a valid name.
-        """
+        """Files of a mission below the folder ``root``, there or not."""
         check_name(name, "mission")
         return cls(root / "missions" / name)
 
@@ -49,11 +45,7 @@ class MissionFolder:
         return self.path / "runs" / name
 
     def publish(self, run: Run) -> None:
-        """Make ``run`` the live one; the previous one stays for readers that have it open.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+        """Make ``run`` the live one; the previous one stays for readers that have it open."""
         snapshots = self.path / "snapshots"
         before = int(self.live.resolve().name) if self.live.exists() else 0
         name = str(before + 1)

@@ -84,12 +84,7 @@ class OpenMission:
         return PacketCounts(*counts, self.worker.is_ready)
 
     def edit(self, content: Change | Undo, author: str) -> Edit:
-        """Append an edit to the mission's log; the worker follows it.
-
-        Raises:
-            EditError: it undoes what cannot be undone.
-            StoreError: it cannot be written.
-        """
+        """Append an edit to the mission's log; the worker follows it."""
         edit = self.store.edit(content, author, self._wall_clock())
         self.worker.notify()
         return edit
@@ -108,9 +103,6 @@ def existing_result(folder: MissionFolder, name: str) -> Path | None:
 def check_words(name: str, settings: FleetConfig) -> None:
     """Check that the vocabularies of a mission's settings can be read; without them, every worker would end at its
     start.
-
-    Raises:
-        ServiceError: they cannot.
     """
     try:
         SharedWords(settings)
@@ -119,11 +111,7 @@ def check_words(name: str, settings: FleetConfig) -> None:
 
 
 def _check_file(folder: MissionFolder) -> None:
-    """Refuse a mission whose file is gone: no new one takes its place.
-
-    Raises:
-        StoreError: it is gone or empty.
-    """
+    """Refuse a mission whose file is gone: no new one takes its place."""
     if folder.worker_lock.exists() and not (folder.store.exists() and folder.store.stat().st_size):
         raise StoreError(
             f"{folder.store}: the mission's file is missing or empty; put its backup in its place, or move "
@@ -142,12 +130,7 @@ class Missions:
         wall_clock: Callable[[], float],
         launch: Callable[[MissionFolder], RunningWorker],
     ) -> None:
-        """Open the mission that was open last, or create the first one; ``launch`` starts the worker of a mission.
-
-        Raises:
-            ServiceError: the folder cannot be used, or another service uses it.
-            StoreError: the mission cannot be opened.
-        """
+        """Open the mission that was open last, or create the first one; ``launch`` starts the worker of a mission."""
         self.root = root
         self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
         self._lock = locked(root)
@@ -166,40 +149,23 @@ class Missions:
         return sorted(path.parent.name for path in (self.root / "missions").glob("*/mission.sqlite"))
 
     def create(self, name: str) -> None:
-        """Create a mission and open it.
-
-        Raises:
-            ServiceError: there is one of this name.
-        """
+        """Create a mission and open it."""
         if MissionFolder.of(self.root, name).store.exists():
             raise ServiceError(f"mission '{name}' exists; open it or choose another name")
         self._switch(name)
 
     def open(self, name: str) -> None:
-        """Open a mission: robots' packets go to it from now on. The mission that was open is closed.
-
-        Raises:
-            ServiceError: no mission has this name.
-        """
+        """Open a mission: robots' packets go to it from now on. The mission that was open is closed."""
         if not MissionFolder.of(self.root, name).store.exists():
             raise UnknownMissionError(name, self.names)
         self._switch(name)
 
     def result(self, name: str, number: int) -> Path | None:
-        """The run folder of a result of a mission; None if it does not exist.
-
-        Raises:
-            PacketError: it is not a name.
-        """
+        """The run folder of a result of a mission; None if it does not exist."""
         return existing_result(MissionFolder.of(self.root, name), str(number))
 
     def export(self, name: str, path: Path) -> None:
-        """Write a mission as one new file.
-
-        Raises:
-            ServiceError: no mission has this name.
-            StoreError: it cannot be written.
-        """
+        """Write a mission as one new file."""
         folder = MissionFolder.of(self.root, name)
         if name == self.open_mission.folder.name:
             self.open_mission.store.export(path)
@@ -213,12 +179,7 @@ class Missions:
             store.close()
 
     def import_mission(self, name: str, path: Path) -> None:
-        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open.
-
-        Raises:
-            ServiceError: there is one of this name.
-            StoreError: it cannot be written.
-        """
+        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""
         folder = MissionFolder.of(self.root, name)
         if folder.store.exists():
             raise ServiceError(f"mission '{name}' exists; choose another name")

@@ -8,11 +8,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
+from fcslam.config import StrictModel
 from fcslam.errors import EvaluationError
 from fcslam.maps.exports import earth_frame, zipped
 from fcslam.maps.occupancy_map import HEADER_BYTES, area_of, map_stem
@@ -34,6 +35,8 @@ from fcslam.service.keyscans import live_pose
 from fcslam.service.map_layers import layers_of
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes
+
+_Model = TypeVar("_Model", bound=StrictModel)
 
 
 def fleet_summary(mission: ViewedMission, read_only: bool, may_edit: bool) -> FleetSummary:
@@ -114,20 +117,16 @@ def newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> bytes
 
 def closure_summary(closure: ClosureRow) -> ClosureSummary:
     """One closure."""
-    return ClosureSummary(
-        robot_i=closure.robot_i,
-        stamp_i=closure.stamp_i,
-        robot_j=closure.robot_j,
-        stamp_j=closure.stamp_j,
-        channel=closure.channel,
-        similarity=closure.similarity,
+    reason = closure.reason
+    return _shown(
+        ClosureSummary,
+        closure,
         T_i_j=closure.T_i_j.tolist(),
-        status=closure.status,
-        reason=closure.reason.code,
-        value=closure.reason.value,
-        limit=closure.reason.limit,
-        setting=closure.reason.setting,
-        explanation=str(closure.reason),
+        reason=reason.code,
+        value=reason.value,
+        limit=reason.limit,
+        setting=reason.setting,
+        explanation=str(reason),
     )
 
 
@@ -182,14 +181,8 @@ def trajectories_zip(folder: Path) -> bytes | None:
 def map_separations(mission: ViewedMission) -> list[MapSeparation]:
     """Why maps of one floor are separate, for every two of them."""
     return [
-        MapSeparation(
-            maps=s.maps,
-            candidates=s.candidates,
-            verified=s.verified,
-            reason=None if s.reason is None else s.reason.code,
-            explanation=str(s),
-        )
-        for s in separations(run_of(mission))
+        _shown(MapSeparation, one, reason=None if one.reason is None else one.reason.code, explanation=str(one))
+        for one in separations(run_of(mission))
     ]
 
 
@@ -197,21 +190,25 @@ def map_joins(mission: ViewedMission) -> list[MapJoin]:
     """On what evidence robots share a map, for every two with closures between them that agree."""
     run = run_of(mission)
     maps = {robot.robot: robot.map_index for robot in run.trajectories.values()}
+    measures = "seen_m", "contradicting_m", "likeness", "elsewhere"
     return [
-        MapJoin(
+        _shown(
+            MapJoin,
+            join,
             robots=(join.robot_i, join.robot_j),
             map=maps[join.robot_i],
-            closures=join.closures,
-            places=join.places,
-            seen_m=_finite(join.seen_m),
-            contradicting_m=_finite(join.contradicting_m),
-            likeness=_finite(join.likeness),
-            elsewhere=_finite(join.elsewhere),
             explanation=str(join),
+            **{name: _finite(getattr(join, name)) for name in measures},
         )
         for join in run.joins
         if maps.get(join.robot_i, -1) == maps.get(join.robot_j)
     ]
+
+
+def _shown(model: type[_Model], record: object, **more: object) -> _Model:
+    """A response with the fields of a record that have the same name, and ``more``."""
+    same = {name: getattr(record, name) for name in model.model_fields if name not in more}
+    return model.model_validate({**same, **more})
 
 
 def _finite(value: float) -> float | None:
@@ -220,7 +217,6 @@ def _finite(value: float) -> float | None:
 
 
 def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
-    """Zoom and extent of a map as in ``MapSummary``."""
     if folder is None or not (folder / f"{stem}.yaml").exists():
         return {"zoom": 0, "extent": None}
     with open_file(folder / f"{stem}.pgm", folder) as image:
@@ -230,10 +226,6 @@ def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
 
 
 def run_of(mission: ViewedMission) -> Run:
-    """The newest run, without its maps; an empty one before the first one is written.
-
-    Raises:
-        EvaluationError: it is broken, or not there any more.
-    """
+    """The newest run, without its maps; an empty one before the first one is written."""
     folder = mission.run_folder
     return Run({}) if folder is None else viewed_run(folder)

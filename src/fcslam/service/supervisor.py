@@ -4,7 +4,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from fcslam.cloud.stage_times import StageTotal
 from fcslam.processes import Child
@@ -27,36 +28,6 @@ STANDBY = "--standby"
 _log = logging.getLogger(__name__)
 
 
-class RunningWorker(Protocol):
-    """A worker, wherever it runs."""
-
-    @property
-    def pid(self) -> int | None:
-        """Process id; None while there is no process."""
-
-    @property
-    def starts(self) -> int:
-        """How often it was started."""
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether it runs and has compiled its code."""
-
-    @property
-    def applied(self) -> int:
-        """How many packets the present worker has applied, those of its snapshot included."""
-
-    @property
-    def stages(self) -> Mapping[str, StageTotal]:
-        """Totals of the present worker's stages, by name."""
-
-    def notify(self) -> None:
-        """Notify the worker of new packets or requests."""
-
-    def stop(self) -> None:
-        """Stop the worker after its current step, and wait."""
-
-
 class Supervisor:
     """One worker at a time, until ``stop``."""
 
@@ -76,23 +47,25 @@ class Supervisor:
         self._child: Child | None = None
         self._is_ready = False
         self.starts, self.applied = 0, 0
+        """How often a worker was started, and how many packets the present one has applied."""
         self.stages: Mapping[str, StageTotal] = {}
+        """Totals of the present worker's stages, by name."""
         self._thread = threading.Thread(target=self._run, name=f"worker of {name}", daemon=True)
         self._thread.start()
 
     @property
     def pid(self) -> int | None:
-        """As in ``RunningWorker``."""
+        """Process id; None while there is no process."""
         child = self._child
         return None if child is None else child.pid
 
     @property
     def is_ready(self) -> bool:
-        """As in ``RunningWorker``."""
+        """Whether the worker runs and has compiled its code."""
         return self._is_ready and self.pid is not None
 
     def notify(self) -> None:
-        """As in ``RunningWorker``. One that is gone is followed by one that looks for itself."""
+        """Notify the worker of new packets or requests; one that is gone is followed by one that looks for itself."""
         with self._lock:
             if self._child is not None:
                 self._child.send()
@@ -123,7 +96,6 @@ class Supervisor:
             pause_s *= 2.0
 
     def _watch_one(self) -> int:
-        """Start a worker and pass on its events until it ends."""
         child = self._start()
         with self._lock:
             self._child, self._is_ready = child, False
@@ -147,3 +119,23 @@ class Supervisor:
             self.stages = {stage: StageTotal(*total) for stage, total in content.items()}
         else:
             self._listen(event, content)
+
+
+class Elsewhere(NamedTuple):
+    """The worker of a mission on another instance, as this one sees it."""
+
+    is_ready: bool
+    applied: int
+    pid: int | None = None
+    starts: int = 0
+    stages: Mapping[str, StageTotal] = MappingProxyType({})
+
+    def notify(self) -> None:
+        """It looks for itself."""
+
+    def stop(self) -> None:
+        """It is stopped where it runs."""
+
+
+RunningWorker = Supervisor | Elsewhere
+"""A worker, wherever it runs."""

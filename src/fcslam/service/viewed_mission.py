@@ -58,11 +58,7 @@ _kept: dict[Path, tuple[object, Run]] = {}
 
 
 def viewed_run(folder: Path) -> Run:
-    """The run in a ``run_folder`` of a viewed mission, without its large files.
-
-    Raises:
-        EvaluationError: it is broken, or not there any more.
-    """
+    """The run in a ``run_folder`` of a viewed mission, without its large files."""
     mission = folder.parent
     with _keeping:
         reading = _reading.setdefault(mission, threading.Lock())

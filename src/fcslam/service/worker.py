@@ -188,7 +188,6 @@ class Worker:
 
     @property
     def _newest_edit(self) -> int:
-        """Number of the last edit that was read."""
         return self._host.edits[-1].number if self._host.edits else 0
 
     @property
@@ -363,7 +362,6 @@ class Worker:
         self._emit_event("finalized", asked.number)
 
     def _result(self) -> FleetResult:
-        """The result of all packets that took effect."""
         envelopes = self._store.envelopes(self._arrivals)
         return self._host.conclude((one.time, _number(one)) for one in envelopes if not one.is_refused)
 
@@ -413,7 +411,6 @@ class Worker:
         return lambda: write_joint_maps(place, joint_maps_of(result, heard_s, self._config.map))
 
     def _live_writer(self) -> Callable[[], None]:
-        """As ``_joint_maps_writer``, for the live run folder."""
         result, traffic = self._host.fleet.estimate(), self._store.traffic()
         maps = {robot.robot: robot.map_index for robot in result.robots}
         is_known = (self._folder.live / f"{QUALITY}.json").exists()

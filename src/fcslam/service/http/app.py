@@ -1,14 +1,13 @@
 """The ASGI application; what it needs is given to it."""
 
 import json
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
 from functools import cache
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
-from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -82,7 +81,10 @@ def create_app(
     for make in (*ROUTERS, *VIEWER_ROUTERS):
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(operations_router(state))
-    app.add_route("/openapi.json", _description(app), include_in_schema=False)
+    description = cache(lambda: json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode())
+    app.add_route(
+        "/openapi.json", lambda _: Response(description(), media_type="application/json"), include_in_schema=False
+    )
     for router in more:
         app.include_router(router)
     if local_names:
@@ -92,19 +94,6 @@ def create_app(
     if named is not None:
         app.add_middleware(NamedMissions, named=named)
     return app
-
-
-def _description(app: FastAPI) -> Callable[[Request], Response]:
-    """The route of the interface's description, which is written once."""
-
-    @cache
-    def written() -> bytes:
-        return json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
-
-    def send(_: Request) -> Response:
-        return Response(written(), media_type="application/json")
-
-    return send
 
 
 class _Watch:

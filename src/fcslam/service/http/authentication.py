@@ -91,7 +91,6 @@ class Authenticator:
 
 
 def _by_name(certificate: str) -> Identity | None:
-    """The robot named by a certificate's common name."""
     try:
         names = x509.Name.from_rfc4514_string(certificate).get_attributes_for_oid(NameOID.COMMON_NAME)
         name = str(names[0].value) if len(names) == 1 else ""
@@ -102,12 +101,7 @@ def _by_name(certificate: str) -> Identity | None:
 
 
 def read_tokens(path: Path) -> tuple[TokenEntry, ...]:
-    """Tokens of a file.
-
-    Raises:
-        ConfigError: it cannot be read or has a key or a value that does not belong.
-        ServiceError: one robot, or one token, is named twice.
-    """
+    """Tokens of a file."""
     tokens = load(TokensFile, path).tokens
     for what in ("sha256", "name"):
         values = [getattr(entry, what) for entry in tokens]

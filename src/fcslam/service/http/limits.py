@@ -33,11 +33,7 @@ class RateLimit:
         self._buckets = TokenBuckets(clock, BYTES_PER_S, burst)
 
     def check(self, robot: str, batch: bytes = b"") -> None:
-        """Count a request. Refuses more than the robot may send: 413, 429 (HTTPException).
-
-        Raises:
-            PacketError: ``batch`` is not a batch.
-        """
+        """Count a request. Refuses more than the robot may send: 413, 429 (HTTPException)."""
         size = sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(batch))  # unpacking takes time
         if size > self._largest:
             raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")

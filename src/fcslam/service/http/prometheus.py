@@ -3,7 +3,9 @@
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import cast
 
 from prometheus_client import CollectorRegistry, Counter, Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -56,7 +58,7 @@ class ServiceMetrics:
     def text(self, mission: OpenMission) -> bytes:
         """All metrics in the Prometheus text format."""
         families = *self._registry.collect(), *self._gauges(mission), *self._uplink.families(mission), *_stages(mission)
-        return generate_latest(_Families(families))
+        return generate_latest(cast(Collector, SimpleNamespace(collect=lambda: families)))
 
     def _gauges(self, mission: OpenMission) -> Iterator[Metric]:
         ready, applied, worker = mission.intake.ready_count(), mission.store.applied(), mission.worker
@@ -71,17 +73,6 @@ class ServiceMetrics:
             ("worker_up", "Whether the worker runs", float(worker.pid is not None)),
         ):
             yield GaugeMetricFamily(f"fcslam_{name}", text, value)
-
-
-class _Families(Collector):
-    """Metrics that were read before."""
-
-    def __init__(self, families: Iterable[Metric]) -> None:
-        self._families = families
-
-    def collect(self) -> Iterable[Metric]:
-        """For the registry."""
-        return self._families
 
 
 class _Arrivals:

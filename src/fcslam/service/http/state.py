@@ -15,7 +15,7 @@ from starlette.types import Scope
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Identity, Role
-from fcslam.service.http.events import EventStream, EventStreams
+from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
@@ -39,7 +39,7 @@ class ViewerState(Protocol):
         """The mission that viewers see."""
 
     @property
-    def events(self) -> EventStream | EventStreams:
+    def events(self) -> EventStream:
         """Changes of it."""
 
     @property
@@ -64,7 +64,7 @@ class ServiceState:
     missions: "Missions | SharedMissions"
     authenticator: Authenticator
     rate: RateLimit
-    events: EventStream | EventStreams
+    events: EventStream
     audit: AuditLog
     learning: Path | None = None
     """Output folder of a federated training, for viewers."""

@@ -43,7 +43,6 @@ class UnauthenticatedLimit:
         await self._app(scope, receive, send)
 
     def _passes(self) -> bool:
-        """Whether a request may pass at once."""
         now = asyncio.get_running_loop().time()
         self._credit = min(AT_ONCE, self._credit + (now - self._at) * PER_S)
         self._at = now

@@ -284,10 +284,7 @@ def _or_404() -> Iterator[None]:
 
 
 def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
-    """The closure with this channel, robot and stamp of i, robot and stamp of j.
-
-    Refuses (HTTPException 404): the run has no such closure.
-    """
+    """The closure with this channel, robot and stamp of i, robot and stamp of j."""
     for c in run.closures:
         if named == (c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j):
             return c
@@ -295,10 +292,6 @@ def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
 
 
 def _folder_of(state: ViewerState) -> Path:
-    """The run folder as it is now.
-
-    Refuses (HTTPException 404): no run folder is written yet.
-    """
     folder = state.mission.run_folder
     if folder is None:
         raise HTTPException(404, "there is no map yet")
@@ -310,10 +303,6 @@ def _file(state: ViewerState, name: str, media_type: str) -> FileResponse:
 
 
 def _existing(state: ViewerState, name: str) -> Path:
-    """A file of the run folder.
-
-    Refuses (HTTPException 404): the file is missing or cannot be read.
-    """
     folder = _folder_of(state)
     try:
         check_file(folder / name, folder)

@@ -4,11 +4,11 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from fcslam.service.intake import LEASE_S, Agents, BusyError, held_by_another
+from fcslam.service.intake import AGENT_LEASE_S, Agents, BusyError, held_by_another
 from fcslam.service.shared.schema import schema_of
 from fcslam.storage.postgres import Postgres
 
-CONFIRM_S: Final = LEASE_S / 3.0
+CONFIRM_S: Final = AGENT_LEASE_S / 3.0
 """An instance asks the store so long after it asked last."""
 ELSEWHERE_S: Final = 5.0
 """How long a robot waits that comes to a full instance."""
@@ -23,15 +23,11 @@ class RobotLimit:
         self._heard: dict[tuple[int, str], float] = {}
 
     def admit(self, mission: int, robot: str) -> None:
-        """Count a robot that sends.
-
-        Raises:
-            BusyError: there are as many others as this instance takes.
-        """
+        """Count a robot that sends."""
         now = self._clock()
         with self._lock:
             if (mission, robot) not in self._heard and len(self._heard) >= self._most:
-                self._heard = {who: heard for who, heard in self._heard.items() if now < heard + LEASE_S}
+                self._heard = {who: heard for who, heard in self._heard.items() if now < heard + AGENT_LEASE_S}
                 if len(self._heard) >= self._most:
                     raise BusyError(
                         f"{robot}: this instance takes {self._most} robots (FCSLAM_MAX_ROBOTS); send to another one",
@@ -50,13 +46,7 @@ class SharedAgents(Agents):
         """When the store said last that an agent speaks for a robot."""
 
     def hold(self, robot: str, agent: str) -> None:
-        """Let an agent speak for a robot.
-
-        Raises:
-            LeaseError: another one does, to this instance or to another one.
-            BusyError: this instance takes no more robots.
-            StoreError: the store cannot be asked.
-        """
+        """Let an agent speak for a robot."""
         self._limit.admit(self._mission, robot)
         if self._clock() >= self._confirmed.get((robot, agent), -CONFIRM_S) + CONFIRM_S:
             self._confirm(robot, agent)
@@ -66,12 +56,12 @@ class SharedAgents(Agents):
         taken = self._server.rows(
             "INSERT INTO agents VALUES (?, ?, clock_timestamp()) ON CONFLICT (robot) DO UPDATE"
             " SET agent = excluded.agent, heard = clock_timestamp() WHERE agents.agent = excluded.agent"
-            f" OR agents.heard < clock_timestamp() - interval '{LEASE_S} seconds' RETURNING 1",
+            f" OR agents.heard < clock_timestamp() - interval '{AGENT_LEASE_S} seconds' RETURNING 1",
             (robot, agent),
             schema_of(self._mission),
         )
         if not taken:
-            raise held_by_another(robot, LEASE_S)
+            raise held_by_another(robot, AGENT_LEASE_S)
         with self._lock:
             self._confirmed = {known: at for known, at in self._confirmed.items() if known[0] != robot}
             self._confirmed[robot, agent] = self._clock()

@@ -15,12 +15,7 @@ class SharedDetectors(DetectorStore):
         self._server = server
 
     def announce(self, content: bytes) -> DetectorFile:
-        """Add a network and announce it to the robots of all instances.
-
-        Raises:
-            FeatureError: it is not a network that this fcslam runs.
-            StoreError: it cannot be stored.
-        """
+        """Add a network and announce it to the robots of all instances."""
         file = super().announce(content)
         self._server.rows(
             "INSERT INTO detectors (channel, version, content) VALUES (?, ?, ?)"
@@ -30,11 +25,7 @@ class SharedDetectors(DetectorStore):
         return file
 
     def follow(self) -> None:
-        """Announce what another instance announced.
-
-        Raises:
-            StoreError: the store cannot be read.
-        """
+        """Announce what another instance announced."""
         newest = self._server.rows(
             "SELECT DISTINCT ON (channel) channel, version, number FROM detectors ORDER BY channel, number DESC"
         )

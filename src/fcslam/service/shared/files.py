@@ -51,11 +51,7 @@ class SharedFiles:
             connection.execute("COMMIT")
 
     def fetch_snapshot(self, folder: MissionFolder) -> None:
-        """Write the snapshot of the worker before into a mission's folder.
-
-        Raises:
-            StoreError: it cannot be read or written.
-        """
+        """Write the snapshot of the worker before into a mission's folder."""
         found = fetched(self._server, self._lease.mission, SNAPSHOT)
         with translate_errors(folder.snapshot):
             if found is None:
@@ -65,21 +61,13 @@ class SharedFiles:
 
 
 def fetched(server: Postgres, mission: int, name: str) -> bytes | None:
-    """A shared file; None if the mission has no file ``name``.
-
-    Raises:
-        StoreError: it cannot be read.
-    """
+    """A shared file; None if the mission has no file ``name``."""
     rows = server.rows("SELECT content FROM files WHERE name = ?", (name,), schema_of(mission))
     return bytes(rows[0][0]) if rows else None
 
 
 def fetch_folder(server: Postgres, mission: int, name: str, path: Path) -> bool:
-    """Write a shared run folder to ``path``; False if the mission has no folder ``name``.
-
-    Raises:
-        StoreError: it cannot be read or written.
-    """
+    """Write a shared run folder to ``path``; False if the mission has no folder ``name``."""
     content = fetched(server, mission, name)
     if content is None:
         return False

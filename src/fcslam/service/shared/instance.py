@@ -4,10 +4,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from fcslam.cloud.stage_times import StageTotal
 from fcslam.errors import ServiceError, StoreError
 from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.registry import LEASE_S, KnownMission, Registry
@@ -32,28 +30,12 @@ class Hooks(NamedTuple):
 
     launch: Callable[[KnownMission, Lease], RunningWorker]
     """Starts the worker of a mission."""
-    listen: Callable[[str, str, int], None]
-    """Receives the name of a mission, an event and its number, whoever has the mission's worker."""
+    listen: Callable[[str, int, str], None]
+    """Receives an event, its number and the name of its mission, whoever has the mission's worker."""
     on_taken: Callable[[], None]
     """Called when another process has taken the name, after this one was gone for a while."""
     follow: Callable[[], None] = lambda: None
     """Called at each step, to take over what other instances put into the store."""
-
-
-class Elsewhere(NamedTuple):
-    """The worker of a mission on another instance, as this one sees it."""
-
-    is_ready: bool
-    applied: int
-    pid: int | None = None
-    starts: int = 0
-    stages: Mapping[str, StageTotal] = MappingProxyType({})
-
-    def notify(self) -> None:
-        """It looks for itself."""
-
-    def stop(self) -> None:
-        """It is stopped where it runs."""
 
 
 class Instance:
@@ -67,12 +49,7 @@ class Instance:
         hooks: Hooks,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take the name; ``most_missions``: how many workers it runs.
-
-        Raises:
-            ServiceError: another instance has this name.
-            StoreError: the server cannot be used.
-        """
+        """Take the name; ``most_missions``: how many workers it runs."""
         self._registry, self._name, self._most, self._hooks, self._clock = registry, name, most_missions, hooks, clock
         self._closing = threading.Event()
         self._take_name()
@@ -116,9 +93,9 @@ class Instance:
         for name, mission in self.known.items():
             old = before.get(name)
             if old is not None and mission.live > old.live:
-                self._hooks.listen(name, "live", mission.live)
+                self._hooks.listen("live", mission.live, name)
             if old is not None and mission.finalized > old.finalized:
-                self._hooks.listen(name, "finalized", mission.finalized)
+                self._hooks.listen("finalized", mission.finalized, name)
 
     def _take_name(self) -> None:
         for _ in range(round(NAME_S / LOOK_S)):
@@ -158,7 +135,6 @@ class Instance:
         self._spread()
 
     def _let_rest(self) -> None:
-        """Find missions in which nothing happens, and end their workers."""
         resting = {mission.number for mission in self.known.values() if not mission.is_wanted}
         for lease in [lease for lease in self._held if lease.mission in resting]:
             self._end(lease)

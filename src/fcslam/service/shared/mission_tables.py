@@ -69,11 +69,7 @@ class MissionTables(RowStore):
             connection.execute("COMMIT")
 
     def import_mission(self, path: Path) -> None:
-        """Insert the rows of a mission file into a mission that has none.
-
-        Raises:
-            StoreError: the file or the server cannot be used; nothing was inserted.
-        """
+        """Insert the rows of a mission file into a mission that has none."""
         with closing(Database(path, SCHEMA, VERSION)) as file, self.transaction() as transaction:
             for table in TABLES:
                 columns, key = ", ".join(table.columns), ", ".join(table.key)

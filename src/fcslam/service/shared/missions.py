@@ -19,10 +19,10 @@ from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, che
 from fcslam.service.shared.agents import RobotLimit, SharedAgents
 from fcslam.service.shared.detectors import SharedDetectors
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, fetch_folder, fetched
-from fcslam.service.shared.instance import Elsewhere, Hooks, Instance
+from fcslam.service.shared.instance import Hooks, Instance
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import KnownMission, Registry
-from fcslam.service.supervisor import RunningWorker
+from fcslam.service.supervisor import Elsewhere, RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import write_file
@@ -133,10 +133,6 @@ class SharedMissions:
 
         Files in ``root`` are this instance's own, and can be made again from the store. At a time, the instance runs
         ``most_missions`` workers, and ``most_robots`` robots send to it.
-
-        Raises:
-            ServiceError: the folder cannot be used, or another instance has the name.
-            StoreError: the store cannot be used.
         """
         self.root = root
         self.closing: Callable[[], object] = lambda: None
@@ -170,11 +166,7 @@ class SharedMissions:
 
     @property
     def open_mission(self) -> SharedMission:
-        """The mission that the present request names, or the open one.
-
-        Raises:
-            UnknownMissionError: no mission has this name.
-        """
+        """The mission that the present request names, or the open one."""
         named = NAMED.get()
         if named is None:
             named = next((name for name, known in self._instance.known.items() if known.is_open), FIRST)

@@ -82,11 +82,7 @@ class Registry:
         return [KnownMission(*row) for row in self._server.rows(_READ)]
 
     def create(self, name: str) -> int:
-        """Create a mission without a row in its tables; returns its number. It needs no worker before its first row.
-
-        Raises:
-            ServiceError: there is one of this name.
-        """
+        """Create a mission without a row in its tables; returns its number. It needs no worker before its first row."""
         with self._server.connection("BEGIN; SET LOCAL search_path TO fcslam") as connection:
             new = connection.execute(
                 "INSERT INTO missions (name) VALUES (%s) ON CONFLICT DO NOTHING RETURNING number", (name,)

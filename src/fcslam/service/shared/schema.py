@@ -61,11 +61,7 @@ def schema_of(number: int) -> str:
 
 
 def prepare(server: Postgres) -> None:
-    """Make the tables on a server that has none.
-
-    Raises:
-        StoreError: they are of another version, the role may not make them, or the server cannot be used.
-    """
+    """Make the tables on a server that has none."""
     with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({LOCK})") as connection:
         found = connection.execute("SELECT to_regclass('fcslam.version') IS NOT NULL").fetchone()
         if not (found and found[0]):
