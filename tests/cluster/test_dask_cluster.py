@@ -136,7 +136,7 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
                 "changed", preload="import fcslam.storage.state_file as file; file.code_version = lambda: 'other'"
             )
             (warning,) = wait_for(warnings_of)
-            assert warning.startswith("worker 'changed' (tcp://127.0.0.1:")
+            assert warning.startswith("a worker of the cluster gets no work: 'changed' (tcp://127.0.0.1:")
             assert warning.endswith(f"has fcslam 0.1.0, {DIFFERENT}")
             assert len(verify._processes()) == 1
             assert written(verify(pairs, CONFIG)) == expected

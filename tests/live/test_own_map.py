@@ -16,8 +16,8 @@ class Instant:
     def __init__(self):
         self.blocks = []
 
-    def submit(self, _, __, *arguments):
-        self.blocks.append(arguments[0])
+    def submit(self, _call, _robot, _function, *arguments):
+        self.blocks.append(arguments[0] if arguments else None)
         done = Future()
         done.set_result([(0, Correction("anna", 1, 0, np.zeros(3)))])
         return done

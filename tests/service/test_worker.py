@@ -325,9 +325,9 @@ def test_a_worker_tells_what_its_stages_cost(cloud):
     cloud.put(packets)
     cloud.work()
     told = dict(cloud.told)
-    assert told["runs of apply"] == len(packets)
-    assert told["runs of solve"] > 0
-    assert told["ms of apply"] >= told["ms of solve"] >= 0
+    assert told[STAGES]["apply"].runs == len(packets)
+    assert told[STAGES]["solve"].runs > 0
+    assert told[STAGES]["apply"].seconds >= told[STAGES]["solve"].seconds >= 0
 
 
 def test_corrections_leave_while_there_is_still_a_queue(cloud):

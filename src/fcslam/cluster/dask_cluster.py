@@ -1,7 +1,7 @@
 """The workers of a Dask cluster as executors: those that compute, bit by bit, what this process computes.
 
-Everything of Dask runs on one thread of its own. It follows the cluster: workers that join are checked before they get
-work, and a scheduler that went away is looked for until it is back. Nobody waits for that.
+A thread follows the cluster: workers that join are checked before they get work, and a scheduler that went away is
+looked for until it is back. Nobody waits for that.
 """
 
 import asyncio
@@ -9,10 +9,10 @@ import hashlib
 import logging
 import ssl
 import threading
-from collections.abc import Callable, Coroutine, Sequence
-from concurrent.futures import Executor, Future
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from functools import cache
-from typing import Any, Final, NamedTuple, Self, TypeVar
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 
@@ -35,7 +35,6 @@ LOOK_EVERY_S: Final = 1.0
 """Between two looks at which workers there are, and for a scheduler that went away."""
 
 _log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 
 class DaskCluster:
@@ -52,90 +51,67 @@ class DaskCluster:
         _quiet()
         self._address = address
         self._client: Any = None
-        self._executors: dict[str, DaskWorker] = {}
+        self._executors: dict[str, Executor] = {}
         """By address, of the workers that passed the check."""
         self._refused: set[str] = set()
         """Addresses of workers that did not."""
         self._is_gone = False
-        self._loop = asyncio.new_event_loop()
-        self._loop.set_exception_handler(_note)
-        self._thread = threading.Thread(target=self._loop.run_forever, name="dask cluster", daemon=True)
-        self._thread.start()
+        self._ending = threading.Event()
         try:
-            self._run(self._begin(must_connect))
-        except BaseException:
-            self._end()
-            raise
-        self._following = asyncio.run_coroutine_threadsafe(self._follow(), self._loop)
+            refusals = self._look()
+            if must_connect and refusals:
+                raise InputError(f"{address}: worker {refusals[0]}")
+            if must_connect and not self._executors:
+                raise InputError(f"{address}: the cluster has no worker; start one: dask worker ADDRESS")
+        except Exception as error:
+            self._disconnect()
+            if not must_connect:
+                self._warn(_text(error))
+            elif isinstance(error, InputError):
+                raise
+            else:
+                raise InputError(
+                    f"{address}: no Dask scheduler answers ({_text(error)}); start one: dask scheduler"
+                ) from error
+        else:
+            self._say(refusals)
+        self._thread = threading.Thread(target=self._follow, name="dask cluster", daemon=True)
+        self._thread.start()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._following.cancel()
-        self._end()
+        self._ending.set()
+        self._thread.join(ANSWER_S)  # it may wait for a scheduler
+        self._disconnect()
 
-    def executors(self) -> "Sequence[DaskWorker]":
+    def executors(self) -> Sequence[Executor]:
         """The workers that take batches now."""
         return list(self._executors.values())
 
-    def submit(self, address: str, function: Callable[..., T], arguments: Sequence[Any]) -> "Future[T]":
-        """Run a function on one worker."""
-        return asyncio.run_coroutine_threadsafe(self._compute(address, function, arguments), self._loop)
-
-    async def _compute(self, address: str, function: Callable[..., T], arguments: Sequence[Any]) -> T:
-        client = self._client
-        if client is None:
-            raise ConnectionError("the cluster does not answer any more")
-        # Not pure: Dask would look for a result of the same arguments, and hash all of them.
-        future = client.submit(function, *arguments, workers=[address], pure=False)
-        try:
-            result: T = await future
-        finally:
-            future.release()
-        return result
-
-    async def _begin(self, must_connect: bool) -> None:
-        try:
-            await self._connect()
-            await self._look(must_connect)
-        except InputError:
-            if must_connect:
-                raise
-        except Exception as error:
-            await self._disconnect()
-            if must_connect:
-                raise InputError(
-                    f"{self._address}: no Dask scheduler answers ({_text(error)}); start one: dask scheduler"
-                ) from error
-        if must_connect and not self._executors:
-            raise InputError(f"{self._address}: the cluster has no worker; start one: dask worker ADDRESS")
-        if not self._executors:
-            self._warn("no worker of it answers")
-
-    async def _follow(self) -> None:
-        while True:
-            await asyncio.sleep(LOOK_EVERY_S)
+    def _follow(self) -> None:
+        while not self._ending.wait(LOOK_EVERY_S):
             try:
-                if self._client is None:
-                    await self._connect()
-                elif self._client.status != "running":
-                    raise ConnectionError("the scheduler closed the connection")
-                await self._look(must_fit=False)
+                refusals = self._look()
             except Exception as error:
-                self._executors = {}
-                await self._disconnect()
+                self._disconnect()
                 self._warn(_text(error))
             else:
-                if self._executors and self._is_gone:
-                    self._is_gone = False
-                    _log.info("the cluster %s is back", self._address)
-                elif not self._executors:
-                    self._warn("it has no worker")
+                self._say(refusals)
+
+    def _say(self, refusals: Sequence[str]) -> None:
+        for refusal in refusals:
+            _log.warning("a worker of the cluster gets no work: %s", refusal)
+        if not self._executors:
+            self._warn("it has no worker")
+        elif self._is_gone:
+            self._is_gone = False
+            _log.info("the cluster %s is back", self._address)
 
     def _warn(self, reason: str) -> None:
         """Say once that it is gone, until it is back."""
-        if not self._is_gone:
+        if not self._is_gone and not self._ending.is_set():
             _log.warning(
                 "the cluster %s is gone (%s); this process verifies closures alone, which is slower",
                 self._address,
@@ -143,7 +119,33 @@ class DaskCluster:
             )
         self._is_gone = True
 
-    async def _connect(self) -> None:
+    def _look(self) -> list[str]:
+        """Follow which workers there are; returns why new ones are refused."""
+        if self._client is None:
+            self._connect()
+        client = self._client
+        if client.status != "running":
+            raise ConnectionError("the scheduler closed the connection")
+        identity = client.sync(client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
+        names = {address: str(about["name"]) for address, about in identity["workers"].items()}
+        self._refused &= names.keys()
+        self._executors = {address: worker for address, worker in self._executors.items() if address in names}
+        new = [address for address in names if address not in self._executors and address not in self._refused]
+        # Not pure: Dask would look for a result of the same arguments, and hash all of them.
+        asked = {address: client.submit(identify, workers=[address], pure=False) for address in new}
+        refusals = []
+        for address, answer in asked.items():
+            refusal = _refusal(answer)
+            if refusal is None:
+                worker = client.get_executor(workers=[address], pure=False)
+                self._executors = {**self._executors, address: worker}
+            else:
+                self._refused.add(address)
+                named = address if names[address] == address else f"'{names[address]}' ({address})"
+                refusals.append(f"{named} {refusal}")
+        return refusals
+
+    def _connect(self) -> None:
         from distributed import Client
         from distributed.security import Security
 
@@ -151,95 +153,34 @@ class DaskCluster:
             security = Security(require_encryption=self._address.startswith("tls://"))
         except (OSError, ssl.SSLError, ValueError) as error:
             raise InputError(f"{self._address}: the certificates cannot be used ({_text(error)})") from error
-        client = Client(
-            self._address,
-            asynchronous=True,
-            timeout=CONNECT_S,
-            set_as_default=False,
-            security=security,
-            name="fcslam",
-        )
-        self._client = client
-        await client
+        self._client = Client(self._address, timeout=CONNECT_S, set_as_default=False, security=security, name="fcslam")
+        self._client.loop.asyncio_loop.set_exception_handler(_note)
 
-    async def _look(self, must_fit: bool) -> None:
-        """Follow which workers there are."""
-        identity = await asyncio.wait_for(self._client.scheduler.identity(n_workers=-1), ANSWER_S)
-        names = {address: str(about["name"]) for address, about in identity["workers"].items()}
-        self._refused &= names.keys()
-        self._executors = {address: worker for address, worker in self._executors.items() if address in names}
-        new = [address for address in names if address not in self._executors and address not in self._refused]
-        refusals = await asyncio.gather(*map(self._refusal, new))
-        for address, refusal in zip(new, refusals, strict=True):
-            if refusal is None:
-                self._executors = {**self._executors, address: DaskWorker(self, address)}
-                continue
-            self._refused.add(address)
-            named = address if names[address] == address else f"'{names[address]}' ({address})"
-            if must_fit:
-                raise InputError(f"{self._address}: worker {named} {refusal}")
-            _log.warning("worker %s of the cluster gets no work: it %s", named, refusal)
-
-    async def _refusal(self, address: str) -> str | None:
-        """Why a worker may not verify closures; None: it may."""
-        here = identify()
-        try:
-            there = CodeIdentity(*await self._ask(address, identify))
-        except Exception as error:
-            return f"cannot verify closures ({_text(error)}); install fcslam {here.version} there"
-        if there[:2] != here[:2]:
-            return (
-                f"has fcslam {there.version}, whose sources or libraries differ from fcslam {here.version} here; "
-                "install the same ones there"
-            )
-        if there.proof != here.proof:
-            return "computes other digits, as its processor differs; the map would depend on who verifies"
-        return None
-
-    async def _ask(self, address: str, function: Callable[[], Any]) -> Any:
-        """The result of a function on one worker, beside its tasks."""
-        asked = self._client.run(function, workers=[address])
-        return (await asyncio.wait_for(asked, CHECK_S))[address]
-
-    async def _disconnect(self) -> None:
+    def _disconnect(self) -> None:
+        self._executors = {}
         client, self._client = self._client, None
         if client is not None:
             try:
-                await asyncio.wait_for(client.close(), CONNECT_S)
+                client.close(timeout=ANSWER_S)
             except Exception as error:  # whatever it was, it is gone
                 _log.debug("the client of the cluster was not closed: %s", _text(error))
-            client.status = "closed"  # or its end would try again, on no loop
-
-    async def _finish(self) -> None:
-        await asyncio.sleep(0)  # who follows the cluster ends first
-        await self._disconnect()
-        others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
-        for task in others:
-            task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
-
-    def _run(self, task: Coroutine[Any, Any, T]) -> T:
-        return asyncio.run_coroutine_threadsafe(task, self._loop).result()
-
-    def _end(self) -> None:
-        self._executors = {}
-        self._run(self._finish())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
 
 
-class DaskWorker(Executor):
-    """One worker of a cluster."""
-
-    def __init__(self, cluster: DaskCluster, address: str) -> None:
-        self._cluster, self._address = cluster, address
-
-    def submit(self, function: Callable[..., T], /, *arguments: Any, **named: Any) -> "Future[T]":
-        """Run a function there; it takes no named arguments."""
-        if named:
-            raise TypeError("a worker of a cluster takes no named arguments")
-        return self._cluster.submit(self._address, function, arguments)
+def _refusal(answer: Any) -> str | None:
+    """Why a worker may not verify closures, by its answer to ``identify``; None: it may."""
+    here = identify()
+    try:
+        there = CodeIdentity(*answer.result(timeout=CHECK_S))
+    except Exception as error:
+        return f"cannot verify closures ({_text(error)}); install fcslam {here.version} there"
+    if there[:2] != here[:2]:
+        return (
+            f"has fcslam {there.version}, whose sources or libraries differ from fcslam {here.version} here; "
+            "install the same ones there"
+        )
+    if there.proof != here.proof:
+        return "computes other digits, as its processor differs; the map would depend on who verifies"
+    return None
 
 
 class CodeIdentity(NamedTuple):

@@ -103,7 +103,7 @@ class OwnMap:
 
     def _submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:
         try:
-            return self._executor.submit(_call, self._robot, function, arguments)
+            return self._executor.submit(_call, self._robot, function, *arguments)
         except RuntimeError as error:  # the worker has ended, or the executor was shut down
             failed: Future[Answer] = Future()
             failed.set_exception(error)
@@ -146,7 +146,7 @@ def _open(robot: str, config: MissionConfig) -> None:
     _clouds[robot] = MissionCloud(config)
 
 
-def _call(robot: str, function: Callable[..., Answer], arguments: Sequence[object]) -> Answer:
+def _call(robot: str, function: Callable[..., Answer], *arguments: object) -> Answer:
     return function(_clouds[robot], *arguments)
 
 
