@@ -6,8 +6,9 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift
-from fcslam.features.detector import NO_FEATURES, FloatFeatures
+from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift, make_detector
+from fcslam.features.detector import NO_FEATURES, FloatFeatures, OnnxConfig
+from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.files import extract, read_features, read_grey, write_features
 from tests.features.networks import tiny_network
 from tests.features.pictures import picture
@@ -182,26 +183,14 @@ def test_taking_some_takes_all_that_is_known_of_them(image):
     assert len(NO_FEATURES.take(slice(3)).scores) == 0
 
 
-def test_scales_of_the_command_line(images, tmp_path, capsys):
+def test_the_strongest_keypoints_of_all_scales_are_kept(images, tmp_path):
     tiny_network(tmp_path / "n.onnx")
-    given = [
-        "tools",
-        "extract",
-        str(images / "grey.png"),
-        "--detector",
-        str(tmp_path / "n.onnx"),
-        "--keypoints",
-        "50",
-        "-o",
-    ]
-    for scales in ("1", "0.5", "1,0.5"):
-        assert main([*given, str(tmp_path / scales), "--scales", scales]) == 0
-    one, half, both = (read_features(tmp_path / scales / "grey.npz")[0] for scales in ("1", "0.5", "1,0.5"))
+    grey = read_grey(images / "grey.png")
+
+    def found(*scales):
+        config = OnnxConfig(weights=tmp_path / "n.onnx", most_features=50, scales=scales)
+        return make_detector(DetectorKind.ONNX, OrbConfig(), config).detect(grey)
+
+    one, half, both = found(1.0), found(0.5), found(1.0, 0.5)
     assert half.scores.max() <= 0.5
-    strongest = np.sort(np.concatenate((one.scores, half.scores)))[::-1][:50]
-    assert np.array_equal(both.scores, strongest)
-    capsys.readouterr()
-    for wrong in ("0", "2", "half"):
-        assert main([*given, str(tmp_path / "wrong"), "--scales", wrong]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("fcslam: the command line: scales.0: ")
+    assert np.array_equal(both.scores, np.sort(np.concatenate((one.scores, half.scores)))[::-1][:50])

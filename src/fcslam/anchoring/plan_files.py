@@ -46,9 +46,6 @@ def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
         path: a PNG (or JPEG, BMP, TIFF) drawing, whose origin is its lower left corner; the YAML file of a ROS map; or
             a DXF drawing.
         scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
-
-    Raises:
-        SourceError: the file cannot be read, shows no lines, or its scale is missing or out of range.
     """
     if scale is not None and not 0.0 < scale < math.inf:
         raise SourceError(f"--plan-scale {scale:g}: give metres per pixel, above 0")

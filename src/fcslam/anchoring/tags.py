@@ -64,11 +64,7 @@ class _SurveyFile(StrictModel):
 
 
 def read_survey(path: Path) -> Survey:
-    """Read the positions of surveyed tags.
-
-    Raises:
-        SourceError: the file cannot be read or has another form.
-    """
+    """Read the positions of surveyed tags."""
     try:
         content = _SurveyFile.model_validate(parse_yaml(read_text(path, most=MOST_TEXT_BYTES)))
     except ValidationError as error:

@@ -35,8 +35,7 @@ from fcslam.cli import map as mapping
 from fcslam.cli import play as playback
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
-from fcslam.cli.options import examples
-from fcslam.cli.recordings import SENSOR_KEYS
+from fcslam.cli.inputs import SENSOR_KEYS
 from fcslam.errors import FcslamError, InputError, printable
 
 BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
@@ -71,7 +70,6 @@ app = typer.Typer(
 tools = typer.Typer(
     no_args_is_help=True,
     help="Simulate recordings, compare dates, train the cameras' detector, and set up a fleet.",
-    epilog=examples("fcslam tools simulate --building office", "fcslam tools config > mission.yaml"),
 )
 COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
     "map": (MAPS, mapping.map_recordings),
@@ -117,6 +115,24 @@ fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c
 fcslam localize today.bag --map runs/building
 fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57
 fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy
+fcslam edit list runs/building
+fcslam edit undo runs/building 2
+fcslam edit veto runs/building anna 1000.0 ben 1000.001
+fcslam edit veto runs/building anna ben
+fcslam edit pin runs/building anna 1000.0 ben 1000.001
+fcslam edit close runs/building anna 1000.0 ben 1000.001 --pose 0.5,0,3.1
+fcslam edit remove runs/building ben
+fcslam edit remove runs/building ben+1
+fcslam edit remove runs/building ben --from 1010 --to 1025
+fcslam edit floor runs/building anna+1 2
+fcslam edit erase runs/building "1,2 3,2 3,4 1,4"
+fcslam edit erase runs/building "0,0 2,0 1,2" --map 1
+fcslam edit free runs/building "1,2 3,4"
+fcslam edit keep-out runs/building "1,2 3,4"
+fcslam edit area runs/building "Room 12" "1,2 3,4"
+fcslam edit place runs/building --to-walls
+fcslam edit place runs/building --at anna,1000.5=3,4,1.57
+fcslam edit place runs/building --match 1.5,2=0,0 --match 9,2.5=7.5,0
 fcslam record ros2:/robot1 -o day.mcap
 fcslam record ros2:/ -o day.mcap --duration 600
 fcslam record robot1.clf.gz -o robot1.bag
@@ -125,6 +141,11 @@ fcslam serve --data cloud
 fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
 fcslam demo --live
 fcslam demo --robots 4 --no-camera -o demo4
+fcslam evaluate fleet fleet/run --truth fleet
+fcslam evaluate fleet demo/run --csv fleet.csv --figure fleet.png
+fcslam evaluate relations runs/intel intel.relations.gz
+fcslam evaluate relations runs/intel-3 intel.relations.gz --across-robots
+fcslam evaluate quality fleet/run
 fcslam tools simulate --building office --no-camera
 fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3
 fcslam tools simulate --robots 20 --building office -o office
@@ -136,28 +157,35 @@ fcslam tools certificates --host cloud.local --robot robot1 --admin boss
 fcslam tools warm-up
 fcslam tools train photos -o detector
 fcslam tools train photos --quick
+fcslam tools federate local robot1 robot2 robot3 --public photos -o fleet
+fcslam tools federate local robot1 robot2 --quick
+fcslam tools federate serve lab:8000 --insecure --public photos -o fleet
+fcslam tools federate join http://server.lab:8000 images --name robot1 -o home
 fcslam tools extract photos -o features --keypoints 1000
 fcslam tools vocabulary runs/building -o building.words
 """
 """Examples for the help of each command: the lines that begin with it."""
 
 
+def _examples(path: str) -> str:
+    """The epilog of a command's help, to be copied as it stands; typer removes single line breaks."""
+    lines = (line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"fcslam {path} "))
+    return "\n\n".join(("Examples:", *lines))
+
+
 for _path, (_panel, _command) in COMMANDS.items():
     _group, _name = (tools if _path.startswith("tools ") else app), _path.removeprefix("tools ")
     if isinstance(_command, typer.Typer):
-        _group.add_typer(_command, name=_name, rich_help_panel=_panel)
+        for _one in _command.registered_commands:
+            assert _one.callback is not None
+            _one.epilog = _examples(f"{_path} {_one.name or _one.callback.__name__}")
+        _group.add_typer(_command, name=_name, rich_help_panel=_panel, epilog=_examples(_path))
     else:
-        _shown = [line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"fcslam {_path} ")]
-        _group.command(_name, rich_help_panel=_panel, epilog=examples(*_shown))(_command)
+        _group.command(_name, rich_help_panel=_panel, epilog=_examples(_path))(_command)
 
 
 def _finite(text: str) -> float:
-    """Number of an option; click takes `nan` for one in every range.
-
-    Raises:
-        InputError: it is not finite.
-        ValueError: it is not a number.
-    """
+    """Number of an option; click takes `nan` for one in every range."""
     number = float(text)
     if not math.isfinite(number):
         raise InputError(f"{text}: is not a finite number; give one to the option")
@@ -217,7 +245,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(epilog=examples("fcslam demo", "fcslam map robot1.bag robot2.bag", "fcslam map --help"))
+@app.callback(epilog="Examples:\n\nfcslam demo\n\nfcslam map robot1.bag robot2.bag\n\nfcslam map --help")
 def _fcslam(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")

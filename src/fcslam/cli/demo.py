@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet
+from fcslam.cli.options import BuildingSeed, Live, NoCamera, PathLength, Quiet
 from fcslam.cli.output import notices, print_line
-from fcslam.cli.show import Live, live_page
+from fcslam.cli.show import live_page
 from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Scanner
 
@@ -74,8 +74,7 @@ def demo(
     with live_page(output / RUN) if live else nullcontext() as page:
         map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
         begin(3, "evaluate: compare with the truth")
-        report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console, explained=False)
-        typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
+        report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console)
         begin(4, "draw")
         _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
@@ -84,11 +83,7 @@ def demo(
 
 
 def _prepare(output: Path) -> None:
-    """Create the folder, and remove the results of an earlier demo from it.
-
-    Raises:
-        OutputError: the folder holds other files, or it cannot be written.
-    """
+    """Create the folder, and remove the results of an earlier demo from it."""
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():

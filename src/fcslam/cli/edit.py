@@ -1,33 +1,26 @@
 """`fcslam edit`: corrections of a mission by hand. Each is a line of a log, counts in later maps, and can be undone."""
 
 import getpass
-import math
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import examples
-from fcslam.cli.recordings import pose as read_pose
+from fcslam.cli.inputs import numbers
+from fcslam.cli.inputs import pose as read_pose
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from fcslam.mission.mission_file import SavedMission
-    from fcslam.records import Change, FloatArray, Pin, Undo, Veto
+    from fcslam.records import Change, Pin, Undo, Veto
     from fcslam.runs import Run
 
 app = typer.Typer(
     no_args_is_help=True,
     help="Correct a mission by hand. An edit counts when you map again: fcslam map --onto RUN -o NEW",
-    epilog=examples(
-        "fcslam edit list runs/building",
-        "fcslam edit veto runs/building anna 1000.0 ben 1000.001",
-        'fcslam edit erase runs/building "1,2 3,2 3,4 1,4"',
-        "fcslam edit undo runs/building 2",
-        "fcslam map --onto runs/building -o runs/building-corrected",
-    ),
 )
 
 _NEGATIVE = {"ignore_unknown_options": True}
@@ -48,7 +41,7 @@ StampI = Annotated[float, typer.Argument(metavar="STAMP_I", help="Seconds, as in
 StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="Seconds, of the other session.")]
 
 
-@app.command("list", epilog=examples("fcslam edit list runs/building"))
+@app.command("list")
 def list_edits(mission: Mission) -> None:
     """Print all edits of a mission: number, time, author, content, and what undid them."""
     from fcslam.cloud.edits import edit_json, kind_of, undone
@@ -65,7 +58,7 @@ def list_edits(mission: Mission) -> None:
         typer.echo("no edits")
 
 
-@app.command(epilog=examples("fcslam edit undo runs/building 2"))
+@app.command()
 def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of the edit.")]) -> None:
     """Undo an edit. The map is then as if the edit had never been made."""
     from fcslam.records import Undo
@@ -73,11 +66,7 @@ def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of
     _append(mission, Undo(number))
 
 
-@app.command(
-    epilog=examples(
-        "fcslam edit veto runs/building anna 1000.0 ben 1000.001", "fcslam edit veto runs/building anna ben"
-    )
-)
+@app.command()
 def veto(
     mission: Mission,
     ends: Annotated[
@@ -100,7 +89,7 @@ def veto(
             raise InputError("give two sessions, or two sessions each with a stamp: anna 1000.0 ben 1000.001")
 
 
-@app.command(epilog=examples("fcslam edit pin runs/building anna 1000.0 ben 1000.001"))
+@app.command()
 def pin(mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ) -> None:
     """Accept a closure of closures.csv, whatever the other evidence says. It joins maps."""
     from fcslam.records import Pin
@@ -108,7 +97,7 @@ def pin(mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: Sessi
     _decide(mission, Pin(session_i, session_j, (stamp_i, stamp_j)))
 
 
-@app.command(epilog=examples("fcslam edit close runs/building anna 1000.0 ben 1000.001 --pose 0.5,0,3.1"))
+@app.command()
 def close(
     mission: Mission,
     session_i: SessionI,
@@ -124,20 +113,14 @@ def close(
     """Add a closure: the pose of session J at one time, as seen from session I at another time. It joins maps."""
     from fcslam.records import ManualClosure
 
-    deviations = tolerance.split(",")
-    if len(deviations) != 2:
+    T_i_j, deviations = read_pose("--pose", pose), numbers(tolerance, 2)
+    if not deviations:
         raise InputError(f"--tolerance {tolerance!r}: give metres and radians, as in --tolerance 0.2,0.1")
-    T_i_j, (metres, radians) = read_pose("--pose", pose), map(_number, deviations)
-    _append(mission, ManualClosure(session_i, stamp_i, session_j, stamp_j, T_i_j, (metres, radians)))
+    sigmas = deviations[0], deviations[1]
+    _append(mission, ManualClosure(session_i, stamp_i, session_j, stamp_j, T_i_j, sigmas))
 
 
-@app.command(
-    epilog=examples(
-        "fcslam edit remove runs/building ben",
-        "fcslam edit remove runs/building ben+1",
-        "fcslam edit remove runs/building ben --from 1010 --to 1025",
-    )
-)
+@app.command()
 def remove(
     mission: Mission,
     session: Annotated[str, typer.Argument(help="A robot, or one of its sessions, such as anna+1 or anna+0.")],
@@ -157,7 +140,7 @@ def remove(
         _append(mission, Cut(session, max(first, -_EVER_S), min(last, _EVER_S)))
 
 
-@app.command(context_settings=_NEGATIVE, epilog=examples("fcslam edit floor runs/building anna+1 2"))
+@app.command(context_settings=_NEGATIVE)
 def floor(
     mission: Mission,
     session: Session,
@@ -169,30 +152,22 @@ def floor(
     _append(mission, FloorLabel(session, name))
 
 
-@app.command(
-    context_settings=_NEGATIVE,
-    epilog=examples(
-        'fcslam edit erase runs/building "1,2 3,4"', 'fcslam edit erase runs/building "0,0 2,0 1,2" --map 1'
-    ),
-)
-def erase(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
-    """Make a part of the map unknown."""
-    _draw(run, "erase", "", corners, map_index)
+def _region_command(use: str) -> Callable[..., None]:
+    def command(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
+        _draw(run, use, "", corners, map_index)
+
+    return command
 
 
-@app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit free runs/building "1,2 3,4"'))
-def free(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
-    """Mark a part of the map as free, where something stood only for a while."""
-    _draw(run, "free", "", corners, map_index)
+for _use, _help in (
+    ("erase", "Make a part of the map unknown."),
+    ("free", "Mark a part of the map as free, where something stood only for a while."),
+    ("keep-out", "Forbid a part of the map: map_keepout.pgm and map_keepout.yaml, the mask of Nav2's keepout filter."),
+):
+    app.command(_use, help=_help, context_settings=_NEGATIVE)(_region_command(_use))
 
 
-@app.command("keep-out", context_settings=_NEGATIVE, epilog=examples('fcslam edit keep-out runs/building "1,2 3,4"'))
-def keep_out(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0) -> None:
-    """Forbid a part of the map: map_keepout.pgm and map_keepout.yaml, the mask of Nav2's keepout filter."""
-    _draw(run, "keep-out", "", corners, map_index)
-
-
-@app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit area runs/building "Room 12" "1,2 3,4"'))
+@app.command(context_settings=_NEGATIVE)
 def area(
     run: RunFolder,
     name: Annotated[str, typer.Argument(help="What the area is called.")],
@@ -204,13 +179,7 @@ def area(
     _draw(run, "area", name, corners, map_index)
 
 
-@app.command(
-    epilog=examples(
-        "fcslam edit place runs/building --to-walls",
-        "fcslam edit place runs/building --at anna,1000.5=3,4,1.57",
-        "fcslam edit place runs/building --match 1.5,2=0,0 --match 9,2.5=7.5,0",
-    )
-)
+@app.command()
 def place(
     run: RunFolder,
     *,
@@ -234,7 +203,8 @@ def place(
     import numpy as np
 
     from fcslam.anchoring.walls import wall_direction
-    from fcslam.mission.map_edits import moved_map
+    from fcslam.geometry import se2
+    from fcslam.mission.map_edits import motion_to_points, moved_map
     from fcslam.records import Placement
 
     if to_walls + (at is not None) + bool(match) != 1:
@@ -246,27 +216,16 @@ def place(
         return
     opened, mission = _opened(run)
     if match:
-        T_new_map, off_m = _matched(match)
+        ends = [pair.partition("=")[::2] for pair in match]
+        points, targets = ([_point("--match", end[k]) for end in ends] for k in (0, 1))
+        T_new_map = motion_to_points(points, targets)
     else:
         walls_rad = wall_direction(opened.maps[map_index]) if map_index in opened.maps else 0.0
-        T_new_map, off_m = np.array((0.0, 0.0, -walls_rad)), 0.0
+        T_new_map = np.array((0.0, 0.0, -walls_rad))
     _append(run, moved_map(opened, mission, map_index, T_new_map))
     if match:
-        typer.echo(f"the points fit to {off_m:.3f} m", err=True)
-
-
-def _matched(pairs: list[str]) -> tuple["FloatArray", float]:
-    """The motion that moves points to where they shall be, and the largest distance that remains, in metres."""
-    import numpy as np
-
-    from fcslam.geometry import se2
-    from fcslam.mission.map_edits import motion_to_points
-
-    ends = [pair.partition("=")[::2] for pair in pairs]
-    points, targets = ([_point("--match", end[k]) for end in ends] for k in (0, 1))
-    T_new_map = motion_to_points(points, targets)
-    off_m = np.hypot(*(se2.transform(T_new_map, np.array(points)) - targets).T)
-    return T_new_map, float(off_m.max())
+        off_m = np.hypot(*(se2.transform(T_new_map, np.array(points)) - targets).T)
+        typer.echo(f"the points fit to {off_m.max():.3f} m", err=True)
 
 
 def _decide(mission: Path, decision: "Veto | Pin") -> None:
@@ -306,29 +265,23 @@ def _append(path: Path, content: "Change | Undo") -> None:
     """Append an edit, and say what to do next."""
     from fcslam.mission.mission_file import edit_mission
 
-    (edit,) = edit_mission(path, [content], _user(), time.time())
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # no account of this number
+        user = "unknown"
+    (edit,) = edit_mission(path, [content], user, time.time())
     typer.echo(f"edit {edit.number}; to apply it: fcslam map --onto {path} -o NEW", err=True)
 
 
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # no account of this number
-        return "unknown"
-
-
 def _point(option: str, text: str) -> tuple[float, float]:
-    numbers = text.split(",")
-    if len(numbers) != 2:
+    given = numbers(text, 2)
+    if not given:
         raise InputError(f"{option} {text!r} is not a point; give metres, as in 1.5,-2")
-    return _number(numbers[0]), _number(numbers[1])
+    return given[0], given[1]
 
 
 def _number(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
+    given = numbers(text, 1)
+    if not given:
         raise InputError(f"{text!r} is not a number")
-    return number
+    return given[0]

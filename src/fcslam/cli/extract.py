@@ -12,6 +12,8 @@ from fcslam.features.detector_kinds import DetectorKind
 
 LONGEST_SIDE_PX = 2048
 """Larger images are shrunk to this longest side."""
+SCALES = (1.0, 0.71, 0.5)
+"""Scales of the image pyramid of a network."""
 
 
 def extract(
@@ -27,21 +29,16 @@ def extract(
     keypoints: Annotated[
         int, typer.Option(min=1, max=2000, help="Number of keypoints to keep of each image, strongest first.")
     ] = 1000,
-    scales: Annotated[
-        str, typer.Option(metavar="S,S,...", help="Scales of the image pyramid of a network.")
-    ] = "1,0.71,0.5",
 ) -> None:
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.config import changed
     from fcslam.features.classical import OrbConfig, make_detector
     from fcslam.features.detector import OnnxConfig
     from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX
-    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints)
-    onnx = changed(onnx, {"scales": scales.split(",")}, "the command line")
+    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=SCALES)
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
-from fcslam.cli.options import SettingsFiles, chosen_settings, examples, output_option
+from fcslam.cli.options import SettingsFiles, chosen_settings, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
 from fcslam.cli.training_options import (
     QUICK_IMAGES,
@@ -48,24 +48,17 @@ SHOWN = {
     "places": "places_found",
 }
 """Figures of a round: name in its line, and column of ``rounds.csv``."""
-_LOCAL = "fcslam tools federate local robot1 robot2 robot3 --public photos -o fleet"
-_SERVE = "fcslam tools federate serve lab:8000 --insecure --public photos -o fleet"
-_JOIN = "fcslam tools federate join http://server.lab:8000 images --name robot1 -o home"
-
 Public = Annotated[
     list[Path] | None,
     typer.Option(help="Folder of public images, on which the server evaluates detectors. Can be repeated."),
 ]
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(
+    no_args_is_help=True, help="Train one detector on the images of many robots. No image leaves its robot."
+)
 
 
-@app.callback(epilog=examples(_LOCAL, _SERVE, _JOIN))
-def federate() -> None:
-    """Train one detector on the images of many robots. No image leaves its robot."""
-
-
-@app.command(epilog=examples(_LOCAL, "fcslam tools federate local robot1 robot2 --quick"))
+@app.command()
 def local(
     folders: Annotated[
         list[Path], typer.Argument(help="Folders of images, one for each robot. The folder names the robot.")
@@ -98,7 +91,7 @@ def local(
     print_line(console, f"{time.perf_counter() - began:.0f} s")
 
 
-@app.command(epilog=examples(_SERVE))
+@app.command()
 def serve(
     address: Annotated[str, typer.Argument(metavar="HOST:PORT", help="Address to listen on.")],
     *,
@@ -143,7 +136,7 @@ def serve(
     typer.echo(str(job.output / "detector.onnx"))
 
 
-@app.command(epilog=examples(_JOIN))
+@app.command()
 def join(
     server: Annotated[str, typer.Argument(metavar="URL", help="Address of the server, as in https://server.lab:8000.")],
     images: Annotated[Path, typer.Argument(help="Folder of the robot's images. They stay on this machine.")],

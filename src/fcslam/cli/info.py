@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.inputs import bag_options
+from fcslam.cli.options import Sensors
 from fcslam.cli.output import notices
-from fcslam.cli.recordings import Sensors, bag_options
 from fcslam.errors import printable
 
 if TYPE_CHECKING:

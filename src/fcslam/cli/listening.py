@@ -11,11 +11,7 @@ from fcslam.errors import ServiceError
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Listen on an address; port 0 is a free one.
-
-    Raises:
-        ServiceError: the port is in use, or the address is not of this machine.
-    """
+    """Listen on an address; port 0 is a free one."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=512)
@@ -35,11 +31,7 @@ Credentials = Annotated[
 
 
 def find_files(folder: Path | None) -> tuple[Path | None, Path | None, Path | None]:
-    """Tokens, certificate and key in a service's folder of credentials, as far as they are there.
-
-    Raises:
-        ServiceError: no file is there.
-    """
+    """Tokens, certificate and key in a service's folder of credentials, as far as they are there."""
     if folder is None:
         return None, None, None
     names = "tokens.yaml", "cloud.pem", "cloud.key"
@@ -50,11 +42,7 @@ def find_files(folder: Path | None) -> tuple[Path | None, Path | None, Path | No
 
 
 def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None = None) -> None:
-    """Check the certificate of a service and its key, and the authority of its clients' certificates.
-
-    Raises:
-        ServiceError: they do not fit, or a file cannot be read.
-    """
+    """Check the certificate of a service and its key, and the authority of its clients' certificates."""
     import ssl
 
     from fcslam.wire.keys import no_passphrase

@@ -7,12 +7,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING
 
 import typer
 
+from fcslam.cli.inputs import LiveSource, print_faults
 from fcslam.cli.output import RUNS, new_folder, print_line
-from fcslam.cli.recordings import bag_options, print_faults
 from fcslam.cli.warm_up import compiled
 from fcslam.errors import CloudError, FcslamError, StateError
 
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
-    from fcslam.ros.addresses import RosAddress
-    from fcslam.ros.parameters import NodeParameters
-    from fcslam.sources import BagOptions
 
 _SCANS_PER_LINE = 600
 """A line of progress is printed each time that many scans have come."""
@@ -33,66 +30,6 @@ SERVER_PATIENCE_S = 60.0
 """Longest wait for the server at the end of a drive."""
 SWITCH_INTERVAL_S = 0.001
 """Time after which a thread that publishes yields to the one that maps; Python's own is 5 ms."""
-
-_ROS = "ROS networks"
-RosParameters = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        rich_help_panel=_ROS,
-        help="Parameters (YAML) of a ROS 2 node, with the names of slam_toolbox where they mean the same.",
-    ),
-]
-UseSimTime = Annotated[
-    bool, typer.Option("--use-sim-time", help="Take the time from /clock, as with a simulator.", rich_help_panel=_ROS)
-]
-
-
-def is_live(source: str) -> bool:
-    """Whether ADDRESS or NAME=ADDRESS is the address of a live robot."""
-    from fcslam.ros.addresses import is_address
-
-    return is_address(source.rpartition("=")[2])
-
-
-def named_address(argument: str) -> "tuple[str, RosAddress]":
-    """Name and address of a live robot, given as ADDRESS or NAME=ADDRESS.
-
-    Raises:
-        NetworkError: its namespace cannot be used.
-    """
-    from fcslam.ros.addresses import parse_address
-
-    name, equals, address = argument.partition("=")
-    place = parse_address(address if equals else argument)
-    return name if equals else place.robot, place
-
-
-class LiveSource(NamedTuple):
-    """Where a live robot is, and how it is read."""
-
-    name: str
-    address: "RosAddress"
-    options: "BagOptions"
-    parameters: "NodeParameters"
-
-
-def live_source(
-    argument: str, sensors: list[str] | None, ros_parameters: Path | None, use_sim_time: bool
-) -> LiveSource:
-    """The live robot that the options of a command describe.
-
-    Raises:
-        InputError: an option cannot be used.
-    """
-    from fcslam.ros.parameters import load_parameters
-    from fcslam.sources import BagOptions
-
-    name, address = named_address(argument)
-    parameters = load_parameters(ros_parameters)
-    if use_sim_time:
-        parameters = parameters.model_copy(update={"use_sim_time": True})
-    return LiveSource(name, address, bag_options(sensors) or BagOptions(), parameters)
 
 
 @contextmanager
@@ -125,9 +62,6 @@ def drive_live(
 ) -> None:
     """Run a live robot until it is stopped, and write the run to ``output``; ``start`` makes the robot.
     With a plan for ``learning``, it learns while it stands still.
-
-    Raises:
-        InputError: the network, its topics, the server or the output cannot be used.
     """
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind

@@ -1,21 +1,31 @@
 """`fcslam localize`: a robot and a finished map in, the poses of the robot in the map out."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
-from fcslam.cli.options import ConfigFiles, Credentials, Force, Quiet, ServerUrl, access, mission_config, output_option
+from fcslam.cli.inputs import is_live, live_source, open_recording, pose, print_faults
+from fcslam.cli.live import drive_live
+from fcslam.cli.options import (
+    ConfigFiles,
+    Credentials,
+    Force,
+    Quiet,
+    RosParameters,
+    Sensors,
+    ServerUrl,
+    UseSimTime,
+    access,
+    mission_config,
+    output_option,
+)
 from fcslam.cli.output import RUNS, new_folder, notices, print_line
-from fcslam.cli.recordings import Sensors, bag_options, open_recording, pose, print_faults, print_notes
 from fcslam.cli.warm_up import compiled, copied_process
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
-    from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission.localization import LocalizationProgress
     from fcslam.runs import Run
 
@@ -95,42 +105,30 @@ def localize(
 
         robot = live_source(source, sensors, ros_parameters, use_sim_time)
         with copied_process(settings.robot) as worker:
-            start = partial(
-                LocalizedRobot,
-                map=map_path,
-                initial_pose=initial,
-                config=settings,
-                floor=floor,
-                wiring=Wiring(worker),
-            )
-            drive_live(robot, start, output, console)
+            start = partial(LocalizedRobot, map=map_path, initial_pose=initial, config=settings, floor=floor)
+            drive_live(robot, partial(start, wiring=Wiring(worker)), output, console)
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)
-    recording = open_recording(source, bag_options(sensors))
-    survey = recording.survey()
-    print_notes(console, survey.notes)
+    recording, survey = open_recording(source, sensors, console)
     with compiled(console), ProgressDisplay(console) as display:
+
+        def watch(now: "LocalizationProgress") -> None:
+            state = f"localized, quality {now.quality:.2f}" if now.is_localized else "not localized"
+            display.show("localizing", now.scans, survey.scan_count, state)
+
         run = localize_recording(
             recording,
             map_path,
             initial_pose=initial,
             config=settings,
-            progress=_watch(display, survey.scan_count),
+            progress=watch,
             floor=floor,
             update=update,
         )
         run.save(output, force)
     print_faults(console, {recording.name: recording.faults})
     _report(run, recording.name, output)
-
-
-def _watch(display: "ProgressDisplay", total: int) -> "Callable[[LocalizationProgress], None]":
-    def watch(now: "LocalizationProgress") -> None:
-        state = f"localized, quality {now.quality:.2f}" if now.is_localized else "not localized"
-        display.show("localizing", now.scans, total, state)
-
-    return watch
 
 
 def _report(run: "Run", robot: str, output: Path) -> None:

@@ -12,10 +12,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.options import ConfigFiles, Force, Quiet, WorkersOption, mission_config, output_option, with_starts
+from fcslam.cli.inputs import bag_options, named_path, print_faults, print_notes
+from fcslam.cli.options import (
+    ConfigFiles,
+    Force,
+    Live,
+    Quiet,
+    Sensors,
+    WorkersOption,
+    mission_config,
+    output_option,
+    with_starts,
+)
 from fcslam.cli.output import RUNS, answers, new_folder, notices
-from fcslam.cli.recordings import Sensors, bag_options, open_recordings, print_faults, print_notes
-from fcslam.cli.show import Live, live_page
+from fcslam.cli.show import live_page
 from fcslam.cli.warm_up import compiled, cores
 from fcslam.errors import InputError
 
@@ -113,6 +123,7 @@ def map_recordings(
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
         from fcslam.runs import prepare_output
+        from fcslam.sources import open_fleet
 
         output = output or new_folder(RUNS)
         prepare_output(output, force)
@@ -123,7 +134,9 @@ def map_recordings(
         if not logs and onto is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
-            opened = [calibrated(source, settings.robot.lidar) for source in open_recordings(logs or [], options)]
+            opened = [
+                calibrated(source, settings.robot.lidar) for source in open_fleet(map(named_path, logs or ()), options)
+            ]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     with verifying(workers) as verify, live_page(output) if live else nullcontext() as page:
@@ -132,11 +145,7 @@ def map_recordings(
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
-    """The floor of each robot that has one; NAME=FLOOR counts before FLOOR.
-
-    Raises:
-        InputError: a robot or all of them are given two floors.
-    """
+    """The floor of each robot that has one; NAME=FLOOR counts before FLOOR."""
     common = [option for option in options if "=" not in option]
     named = [(name, floor) for name, _, floor in (option.partition("=") for option in options if "=" in option)]
     twice = next((name for name, count in Counter(name for name, _ in named).items() if count > 1), None)
@@ -197,17 +206,14 @@ def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") 
     began = time.perf_counter()
 
     def watch(now: "Progress") -> None:
-        display.show("mapping", now.scans, total, _details(now, time.perf_counter() - began))
+        speed = _speed(now.recorded_s, time.perf_counter() - began)
+        counts = f"{sum(now.closures.values())} closures", f"{now.keyscans} keyscans"
+        display.show("mapping", now.scans, total, ", ".join([*speed, *counts]))
         faults.update(now.faults)
         if now.fusing:
             display.start("fusing")
 
     return watch
-
-
-def _details(progress: "Progress", elapsed_s: float) -> str:
-    counts = f"{sum(progress.closures.values())} closures", f"{progress.keyscans} keyscans"
-    return ", ".join([*_speed(progress.recorded_s, elapsed_s), *counts])
 
 
 def _speed(recorded_s: float, elapsed_s: float) -> list[str]:

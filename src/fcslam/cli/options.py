@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fcslam.cli.recordings import pose
+from fcslam.cli.inputs import pose
 from fcslam.errors import ConfigError
 from fcslam.lab.presets import Preset
 
@@ -51,6 +51,31 @@ SettingsFiles = Annotated[
         "--config", "-c", metavar="FILE|KEY=VALUE", help="Settings file (YAML), or one of its keys. Can be repeated."
     ),
 ]
+
+Sensors = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KEY=VALUE",
+        help="ROS topics and frames to read instead of those that fcslam chooses; repeat it for each key. scan-topic "
+        "(one for each laser), odom-topic (/tf: from tf; none), camera-topic; odom-frame and base-frame of the "
+        "odometry in tf; laser-pose=X,Y,THETA[,upside-down] in the base frame (one for each scan-topic); "
+        "cloud-band=LOW,HIGH[,BODY], the heights of a 3D LiDAR or depth camera that count, and the radius of the "
+        "robot. Metres, radians.",
+    ),
+]
+_ROS = "ROS networks"
+RosParameters = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        rich_help_panel=_ROS,
+        help="Parameters (YAML) of a ROS 2 node, with the names of slam_toolbox where they mean the same.",
+    ),
+]
+UseSimTime = Annotated[
+    bool, typer.Option("--use-sim-time", help="Take the time from /clock, as with a simulator.", rich_help_panel=_ROS)
+]
+Live = Annotated[bool, typer.Option("--live", help="Show the map on a page while it grows, and after that the run.")]
 
 Floor = Annotated[str, typer.Option(help="Floor of the building. Places of different floors are never compared.")]
 ServerUrl = Annotated[
@@ -101,11 +126,7 @@ def output_option(description: str, parent: str) -> Any:
 
 
 def access(server: str | None, credentials: Path | None, budget_kBps: float | None = None) -> "Server | None":
-    """The service that a robot sends to; None if none is named.
-
-    Raises:
-        InputError: the credentials cannot be read.
-    """
+    """The service that a robot sends to; None if none is named."""
     from fcslam.wire.http_transport import Server
     from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
 
@@ -119,11 +140,7 @@ def access(server: str | None, credentials: Path | None, budget_kBps: float | No
 def chosen_settings(
     settings: "SettingsType", chosen: Sequence[str] | None, presets: Mapping[str, Path] = MappingProxyType({})
 ) -> "SettingsType":
-    """The settings with the changes of files, presets and single keys, in this order.
-
-    Raises:
-        ConfigError: a file cannot be read, or a key or a value is invalid.
-    """
+    """The settings with the changes of files, presets and single keys, in this order."""
     from fcslam.config import changed, load, parse_yaml
 
     for one in chosen or ():
@@ -150,9 +167,6 @@ def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None"
     """The configuration of a mission that the command line chooses.
 
     Files and presets change the defaults. Without any, single keys change ``default``.
-
-    Raises:
-        ConfigError: a file cannot be read or is invalid.
     """
     from fcslam.mission.mission import MissionConfig
 
@@ -161,12 +175,7 @@ def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None"
 
 
 def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "MissionConfig":
-    """The configuration with the starts of ``--start NAME=X,Y,THETA``.
-
-    Raises:
-        ConfigError: a robot is given two starts, or a name or a number cannot be used.
-        InputError: a start is not a pose.
-    """
+    """The configuration with the starts of ``--start NAME=X,Y,THETA``."""
     from fcslam.config import changed
 
     named = [start.partition("=")[::2] for start in starts or ()]
@@ -174,8 +183,3 @@ def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "Missi
         raise ConfigError("--start: a robot is given two starts; give one for each")
     poses = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
     return changed(config, {"fleet": {"starts": poses}}, "the command line") if poses else config
-
-
-def examples(*commands: str) -> str:
-    """The epilog of a command's help: one example on each line of at most 78 characters, to be copied as it stands."""
-    return "\n\n".join(("Examples:", *commands))  # typer removes single line breaks

@@ -3,17 +3,27 @@
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live
-from fcslam.cli.options import STATE, Budget, ConfigFiles, Credentials, Floor, Quiet, ServerUrl, access, mission_config
+from fcslam.cli.inputs import is_live, open_recording, print_faults
+from fcslam.cli.options import (
+    STATE,
+    Budget,
+    ConfigFiles,
+    Credentials,
+    Floor,
+    Quiet,
+    Sensors,
+    ServerUrl,
+    access,
+    mission_config,
+)
 from fcslam.cli.output import notices, print_line
-from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.cli.training_options import Learn, learning_plan
 from fcslam.cli.warm_up import compiled, copied_process
 from fcslam.errors import InputError, PacketError, SourceError
@@ -72,11 +82,9 @@ def play(
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
-    opened = open_recording(recording, bag_options(sensors))
-    _check_name(opened.name)
-    survey = opened.survey()
     console = notices(quiet)
-    print_notes(console, survey.notes)
+    opened, survey = open_recording(recording, sensors, console)
+    _check_name(opened.name)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
     with copied_process(settings.robot) as worker:
@@ -85,8 +93,9 @@ def play(
             opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor, wiring=wiring
         )
         with closing(robot):
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # service managers send it
             try:
-                with compiled(console), _interruptible(), ProgressDisplay(console) as display:
+                with compiled(console), ProgressDisplay(console) as display:
                     watch = _watch(display, console, survey.scan_count)
                     stay = None if plan is None else partial(_learn, plan, console, display, watch)
                     play_records(robot, opened.records(), pace, watch, stay)
@@ -164,36 +173,16 @@ def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kB
     return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Treat SIGTERM, which service managers send, like Ctrl-C."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
     """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localization."""
-    trouble: str | None = "connecting"
-    notices_before: tuple[str, ...] = ()
-    localization, times_lost = "mapping", 0
+    before: RobotStatus | None = None
     waits = sends = False
 
     def watch(now: "RobotStatus") -> None:
-        nonlocal trouble, notices_before, localization, times_lost, waits, sends
-        lines = [now.trouble or "connected"] * (now.trouble != trouble)
-        if (now.localization, now.times_lost) != (localization, times_lost):
-            lines.append(_localization(now, times_lost))
-        localization, times_lost = now.localization, now.times_lost
-        for line in [*lines, *(notice for notice in now.notices if notice not in notices_before)]:
+        nonlocal before, waits, sends
+        for line in _news(now, before):
             print_line(console, line)
-        is_complete = now.scans == total
+        before, is_complete = now, now.scans == total
         if is_complete and now.trouble and not waits:
             waits = True
             print_line(
@@ -201,7 +190,6 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
                 f"all scans are mapped; {now.waiting.packets} packets wait for the server. Ctrl-C ends the wait: they "
                 "stay on disk, and --resume sends them",
             )
-        trouble, notices_before = now.trouble, now.notices
         details = _details(now, is_complete)
         display.show("mapping", now.scans, total, details)
         sends = sends or (is_complete and now.waiting.packets > 0)
@@ -209,6 +197,15 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
             display.show("sending", now.confirmed, now.confirmed + now.waiting.packets, details)
 
     return watch
+
+
+def _news(now: "RobotStatus", before: "RobotStatus | None") -> Iterator[str]:
+    if now.trouble != ("connecting" if before is None else before.trouble):
+        yield now.trouble or "connected"
+    was, times_lost = ("mapping", 0) if before is None else (before.localization, before.times_lost)
+    if (now.localization, now.times_lost) != (was, times_lost):
+        yield _localization(now, times_lost)
+    yield from (notice for notice in now.notices if before is None or notice not in before.notices)
 
 
 def _localization(now: "RobotStatus", times_lost_before: int) -> str:

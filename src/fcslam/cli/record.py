@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.live import is_live, named_address, stopping
-from fcslam.cli.options import Force, Quiet
+from fcslam.cli.inputs import is_live, live_source, open_recording, print_faults
+from fcslam.cli.live import stopping
+from fcslam.cli.options import Force, Quiet, Sensors
 from fcslam.cli.output import notices, print_line
-from fcslam.cli.recordings import Sensors, bag_options, open_recording, print_faults, print_notes
 from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.cli.inputs import LiveSource
     from fcslam.records import SensorRecord
-    from fcslam.sources import BagOptions, Source, Survey
+    from fcslam.sources import Source, Survey
 
 _CARMEN = re.compile(r"\.(clf|log)(\.(gz|xz|bz2))?$")
 _RECORDING = ".fcslam"
@@ -59,31 +60,27 @@ def record(
     quiet: Quiet = False,
 ) -> None:
     """Record the sensors of a live robot: everything that `fcslam map` needs. Or convert a recording."""
-    console, options = notices(quiet), bag_options(sensors)
+    console = notices(quiet)
     if is_live(source):
-        _record(source, output, duration, options, force, console)
+        _record(live_source(source, sensors), output, duration, force, console)
     else:
         if duration is not None:
             raise InputError(f"--duration is the time to record a live robot; {source} is a recording")
-        _convert(source, output, options, force, console)
+        _convert(source, output, sensors, force, console)
 
 
-def _record(
-    address: str, output: Path, duration: float | None, options: "BagOptions | None", force: bool, console: "Console"
-) -> None:
+def _record(live: "LiveSource", output: Path, duration: float | None, force: bool, console: "Console") -> None:
     from fcslam.ros.addresses import open_network
     from fcslam.ros.node import await_sensors
-    from fcslam.ros.parameters import NodeParameters
     from fcslam.ros.record import record as record_messages
-    from fcslam.sources import BagOptions
 
-    _, place = named_address(address)
+    place = live.address
     if output.suffix != ".mcap":
         raise OutputError(f"{output}: a recording of a live robot is a .mcap file; choose such a name")
     _prepare(output, force)
     stop = Event()
     with closing(open_network(place)) as network:
-        found = await_sensors(network, place.namespace, options or BagOptions(), NodeParameters().topic_timeout)
+        found = await_sensors(network, place.namespace, live.options, live.parameters.topic_timeout)
         print_line(console, f"records {', '.join(found.kinds)}; Ctrl-C ends the recording")
         timer = Timer(duration or 0.0, stop.set)
         timer.daemon = True
@@ -96,13 +93,11 @@ def _record(
     typer.echo(f"{listed}: {output}")
 
 
-def _convert(log: str, output: Path, options: "BagOptions | None", force: bool, console: "Console") -> None:
+def _convert(log: str, output: Path, sensors: list[str] | None, force: bool, console: "Console") -> None:
     from fcslam.records import LaserScan
 
-    source = open_recording(log, options)
     _prepare(output, force)
-    survey = source.survey()
-    print_notes(console, survey.notes)
+    source, survey = open_recording(log, sensors, console)
     if _CARMEN.search(output.name):
         first = next((record for record in source.records() if isinstance(record, LaserScan)), None)
         for is_lost, what in (

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.live import RosParameters, UseSimTime, drive_live, is_live, live_source
+from fcslam.cli.inputs import is_live, live_source
+from fcslam.cli.live import drive_live
 from fcslam.cli.options import (
     STATE,
     Budget,
@@ -14,13 +15,15 @@ from fcslam.cli.options import (
     Credentials,
     Floor,
     Quiet,
+    RosParameters,
+    Sensors,
     ServerUrl,
+    UseSimTime,
     access,
     mission_config,
     output_option,
 )
 from fcslam.cli.output import RUNS, notices
-from fcslam.cli.recordings import Sensors
 from fcslam.cli.training_options import Learn, learning_plan
 from fcslam.cli.warm_up import copied_process
 from fcslam.errors import InputError

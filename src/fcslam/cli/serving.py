@@ -49,11 +49,7 @@ _log = logging.getLogger("fcslam.service")
 
 
 def check_open(host: str, credentials: Path | None) -> None:
-    """Check that a service may go without authentication.
-
-    Raises:
-        ServiceError: others reach it, or credentials are given in vain.
-    """
+    """Check that a service may go without authentication."""
     if not is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
     if credentials is not None:
@@ -64,12 +60,7 @@ def check_open(host: str, credentials: Path | None) -> None:
 
 
 def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, workers: str) -> ServiceState:
-    """The state of a service whose missions are files in the folder ``data``.
-
-    Raises:
-        ServiceError: the folder cannot be used, or another service uses it.
-        StoreError: the mission cannot be opened.
-    """
+    """The state of a service whose missions are files in the folder ``data``."""
     events = EventStream()
 
     def launch(folder: MissionFolder) -> RunningWorker:
@@ -88,10 +79,6 @@ def shared_state(
     """The state of an instance of the store; who closes its missions closes all that it holds.
 
     Host and port name the instance; FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit it.
-
-    Raises:
-        ServiceError: the store's address or a limit cannot be used.
-        StoreError: the store cannot be used, or is of a newer version.
     """
     name = f"{socket.gethostname()[:LONGEST_HOST]}-{port}"
     missions_here = _limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS)
@@ -130,11 +117,7 @@ def shared_state(
 
 
 def _limit(variable: str, least: int, otherwise: int) -> int:
-    """A limit that the environment gives.
-
-    Raises:
-        ServiceError: it is not a number, or too small.
-    """
+    """A limit that the environment gives."""
     text = os.environ.get(variable) or str(otherwise)
     if not (text.isdecimal() and int(text) >= least):
         raise ServiceError(f"{variable}={text}: is not a number from {least} on")
@@ -189,11 +172,6 @@ def learning_settings(data: Path, store: str | None) -> FleetLearningSettings:
     Args:
         data: folder of the missions; it may hold a file of settings.
         store: database of the missions; None: they are files.
-
-    Raises:
-        ConfigError: the settings cannot be used.
-        ServiceError: options do not fit.
-        TrainingError: a library is missing.
     """
     if store is not None:
         raise ServiceError("--learn works with missions in --data; leave out --store")

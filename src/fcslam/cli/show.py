@@ -28,8 +28,6 @@ LARGEST_BYTES = 2 * 2**30
 """Largest total size of the files of a run folder: the page's server holds most of them in memory."""
 HOST = "127.0.0.1"
 
-Live = Annotated[bool, typer.Option("--live", help="Show the map on a page while it grows, and after that the run.")]
-
 
 def show(
     run: Annotated[
@@ -77,11 +75,7 @@ def show(
 
 @contextmanager
 def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
-    """The run folder to show; that of a mission file is made, and removed in the end.
-
-    Raises:
-        InputError: there is no run, it is too large, or it is damaged.
-    """
+    """The run folder to show; that of a mission file is made, and removed in the end."""
     from fcslam import api
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.runs import open_run

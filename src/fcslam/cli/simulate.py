@@ -88,12 +88,7 @@ def simulate(
 
 
 def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Console") -> list[Path]:
-    """Write a recording of each robot and the truth into the folder ``output``; returns the recordings.
-
-    Raises:
-        SimulationError: MuJoCo or a GL library is missing.
-        OutputError: something cannot be written.
-    """
+    """Write a recording of each robot and the truth into the folder ``output``; returns the recordings."""
     import numpy as np
 
     from fcslam.cli.progress import ProgressDisplay

@@ -76,13 +76,7 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
 def learning_plan(
     settings: "RobotConfig", server: "Server | None", credentials: Path | None, state: Path | None
 ) -> "RobotLearningPlan":
-    """Where and how a robot learns with this service; ``state`` is its state folder.
-
-    Raises:
-        ConfigError: the settings cannot be used.
-        InputError: something is missing, or does not fit.
-        TrainingError: a library is missing.
-    """
+    """Where and how a robot learns with this service; ``state`` is its state folder."""
     from fcslam.config import load
     from fcslam.features.detector_kinds import DetectorKind
     from fcslam.learning.federated.learning_process import RobotLearningPlan

@@ -156,11 +156,7 @@ class _Panel:
 
 
 def write_figure(charts: FleetCharts, path: Path) -> None:
-    """Write the figure as a PNG file, 2000 pixels wide.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the figure as a PNG file, 2000 pixels wide."""
     from PIL import Image
 
     drawn = io.BytesIO()

@@ -58,10 +58,6 @@ def fuse(
     ``T_map_base`` (N, 3) are the poses of the keyscans in ``map``, in metres and radians; ``lasers`` those that each
     robot announced. ``senders`` names the robot of each session, if points on other robots are not drawn; None: all
     are.
-
-    Raises:
-        ValueError: the numbers of poses and keyscans or of ranges and beams differ, or a pose is not finite.
-        KeyError: a keyscan's robot has no lasers.
     """
     *_, newest = fuse_periods(keyscans, T_map_base, lasers, config, periods_of(keyscans), senders)
     return newest

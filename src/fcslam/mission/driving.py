@@ -64,9 +64,6 @@ def side_by_side(processes: int) -> Drive:
 
     A single robot drives in this process, with its back end in another. One process does everything itself. A robot's
     error is raised where its legs are read.
-
-    Raises:
-        InputError: there is no process.
     """
     if processes < 1:
         raise InputError(f"processes={processes}: no robot can be mapped; give 1 or more")
@@ -105,12 +102,7 @@ def _with_backend_beside(source: Source, config: RobotConfig) -> Iterator[Iterat
 
 
 def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
-    """Drive one robot over its whole recording.
-
-    Raises:
-        SourceError: the recording cannot be read.
-        FcslamError: the process of the robot's back end ended.
-    """
+    """Drive one robot over its whole recording."""
     packets: list[SizedPacket] = []
     stamps: list[float] = []
     turns = cycle(range(LEGS_PER_TRIM))

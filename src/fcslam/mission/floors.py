@@ -47,12 +47,7 @@ class OnFloors:
 
 
 def on_floors(sources: Sequence[Source], floors: Mapping[str, str]) -> list[Source]:
-    """The recordings with their floors, by NAME or NAME@TIME.
-
-    Raises:
-        ConfigError: a floor is not valid, its robot is not there, or its time is not within the recording.
-        SourceError: a recording cannot be mapped.
-    """
+    """The recordings with their floors, by NAME or NAME@TIME."""
     of: dict[str, dict[float, str]] = {source.name: {} for source in sources}
     for key, floor in floors.items():
         name, at, time = key.partition("@")

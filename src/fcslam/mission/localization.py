@@ -61,9 +61,6 @@ def read_map(path: Path, floor: str = "") -> OccupancyMap:
     Args:
         path: the folder or file.
         floor: the floor; name it where the run has several, because they may look the same.
-
-    Raises:
-        SourceError: there is no map, or it cannot be read.
     """
     if path.suffix == Path(MISSION).suffix:
         return _mission_map(path, floor)
@@ -76,11 +73,7 @@ def read_map(path: Path, floor: str = "") -> OccupancyMap:
 
 
 def pose_in_map(name: str, given: ArrayLike, occupancy: OccupancyMap) -> FloatArray:
-    """A pose (x, y, theta) within the map, metres and radians, shape (3,); ``name`` is what messages call it.
-
-    Raises:
-        InputError: it is not a pose, or outside of the map.
-    """
+    """A pose (x, y, theta) within the map, metres and radians, shape (3,); ``name`` is what messages call it."""
     pose = checked_pose(name, given)
     low = np.array(occupancy.origin_xy)
     high = low + occupancy.resolution_m * np.array(occupancy.cells.shape[::-1])
@@ -158,9 +151,6 @@ def run_localization(
 
     Returns:
         The believed poses as trajectory, and every pose with standard deviations and quality.
-
-    Raises:
-        SourceError: the map or the recording cannot be used.
     """
     localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
     robot = RobotFrontend(source.name, config.robot, localizer)

@@ -48,11 +48,6 @@ def find_changes(folder: Path, since: str | None = None, until: str | None = Non
             end of the day. None: the oldest period.
         until: as ``since``; None: the newest period.
         map_index: number of the map.
-
-    Raises:
-        EvaluationError: ``folder`` is not a run folder, or it is broken.
-        SourceError: it has no mission file or no such map, its robots sent words only, or a time is unknown or before
-            the first period.
     """
     return changes_of(open_run(folder), read_mission(folder), since, until, map_index, str(folder))
 
@@ -63,9 +58,6 @@ def changes_of(
     """As ``find_changes``, of a run and its mission; ``name`` tells in messages which run it is.
 
     Keyscans that are newer than the run are left out.
-
-    Raises:
-        SourceError: as for ``find_changes``.
     """
     seen = _seen(run, mission, map_index, name)
     periods = periods_of(seen.keyscans)
@@ -93,9 +85,6 @@ def save_changes(changes: Changes, folder: Path, force: bool = False) -> None:
     """Write the changes into a new folder, whole or not at all.
 
     ``appeared`` and ``disappeared`` are maps for ROS map_server: occupied cells changed, free ones did not.
-
-    Raises:
-        OutputError: something else is there, changes are there and ``force`` is not given, or writing fails.
     """
     check_output(folder, force)
     try:
@@ -111,11 +100,7 @@ def save_changes(changes: Changes, folder: Path, force: bool = False) -> None:
 
 
 def check_output(folder: Path, force: bool = False) -> None:
-    """Check, before the work, that changes can be written to ``folder``.
-
-    Raises:
-        OutputError: something else is there, or changes are there and ``force`` is not given.
-    """
+    """Check, before the work, that changes can be written to ``folder``."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / TABLE).is_file():

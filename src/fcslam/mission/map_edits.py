@@ -14,11 +14,7 @@ from fcslam.runs import Run
 
 
 def check_closure(run: Run, decision: Veto | Pin) -> None:
-    """Check that a run has the closure about which a user decides.
-
-    Raises:
-        EditError: it has not.
-    """
+    """Check that a run has the closure about which a user decides."""
     if decision.stamps is None:
         return
     named = Veto(decision.robot_i, decision.robot_j, decision.stamps)
@@ -41,9 +37,6 @@ def region_in_map(
         use: what the region is for.
         name: what it is called.
         polygon: corners (x, y) in ``map``, metres.
-
-    Raises:
-        EditError: the run has no such map, or the polygon has no inside.
     """
     check_polygon(polygon)
     corners = np.array(polygon, dtype=np.float64)
@@ -62,9 +55,6 @@ def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatA
         mission: its mission.
         map_index: number of the map.
         T_new_map: the present frame in the new one, shape (3,), metres and radians.
-
-    Raises:
-        EditError: the run has no such map.
     """
     session, stamp, T_map_base = next(_keyscans(run, mission, map_index))
     x, y, theta = se2.compose(T_new_map, T_map_base).tolist()
@@ -80,9 +70,6 @@ def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tu
 
     Returns:
         The present frame in the new one, shape (3,), metres and radians.
-
-    Raises:
-        EditError: there are fewer than two different points.
     """
     T_new_map = n_point_alignment(np.array(targets).reshape(-1, 2), np.array(points).reshape(-1, 2))
     if not np.isfinite(T_new_map).all():
@@ -91,11 +78,7 @@ def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tu
 
 
 def _keyscans(run: Run, mission: SavedMission, map_index: int) -> Iterator[tuple[str, float, FloatArray]]:
-    """Session, stamp and T_map_base of the keyscans of a map.
-
-    Raises:
-        EditError: the run has no such map.
-    """
+    """Session, stamp and T_map_base of the keyscans of a map."""
     sessions = [t for t in run.trajectories.values() if t.map_index == map_index]
     if not sessions:
         known = sorted({trajectory.map_index for trajectory in run.trajectories.values()})

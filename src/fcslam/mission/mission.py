@@ -135,11 +135,6 @@ def run_mission(
         beginning: what is known before the recordings.
         drive: runs the robots.
         live: called with the cloud after every packet.
-
-    Raises:
-        SourceError: two recordings have one name, or one cannot be read.
-        ConfigError: a veto, a floor or a start names a robot that is not there, or a floor is not valid.
-        OutputError: a robot's name cannot be a file name.
     """
     onto = beginning.onto
     check_robots(sources)
@@ -213,11 +208,7 @@ class MissionCloud:
         return True
 
     def apply(self, sent: SizedPacket) -> list[Packet]:
-        """Apply the next packet of a robot; returns the replies to it.
-
-        Raises:
-            FcslamError: the cloud refuses it.
-        """
+        """Apply the next packet of a robot; returns the replies to it."""
         try:
             replies = self.host.apply(sent.packet)
         except PacketError as error:
@@ -336,11 +327,7 @@ class _Meter:
 
 
 def check_robots(sources: Sequence[Source]) -> None:
-    """Check that each recording names a robot of its own.
-
-    Raises:
-        SourceError: two have one name, or a name is not one of a robot.
-    """
+    """Check that each recording names a robot of its own."""
     names = [source.name for source in sources]
     for name in names:
         if names.count(name) > 1:

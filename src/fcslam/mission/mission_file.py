@@ -64,11 +64,7 @@ class SavedMission:
 
     @cached_property
     def packets(self) -> Mapping[str, tuple[SizedPacket, ...]]:
-        """The packets of each robot in the order of their times, decoded when somebody asks for them.
-
-        Raises:
-            PacketError: one cannot be read.
-        """
+        """The packets of each robot in the order of their times, decoded when somebody asks for them."""
         sent: dict[str, list[SizedPacket]] = {robot: [] for robot in self.robots}
         for stored in self.stored:
             sent[stored.robot].append(SizedPacket(decode(stored.data), stored.data))
@@ -102,11 +98,7 @@ EMPTY: Final = SavedMission(CloudConfig(), (), (), (), {})
 
 
 def read_mission(path: Path) -> SavedMission:
-    """Read a mission file; it is not changed.
-
-    Raises:
-        SourceError: the file is missing, damaged or of another version, or a packet in it cannot be read.
-    """
+    """Read a mission file; it is not changed."""
     path = mission_path(path)
     try:
         with opened_copy(path) as store:
@@ -122,12 +114,7 @@ def read_mission(path: Path) -> SavedMission:
 
 
 def check_packets(mission: SavedMission) -> None:
-    """Check what the packets of a mission expand to, before they are decoded.
-
-    Raises:
-        LimitError: to more than ``most_unpacked``.
-        PacketError: one has no size.
-    """
+    """Check what the packets of a mission expand to, before they are decoded."""
     check_unpacked(
         sum(len(packet.data) for packet in mission.stored),
         sum(unpacked_size(packet.data) for packet in mission.stored),
@@ -136,11 +123,7 @@ def check_packets(mission: SavedMission) -> None:
 
 @contextmanager
 def opened_copy(path: Path | None) -> Iterator[MissionStore]:
-    """Open a copy of a mission file, which itself is not changed; None: a mission before its first packet.
-
-    Raises:
-        StoreError: the file is damaged, too large or of another version, or cannot be read.
-    """
+    """Open a copy of a mission file, which itself is not changed; None: a mission before its first packet."""
     with TemporaryDirectory() as place:  # opening the file for reading would leave files beside it
         copy = Path(place) / MISSION
         if path is not None:
@@ -215,10 +198,6 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
         contents: what to append.
         author: who edits.
         time_s: now, seconds since 1970.
-
-    Raises:
-        SourceError: as ``read_mission``, or the file cannot be written.
-        EditError: an edit names a session or a time that the mission does not have, or what cannot be undone.
     """
     path = mission_path(path)
     try:
@@ -239,11 +218,7 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
 
 
 def mission_path(path: Path) -> Path:
-    """The mission file that a user names by itself or by its run folder.
-
-    Raises:
-        SourceError: there is no mission file at ``path``.
-    """
+    """The mission file that a user names by itself or by its run folder."""
     path = path / MISSION if path.is_dir() else path
     if not path.is_file():
         raise SourceError(f"{path}: not a mission file; `fcslam map` writes one into each run folder")

@@ -149,9 +149,6 @@ class MissionStore:
         """Open a mission: that of a file, which is created if it is missing, or that of a server.
 
         ``is_checked``: ``check_mission`` passed the file just now.
-
-        Raises:
-            StoreError: the file is not a mission of this version, or cannot be used.
         """
         self._database: RowStore = (
             Database(place, SCHEMA, VERSION, is_checked=is_checked) if isinstance(place, Path) else place
@@ -472,11 +469,7 @@ def _edits(query: Callable[[str, tuple[int]], Iterable[Any]], after: int) -> lis
 
 
 def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
-    """Check a log of edits.
-
-    Raises:
-        EditError: an edit cannot be read, is missing, or undoes what cannot be undone.
-    """
+    """Check a log of edits."""
     edits: list[Edit] = []
     for number, author, time_s, kind, content in rows:
         edit = Edit(number, author, time_s, read_edit(kind, content))
@@ -533,11 +526,7 @@ def _known(database: Transaction, packets: Sequence[StoredPacket]) -> dict[tuple
 
 
 def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
-    """Read the columns of a session's scans.
-
-    Raises:
-        ValueError: they do not fit each other, or hold a number that is not one of theirs.
-    """
+    """Read the columns of a session's scans."""
     track = Track(
         frozen(np.frombuffer(stamps, "<f8")),
         np.frombuffer(keyscans, "<i8"),

@@ -1,4 +1,7 @@
-"""The tables of a run folder: trajectories (TUM), robots, closures, metrics."""
+"""The tables of a run folder: trajectories (TUM), robots, closures, metrics.
+
+Readers raise ValueError for a file that is not such a table; ``within``: see ``untrusted.open_file``.
+"""
 
 import csv
 import io
@@ -41,11 +44,7 @@ def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray)
 
 
 def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
-    """Stamps (N,) and poses (N, 3) of a TUM file, in its order; ``within``: see ``untrusted.open_file``.
-
-    Raises:
-        EvaluationError: the file cannot be read or a line is not eight finite numbers.
-    """
+    """Stamps (N,) and poses (N, 3) of a TUM file, in its order."""
     try:
         rows = [_tum_fields(line) for line in read_text(path, within).splitlines() if line.strip()]
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
@@ -74,11 +73,7 @@ def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
 
 
 def read_robots(path: Path, within: Path | None = None) -> dict[str, tuple[int, str]]:
-    """Map index and floor by robot, in the order of robots.csv; ``within``: see ``untrusted.open_file``.
-
-    Raises:
-        ValueError: a column is missing, a map index or a floor is not valid, or a robot occurs twice.
-    """
+    """Map index and floor by robot, in the order of robots.csv."""
     rows = _read_csv(path, _ROBOT_COLUMNS, within)
     return _unique(path.name, ((row["robot"], (int(row["map"]), _floor(row.get(_FLOOR) or ""))) for row in rows))
 
@@ -95,11 +90,7 @@ def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
 
 
 def read_closures(path: Path, within: Path | None = None) -> tuple[ClosureRow, ...]:
-    """Every line of closures.csv; ``within``: see ``untrusted.open_file``.
-
-    Raises:
-        ValueError: a column is missing or a value is not what the column holds.
-    """
+    """Every line of closures.csv."""
     return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS, within))
 
 
@@ -115,11 +106,7 @@ def _cell(value: str | float) -> str | float:
 
 
 def read_joins(path: Path, within: Path | None = None) -> tuple[Join, ...]:
-    """Every line of joins.csv; ``within``: see ``untrusted.open_file``.
-
-    Raises:
-        ValueError: a column is missing or a value is not what the column holds.
-    """
+    """Every line of joins.csv."""
     return tuple(
         Join(
             row["robot_i"],
@@ -140,11 +127,7 @@ def write_localized(path: Path, poses: LocalizedPoses) -> None:
 
 
 def read_localized(path: Path, within: Path | None = None) -> LocalizedPoses:
-    """Every line of localization/<robot>.csv; ``within``: see ``untrusted.open_file``.
-
-    Raises:
-        ValueError: a column is missing or a value is not a number.
-    """
+    """Every line of localization/<robot>.csv."""
     rows = [
         [float(row[column] or "nan") for column in _LOCALIZED_COLUMNS]
         for row in _read_csv(path, _LOCALIZED_COLUMNS, within)
@@ -163,11 +146,7 @@ def metrics_json(metrics: Iterable[Metric]) -> str:
 
 
 def read_metrics(path: Path, within: Path | None = None) -> dict[str, Metric]:
-    """Every metric of metrics.json by its name; null is NaN; ``within``: see ``untrusted.open_file``.
-
-    Raises:
-        ValueError: it is not a list of name, value, unit, or a name occurs twice.
-    """
+    """Every metric of metrics.json by its name; null is NaN."""
     try:
         rows = json.loads(read_text(path, within))
         values = [math.nan if row["value"] is None else _number(row["value"]) for row in rows]

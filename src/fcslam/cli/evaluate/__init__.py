@@ -6,23 +6,16 @@ from typing import Annotated
 
 import typer
 
-from fcslam.cli.options import Csv, examples
+from fcslam.cli.options import Csv
 from fcslam.cli.output import notices
 from fcslam.errors import EvaluationError
 
-_FLEET = "fcslam evaluate fleet fleet/run --truth fleet"
-_RELATIONS = "fcslam evaluate relations runs/intel intel.relations.gz"
 RunFolder = Annotated[Path, typer.Argument(help="Run folder to measure.")]
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, help="Measure runs against references.")
 
 
-@app.callback(epilog=examples(_FLEET, _RELATIONS))
-def evaluate() -> None:
-    """Measure runs against references."""
-
-
-@app.command(epilog=examples(_FLEET, "fcslam evaluate fleet demo/run --csv fleet.csv --figure fleet.png"))
+@app.command()
 def fleet(
     run: RunFolder,
     *,
@@ -54,7 +47,7 @@ def fleet(
             write_figure(fleet_charts(run, truth), figure)
 
 
-@app.command(epilog=examples(_RELATIONS, "fcslam evaluate relations runs/intel-3 intel.relations.gz --across-robots"))
+@app.command()
 def relations(
     run: RunFolder,
     reference: Annotated[
@@ -84,7 +77,7 @@ def relations(
         write_metrics(relation_metrics(errors), csv)
 
 
-@app.command(epilog=examples("fcslam evaluate quality fleet/run"))
+@app.command()
 def quality(run: RunFolder) -> None:
     """Print how good the maps of a run are, by its certificate, and what to drive again."""
     from fcslam.runs import QUALITY, open_run

@@ -10,26 +10,23 @@ from rich.table import Table
 
 from fcslam.cli.output import answers
 from fcslam.cli.progress import ProgressDisplay
-from fcslam.lab.evaluation.closures import BOTH, LIKE_HEADING_DEG, ClosureScope
+from fcslam.lab.evaluation.closures import BOTH, ClosureScope
 from fcslam.lab.evaluation.relations import write_metrics
 from fcslam.lab.evaluation.report import FleetReport, evaluate_fleet, fleet_metrics
-from fcslam.metrics.closures import EVERY_M, RADIUS_M, REACH_M, WITHIN_GAP_S, WRONG_DEG, WRONG_M
-from fcslam.metrics.grid import TOLERANCE_M
 from fcslam.metrics.relations import RelationErrors
-from fcslam.records import ClosureStatus
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
-def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console, explained: bool = True) -> None:
-    """Compare a run with the truth: print tables, and what they mean if ``explained``; write the numbers to ``csv``."""
+def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console) -> None:
+    """Compare a run with the truth: print tables, and write the numbers to ``csv``."""
     with ProgressDisplay(notices) as display:
         display.start("evaluating")
         report = evaluate_fleet(run, truth)
     console, closures = answers(), (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
-    for line in (*_findings(report), *(_explanations(report) if explained else ())):
+    for line in _findings(report):
         typer.echo(line)
     if csv is not None:
         write_metrics(fleet_metrics(report), csv)
@@ -85,6 +82,8 @@ def _traffic(report: FleetReport) -> Table:
 
 
 def _findings(report: FleetReport) -> Iterator[str]:
+    scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
+    yield f"Truth: {report.truth}, at {covered} of {scans} scans. What the columns mean: docs/howto/evaluation.md"
     yield f"Maps: {report.maps}. Pairs of robots in one map: {len(report.joins)}, of them falsely joined: " + (
         ", ".join(f"{j.robot_a} and {j.robot_b} ({j.translation_m:.2f} m, {j.rotation_deg:.1f} deg)" for j in false)
         if (false := report.false_joins)
@@ -98,32 +97,6 @@ def _findings(report: FleetReport) -> Iterator[str]:
         f"Map: F1 of occupied cells {_number(found.f1, 3)} (precision {_number(found.precision, 3)}, recall "
         f"{_number(found.recall, 3)}), IoU of free space {_number(found.free_iou, 3)}."
     )
-
-
-def _explanations(report: FleetReport) -> Iterator[str]:
-    scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
-    yield f"Truth: {report.truth}, at {covered} of {scans} scans."
-    yield "ATE: root mean square, each map moved onto the truth as a whole, no scale; 'alone': each robot by itself."
-    yield "Relative poses: drawn evenly from pairs of scans less than 5 m apart in truth, 2,000 at most."
-    yield f"Wrong, of closures and joins: off by more than {WRONG_M:g} m or {WRONG_DEG:g} deg."
-    counts = ", ".join(_revisits(report, within) for within in ClosureScope)
-    yield (
-        f"Recall: share of revisits found: {counts}. At every {EVERY_M:g} m of each path there is one for each "
-        f"robot whose path passes within {RADIUS_M:g} m (its own: over {WITHIN_GAP_S:g} s away), found "
-        f"if a correct closure ends within {REACH_M:g} m of path at both sides. Like heading: within "
-        f"{LIKE_HEADING_DEG:g} deg. At 100 %: by the closures more similar than every wrong one of their channel."
-    )
-    yield "A robot reports only closures that it accepts, so candidates within robots are not all known."
-    if report.agreement is not None:
-        yield (
-            f"Occupied cells: within {TOLERANCE_M:g} m of one another. The map's surfaces count wherever they are: "
-            "the true map has all that beams could reach."
-        )
-
-
-def _revisits(report: FleetReport, within: ClosureScope) -> str:
-    score = report.closures[within, ClosureStatus.ACCEPTED, BOTH]
-    return f"{score.recall.revisits} {_KINDS[within]} ({score.recall_like_heading.revisits} with like heading)"
 
 
 def _ratio(part: float, whole: float) -> float:
