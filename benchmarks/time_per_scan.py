@@ -35,8 +35,8 @@ from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.backend_runner import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.warmup import warm_up_tracking
 from fcslam.sources import open_source
+from fcslam.warmup import warm_up_tracking
 from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import encode, read_label
 
