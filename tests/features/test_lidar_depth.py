@@ -24,7 +24,7 @@ def project(points, camera=CAMERA):
 
 def located(points, walls, pose=POSE, camera=CAMERA):
     scan = scan_at(pose, walls, LASER)
-    return locate_keypoints(project(points, camera), camera, seen_in(scan), 3.0)
+    return locate_keypoints(project(points, camera), camera, seen_in(scan))
 
 
 def seen_in(scan):
@@ -76,7 +76,7 @@ def test_where_nothing_returned_nothing_is_placed():
     points = np.array([[3.0, 1.0, 1.0], [3.0, -1.0, 1.0]])
     _, placed = located(points, walls, np.zeros(3))
     assert placed.tolist() == [True, False]
-    _, placed = locate_keypoints(project(points), CAMERA, LidarView(np.empty((0, 2)), np.zeros(2), 0.02), 3.0)
+    _, placed = locate_keypoints(project(points), CAMERA, LidarView(np.empty((0, 2)), np.zeros(2), 0.02))
     assert not placed.any()
 
 
@@ -109,13 +109,13 @@ def test_the_mounting_of_the_camera_is_heeded():
     turned = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.1, 0.6), tuple(left)))
     centre = np.array([[159.5, 119.5]], np.float32)
     scan = scan_at(np.zeros(3), walls, LASER)
-    found, placed = locate_keypoints(centre, turned, seen_in(scan), 3.0)
+    found, placed = locate_keypoints(centre, turned, seen_in(scan))
     assert placed[0]
     assert np.allclose(found[0], (0.0, 4.0, 0.6), atol=0.01)
     pitch = np.array([0.0, np.sin(np.deg2rad(5)), 0.0, np.cos(np.deg2rad(5))])
     down = product(pitch, np.array(CAMERA.T_base_camera.rotation))
     lowered = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.0, 0.9), tuple(down)))
-    found, placed = locate_keypoints(centre, lowered, seen_in(scan), 3.0)
+    found, placed = locate_keypoints(centre, lowered, seen_in(scan))
     assert placed[0]
     assert np.allclose(found[0], (4.0, 0.0, 0.9 - 4.0 * np.tan(np.deg2rad(10))), atol=0.01)
 
@@ -140,8 +140,8 @@ def test_what_one_lidar_does_not_see_another_one_may():
     half = len(whole.returns) // 2
     sides = [whole._replace(returns=part) for part in (whole.returns[:half], whole.returns[half:])]
     pixels = project(points)
-    expected, placed = locate_keypoints(pixels, CAMERA, whole, 3.0)
-    found, is_found = locate_among(pixels, CAMERA, sides, 3.0)
+    expected, placed = locate_keypoints(pixels, CAMERA, whole)
+    found, is_found = locate_among(pixels, CAMERA, sides)
     assert np.sum(placed & ~is_found) <= 3  # between the two halves
-    assert 0 < np.sum(locate_among(pixels, CAMERA, sides[:1], 3.0)[1]) < np.sum(is_found)
+    assert 0 < np.sum(locate_among(pixels, CAMERA, sides[:1])[1]) < np.sum(is_found)
     assert found[is_found] == pytest.approx(expected[is_found])

@@ -36,7 +36,7 @@ def viewed(robot, pose):
     features = Orb(OrbConfig()).detect(picture(pose, room()))
     scan = scan_at(pose, room(), LASER)
     positions, placed = locate_keypoints(
-        features.keypoints_px, CAMERA, LidarView(scan.points, scan.origin, LASER.angle_increment_rad), 3.0
+        features.keypoints_px, CAMERA, LidarView(scan.points, scan.origin, LASER.angle_increment_rad)
     )
     keypoints, codes = frozen(positions[placed], np.float32), features.descriptors[placed]
     return Place(KeyscanId(robot, 0), Channel.CAMERA, "v", 0, 0, keypoints, codes)

@@ -2,7 +2,7 @@
 
 Walls, cupboards and door frames are vertical. So a point above or below the scan plane is assumed to lie, seen from
 above, where the LiDAR measures a surface in its direction. A keypoint is dropped if the LiDAR has no return in its
-direction. It is also dropped if the ray would be below the floor or above ``ceiling_m`` there, because it hit the floor
+direction. It is also dropped if the ray would be below the floor or above ``CEILING_M`` there, because it hit the floor
 or the ceiling first. Objects that overhang the scan plane, such as a table top, get a wrong depth. RANSAC and the
 verification of the submaps reject them.
 """
@@ -17,6 +17,8 @@ from fcslam.compiled import njit
 from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray
 
+CEILING_M = 3.0
+"""Keypoints higher above the floor have no position: the LiDAR does not see the ceiling."""
 FLOOR_MARGIN_M: Final = 0.03
 """Keypoints at most this high are dropped, because they may lie on the floor."""
 SAME_SURFACE_M: Final = 0.20
@@ -42,11 +44,11 @@ class LidarView(NamedTuple):
 
 
 def locate_keypoints(
-    keypoints_px: NDArray[np.float32], camera: CameraModel, lidar: LidarView, ceiling_m: float
+    keypoints_px: NDArray[np.float32], camera: CameraModel, lidar: LidarView
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Positions (K, 3) of keypoints (K, 2) in ``base`` by the LiDAR range in their direction, and which have one, (K,).
 
-    ``base`` lies on the floor; the LiDAR scanned at the image's stamp. Keypoints above ``ceiling_m`` have no position;
+    ``base`` lies on the floor; the LiDAR scanned at the image's stamp. Keypoints above ``CEILING_M`` have no position;
     then it is 0.
     """
     rays = _rays(keypoints_px.astype(np.float64), camera)
@@ -55,18 +57,18 @@ def locate_keypoints(
     directions = rays[:, :2] / np.maximum(level, 1e-9)[:, None]
     distances = _distances(eye, directions, lidar.returns, lidar.origin, WIDEST_GAP * lidar.spacing_rad)
     heights = height + distances * rays[:, 2] / np.maximum(level, 1e-9)
-    placed = np.isfinite(distances) & (heights > FLOOR_MARGIN_M) & (heights < ceiling_m)
+    placed = np.isfinite(distances) & (heights > FLOOR_MARGIN_M) & (heights < CEILING_M)
     positions = np.column_stack((eye + distances[:, None] * directions, heights))
     return np.where(placed[:, None], positions, 0.0), placed
 
 
 def locate_among(
-    keypoints_px: NDArray[np.float32], camera: CameraModel, surroundings: Sequence[LidarView], ceiling_m: float
+    keypoints_px: NDArray[np.float32], camera: CameraModel, surroundings: Sequence[LidarView]
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """``locate_keypoints`` with several LiDARs: what one does not see, another one may."""
     positions, placed = np.zeros((len(keypoints_px), 3)), np.zeros(len(keypoints_px), np.bool_)
     for lidar in surroundings:
-        found, is_found = locate_keypoints(keypoints_px, camera, lidar, ceiling_m)
+        found, is_found = locate_keypoints(keypoints_px, camera, lidar)
         fresh = is_found & ~placed
         positions[fresh], placed = found[fresh], placed | is_found
     return positions, placed

@@ -22,8 +22,6 @@ from fcslam.features.lidar_depth import LidarView, locate_among, project
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, FloatArray
 
-CEILING_M: Final = 3.0
-"""Keypoints above this height have no position."""
 BORDER_PX: Final = 4.0
 """Points that are predicted closer to the border of an image count as not shown."""
 SAME_SURFACE_M: Final = 0.15
@@ -68,7 +66,7 @@ class Keyframe:
         cls, image: GreyImage, features: ImageFeatures, camera: CameraModel, surroundings: tuple[LidarView, ...]
     ) -> "Keyframe":
         """Locate the keypoints."""
-        positions, placed = locate_among(features.keypoints_px, camera, surroundings, CEILING_M)
+        positions, placed = locate_among(features.keypoints_px, camera, surroundings)
         return cls(image, features, camera, surroundings, positions, placed)
 
 
@@ -84,7 +82,7 @@ def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tu
     last = np.array([second.camera.width - 1.0, second.camera.height - 1.0])
     inside = np.all((pixels >= BORDER_PX) & (pixels <= last - BORDER_PX), axis=1)  # NaN is outside
     shown = first.placed & inside
-    surface, met = locate_among(pixels[shown].astype(np.float32), second.camera, second.surroundings, CEILING_M)
+    surface, met = locate_among(pixels[shown].astype(np.float32), second.camera, second.surroundings)
     gap_m = np.hypot(*(surface[:, :2] - there[shown, :2]).T)
     shown[shown] = met & (gap_m <= SAME_SURFACE_M)
     return pixels, shown

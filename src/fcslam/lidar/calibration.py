@@ -36,7 +36,7 @@ DELAY_STEP_S: Final = 0.01
 """Range and step of the search for the delay, before it is refined."""
 HUBER: Final = 1.5
 """Residuals beyond this many standard deviations count less."""
-CORRELATED: Final = 3.0
+SIGMA_FACTOR: Final = 3.0
 """Factor of the standard deviations: consecutive residuals are correlated."""
 
 
@@ -236,4 +236,4 @@ def _robust(design: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatAr
         residual = np.abs(target - design @ x)
         sigma = max(1.4826 * float(np.median(residual)), 1e-9)
         weights = np.asarray(np.minimum(1.0, HUBER * sigma / np.maximum(residual, 1e-12)))
-    return x, np.asarray((CORRELATED * sigma) ** 2 * inverse)
+    return x, np.asarray((SIGMA_FACTOR * sigma) ** 2 * inverse)

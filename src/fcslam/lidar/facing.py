@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
+from fcslam.lidar.own_body import LEAST_MOVE_M, LEAST_TURN_RAD
 from fcslam.lidar.scan import beam_times, rays_of
 from fcslam.records import Beams, FloatArray, LaserScan, frozen
 
-LEAST_MOVE_M: Final = 0.3
-LEAST_TURN_RAD: Final = 0.3
-"""Two scans are compared once the robot has moved or turned by so much."""
 LONGEST_S: Final = 4.0
 """Scans farther apart in time are not compared: odometry drifts."""
 MOST_COMPARED: Final = 3000
@@ -72,7 +70,7 @@ FAR_M, FAR_RAD = 1.0, 0.8
 EXCESS_STEP_M: Final = 0.05
 LEAST_EXCESS_M, LARGEST_EXCESS_M = 0.1, 1.0
 
-WHEELS: Final = 1.5
+LARGEST_WHEEL_SCALE: Final = 1.5
 """Distances that differ by a larger factor may be due to the unit of the ranges."""
 BENT: Final = 1.15
 """Turns that differ by a larger factor may be due to the angles of the beams."""
@@ -172,7 +170,7 @@ class Excess(NamedTuple):
 def distance_remedy(distance: float) -> str:
     """What to do about a robot whose distance by scans is ``distance`` of that by odometry."""
     wheels = "correct the radius of the wheels in its driver"
-    if 1.0 / WHEELS < distance < WHEELS:
+    if 1.0 / LARGEST_WHEEL_SCALE < distance < LARGEST_WHEEL_SCALE:
         return wheels
     seem = (
         f", which seem to be {unit}" for unit, metres in UNITS_M.items() if abs(distance * metres - 1.0) < SAME_UNIT

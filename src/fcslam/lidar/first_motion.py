@@ -16,8 +16,8 @@ from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import ScanTracker
 from fcslam.records import LaserScan, Sweep, frozen
 
-LONGEST_S: Final = 1.0
-"""A later scan says little about the motion during the first one."""
+LONGEST_GAP_S: Final = 1.0
+"""A scan after a longer gap says nothing about the motion during the one before it, nor the reverse."""
 PASSES: Final = 8
 """Most matches of the two scans."""
 SAME_M, SAME_RAD = 1e-3, 1e-3
@@ -40,7 +40,7 @@ def first_sweep(first: LaserScan, second: LaserScan, odometry: OdometryModel) ->
     """
     elapsed_s = second.stamp - first.stamp
     is_one_laser = first.laser.T_base_laser == second.laser.T_base_laser
-    if first.sweep is None or second.sweep is None or not is_one_laser or not 0.0 < elapsed_s <= LONGEST_S:
+    if first.sweep is None or second.sweep is None or not is_one_laser or not 0.0 < elapsed_s <= LONGEST_GAP_S:
         return first.sweep
     sweep, T_first_second = first.sweep._replace(velocity=AT_REST), np.zeros(3)
     for _ in range(PASSES):

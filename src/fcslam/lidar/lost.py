@@ -59,14 +59,14 @@ RODE, RODE_OVERLAP = 0.73, 0.40
 The cabin says where its door is, so a part of the walls decides; but a larger share of them lies in known area."""
 LEAST_OVERLAP = 0.25
 """Least share of all points in known area; below it, nothing is decided."""
-STAYED_M, LARGEST_SPEED, LONGEST_GAP_S = 1.0, 2.0, 5.0
+STAYED_M, LARGEST_SPEED, REACHABLE_S = 1.0, 2.0, 5.0
 """Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
 scans, m/s. After a longer gap, in seconds, that would be another room with the same walls: it must be where it was."""
 SEEN_S = 2.0
 """After a shorter gap, in seconds, a robot that is found nowhere counts as where it was: a match finds it again."""
 GAP_TRAVEL_M = 2.0
 """``DOUBTFUL_TRAVEL_M`` after a gap, metres: more walls fit in fewer ways."""
-CLEAR, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
+LEAST_RATIO, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
 """The best alignment after a gap scores higher than the best one elsewhere by this factor. The one elsewhere counts as
 so many metres at least: a few walls are never unique. No larger share of the walls of one lies in free space of the
 other."""
@@ -173,7 +173,7 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
         return None
     best, rival = found
     against_m = LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m)
-    if best.score_m >= CLEAR * against_m and best.violation <= LARGEST_VIOLATION:
+    if best.score_m >= LEAST_RATIO * against_m and best.violation <= LARGEST_VIOLATION:
         return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
     T_local_first = frontend.localize(scans[0]).tracked.T_local_base
     worse, gate = _agreement_at(T_local_first, frontend, fresh), VERIFICATION.loose
@@ -197,7 +197,7 @@ def _agreement_at(
 def is_in_reach(T_local_base: FloatArray, scan: LaserScan, frontend: LidarFrontend, gap_s: float) -> bool:
     """Whether a robot without odometry may have come to a pose, shape (3,), in a gap of the scans before ``scan``."""
     x, y, _ = se2.motion(frontend.localize(scan).tracked.T_local_base, T_local_base)
-    reach_m = STAYED_M + LARGEST_SPEED * (gap_s if gap_s <= LONGEST_GAP_S else 0.0)
+    reach_m = STAYED_M + LARGEST_SPEED * (gap_s if gap_s <= REACHABLE_S else 0.0)
     return math.hypot(x, y) <= reach_m
 
 

@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, LaserModel, LaserScan
+from fcslam.sources.point_clouds import LARGEST_BODY_M
 
 Heading = Annotated[float, Field(ge=-360.0, le=360.0)]
 Sectors = tuple[tuple[Heading, Heading], ...]
@@ -53,12 +54,10 @@ Polygon = Annotated[
 """Corners in the order of the outline; empty: none."""
 
 LEAST_MOVE_M, LEAST_TURN_RAD = 0.3, 0.3
-"""The robot has moved or turned by so much between two places."""
+"""The robot has moved or turned by so much between two scans that are compared."""
 FEWEST_PLACES, MOST_PLACES = 20, 200
 NOTHING_M: Final = 1e3
 """Range of a degree without a return."""
-LARGEST_BODY_M: Final = 1.5
-"""Farther returns are not of the robot."""
 SAME_M, STEADY = 0.05, 0.95
 """Largest deviation of a return of the robot from its usual range, and share of the places at which it has it."""
 MARGIN_DEG, LARGEST_GAP_DEG = 1, 3

@@ -26,7 +26,7 @@ SEEN_THROUGH: Final = 3
 """A surfel counts as moving, and is dropped, if the beams of at least this many scans passed through its cell ..."""
 SEEN_THROUGH_RATIO: Final = 2
 """... and of more than this many times the scans with a return in it: beams at a grazing angle pass walls, too."""
-EXPLAINED_M: Final = 0.15
+ON_SURFEL_M: Final = 0.15
 """A point this close to a surfel that faces the same way lies on its surface."""
 VIOLATION_M: Final = 0.30
 """A point in free space farther than this from any surfel contradicts the submap."""
@@ -278,7 +278,7 @@ def _agreement(points, normals, T, field, free, free_corner):  # type: ignore[no
             s = field.surfels[label]
             if s[2] * mx + s[3] * my > OPPOSED:
                 distance = np.hypot(x - s[0], y - s[1])
-        if distance < EXPLAINED_M:
+        if distance < ON_SURFEL_M:
             known += 1
             explained += 1
             jacobian[0] = mx

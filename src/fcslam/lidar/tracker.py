@@ -14,6 +14,7 @@ from fcslam.lidar.matching import FIXED, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
+from fcslam.sources.contradictions import STILL_M, STILL_RAD
 
 GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA = 0.8, 0.5, 0.3
 """Limits of a good match, by which odometry is judged: the share of the points in known area that it explains, and the
@@ -27,7 +28,7 @@ SEARCH_SIGMA_M = 0.02
 """Limit in metres, for a match that explains the known area: its points must fix the position so well in every
 direction. Along a bare wall the points hardly distinguish poses, and the pattern of the beams favours some.
 """
-JUMP_M, JUMP_RAD, JUMP_SHARE, JUMP_GAIN = 0.3, 0.35, 0.85, 20.0
+LONG_STEP_M, LONG_STEP_RAD, JUMP_SHARE, JUMP_GAIN = 0.3, 0.35, 0.85, 20.0
 """Odometry may jump, as when its driver restarts at zero. After a step so long that the scan contradicts, the robot is
 also looked for where it was. There the scan must show what it did before: so large a share of the points on surfaces,
 and a log-likelihood higher by this."""
@@ -47,11 +48,6 @@ _NO_INFORMATION = np.zeros((3, 3))
 _DIRECTIONS = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
 
 
-STILL_M = 0.005
-"""Motion since the last match, in metres, below which a robot stands still if it also turned less than ``STILL_RAD``.
-Its scans are not matched then."""
-STILL_RAD = 0.003
-"""Turn since the last match, in radians, below which a robot stands still if it also moved less than ``STILL_M``."""
 POINT_SPACING_M = 0.05
 """Least distance between consecutive points of a scan that are matched, metres."""
 POINT_LIMIT = 180
@@ -142,6 +138,7 @@ class ScanTracker:
         """Find the pose of the next scan; the tracker does not change before ``commit``."""
         # 1. Prediction: the last pose, moved by odometry.
         T_local_guess, moved_m, turned_rad = self._predict(scan)
+        # The scans of a robot that has not moved since the last match are not matched.
         is_still = self._odometry.is_measured and moved_m < STILL_M and turned_rad < STILL_RAD
         matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
         if self._fields and is_still and matched_here == self._matched_here:
@@ -240,7 +237,7 @@ class ScanTracker:
     def _is_long_step(self, T_local_guess: FloatArray) -> bool:
         """Whether odometry moved so far since the last scan that it may have jumped."""
         x, y, theta = se2.motion(self._T_local_base, T_local_guess)
-        return math.hypot(x, y) > JUMP_M or abs(theta) > JUMP_RAD
+        return math.hypot(x, y) > LONG_STEP_M or abs(theta) > LONG_STEP_RAD
 
     def _is_unsure(self, error: OdometryError) -> bool:
         """Whether odometry may have erred so much that a match has several starts."""

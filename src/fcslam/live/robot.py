@@ -57,7 +57,7 @@ from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server
 from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Packet
 
-JUMP_M, JUMP_RAD = 0.01, 0.005
+EVENT_M, EVENT_RAD = 0.01, 0.005
 """Corrections that move the robot by less are not events."""
 
 POLL_INTERVAL_S = 0.1
@@ -579,7 +579,7 @@ class Robot(LiveTracker):
         T_map_before = np.zeros(3) if before is None else before.T_map_odom
         moved = se2.between(se2.compose(T_map_before, T_smooth_base), se2.compose(now.T_map_odom, T_smooth_base))
         distance_m, turned_rad = float(np.hypot(moved[0], moved[1])), abs(float(moved[2]))
-        if distance_m > JUMP_M or turned_rad > JUMP_RAD:
+        if distance_m > EVENT_M or turned_rad > EVENT_RAD:
             self._event(EventKind.CORRECTED, f"corrected by {distance_m:.3f} m and {turned_rad:.4f} rad")
 
 

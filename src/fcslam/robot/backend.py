@@ -34,7 +34,7 @@ from fcslam.records import (
 from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.robot.keyframe_folder import KeyframeFolder
 from fcslam.robot.own_places import OwnPlaces
-from fcslam.robot.tags import TagDetector, TagsConfig
+from fcslam.robot.tag_detection import TagDetector, TagsConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
 from fcslam.wire.messages import Body, Hello

@@ -12,8 +12,8 @@ from fcslam.geometry import se2
 from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
 from fcslam.lidar.facing import (
+    LARGEST_WHEEL_SCALE,
     MOST_COMPARED,
-    WHEELS,
     Contradiction,
     Excess,
     contradicted_facing,
@@ -215,7 +215,10 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
         return Calibrated(calibration, BagCorrection(), lines)
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
-    if _is_wrong(distance := calibration.distance_scale) and not 1.0 / WHEELS < distance.value < WHEELS:
+    if (
+        _is_wrong(distance := calibration.distance_scale)
+        and not 1.0 / LARGEST_WHEEL_SCALE < distance.value < LARGEST_WHEEL_SCALE
+    ):
         calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
     found = _corrected(calibration, assumed, _stated_share(bag.plan.stated_sweep, assumed_s))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from enum import Enum, auto
 
 from fcslam.geometry import se2
-from fcslam.lidar.first_motion import first_sweep
+from fcslam.lidar.first_motion import LONGEST_GAP_S, first_sweep
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.lifts import LEAVING_M, LEAVING_SCANS, Cabin
 from fcslam.lidar.lost import (
@@ -31,7 +31,7 @@ from fcslam.lidar.lost import (
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
 from fcslam.robot.motion import RobotMotion
-from fcslam.robot.motion_prediction import LONGEST_S, PREDICTED, MotionPrediction
+from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.robot.session import Session
 
 
@@ -72,7 +72,7 @@ class DeferredScans:
 
     def follows_gap(self, before: LaserScan, scan: LaserScan, session: Session) -> bool:
         """Whether nothing shows the motion between two scans of a robot without odometry."""
-        is_gap = self._motion.prediction is not None and scan.stamp - before.stamp > LONGEST_S
+        is_gap = self._motion.prediction is not None and scan.stamp - before.stamp > LONGEST_GAP_S
         return is_gap and session.newest is not None and self._lost.doubted > 0.0
 
     def begin_gap(self, gap_s: float) -> None:

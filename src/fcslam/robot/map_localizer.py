@@ -16,53 +16,42 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, MappedKeyscan
+from fcslam.lidar.lost import LEAST_OVERLAP, LEAST_RATIO, LEAST_RIVAL_M, LOST_EXPLAINED
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import Agreement, Submap, agreement, build_submap
-from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M
+from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
 from fcslam.wire.messages import Body
 
 AGREES_M, AGREES_RAD = 0.5, 0.1
 """Alignments of two stretches this near each other are one; in between the robot's own motion may drift."""
-LEAST_RIVAL_M = 5.0
-"""The best alignment elsewhere scores at least as much: a few walls are never unique."""
 FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.05, 0.01
 """Standard deviations of a pose that the exhaustive search found."""
-
-
 FIRST_SEARCH_M = 3.0
 """Travel before the first search of the whole map, metres."""
 STRETCH_GROWTH = 1.5
 """Length of a stretch, relative to that at the search before."""
 LONGEST_STRETCH_M = 15.0
 """Longest stretch whose walls are searched for, metres."""
-LEAST_RATIO = 1.5
-"""Least ratio of the score of the best alignment with the map to that of the best one elsewhere; below it, the
-alignment does not count."""
 LEAST_EVIDENCE = 3.0
 """Evidence that fixes the pose, if one of the stretches is clear: the number of separate stretches whose best
 alignments agree, plus the least of their ratios, less one."""
-LARGEST_VIOLATION = 0.10
+MOST_IN_FREE_SPACE = 0.10
 """Largest share of the walls in free space of the map, or the reverse. The lead of an alignment counts less in
 proportion to the walls of the robot there."""
 CLEAR_VIOLATION = 0.045
 """Largest share of the walls of a stretch in free space of the map, of one stretch at least: in another building with
 such rooms, more of each are."""
-SUPPORTED = 0.30
-"""Least share of a keyscan's points on walls of the map; below it, the robot's own motion alone counts."""
 CHECK_EVERY_M = 2.0
 """Travel between two comparisons with the map, metres."""
 CHECKED_M = 5.0
 """Travel, in metres, whose walls are compared with the map."""
-LEAST_OVERLAP = 0.25
-"""Least share of the walls in known area; below it, nothing is compared."""
 DOUBTED = 0.80
 """With a smaller share of the walls in the map, the pose is compared with the best one elsewhere."""
-LOST_EXPLAINED = 0.60
-"""A robot that is lost sees a smaller share of its walls in the map."""
-LOST_VIOLATION = 0.20
-"""And a larger share of its walls in free space of the map."""
+LOST_IN_FREE_SPACE = 0.20
+"""A robot that is lost sees a larger share of its walls in free space of the map. It is less than that of keyscans
+(``LOST_VIOLATION``): a finished map has no error of the robot's newest poses."""
 LARGEST_UNSEEN_M = 20.0
 """Travel without known walls after which the robot is not localized any more, metres."""
 INITIAL_ERROR_M = 1.5
@@ -216,7 +205,7 @@ class MapLocalizer:
         found = self._agreement(self._T_map_base, CHECKED_M)
         if found.overlap >= LEAST_OVERLAP:
             self._seen_m, self._quality = keyscan.travel_m, found.explained
-            if found.explained < LOST_EXPLAINED and found.violation > LOST_VIOLATION:
+            if found.explained < LOST_EXPLAINED and found.violation > LOST_IN_FREE_SPACE:
                 self._lose()
             elif found.explained < DOUBTED:
                 self._contest(self._T_map_base, keyscan)
@@ -229,7 +218,7 @@ class MapLocalizer:
 
         submap = self._submap(CHECKED_M)
         rival = best_elsewhere(self._map, submap, T_map_base)
-        if rival is None or rival.violation > LARGEST_VIOLATION:
+        if rival is None or rival.violation > MOST_IN_FREE_SPACE:
             return
         here = align_map(self._map, submap, T_map_base)
         ratio = rival.score_m / max(LEAST_RIVAL_M, here.score_m)
@@ -258,7 +247,7 @@ class MapLocalizer:
             return
         best, rival = found
         ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
-        if ratio < LEAST_RATIO or best.violation > LARGEST_VIOLATION:
+        if ratio < LEAST_RATIO or best.violation > MOST_IN_FREE_SPACE:
             return
         self._vote(best.T_a_b, ratio, submap, keyscan)
 
@@ -276,13 +265,13 @@ class MapLocalizer:
         near = align_map(self._map, self._submap(keyscan.travel_m - given_m), guess)
         off = se2.between(guess, near.T_a_b)
         is_near = np.hypot(off[0], off[1]) <= INITIAL_ERROR_M and abs(off[2]) <= INITIAL_ERROR_RAD
-        if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= LARGEST_VIOLATION:
+        if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= MOST_IN_FREE_SPACE:
             self._fix(near.T_a_b, keyscan)
 
     def _vote(self, T_map_base: FloatArray, ratio: float, stretch: Submap, keyscan: MappedKeyscan) -> None:
         """Count the best alignment of a stretch; with enough evidence it fixes the pose."""
         violation = agreement(stretch, self._map, T_map_base).violation
-        cleared = 1.0 + max(0.0, 1.0 - violation / LARGEST_VIOLATION) * (ratio - 1.0)
+        cleared = 1.0 + max(0.0, 1.0 - violation / MOST_IN_FREE_SPACE) * (ratio - 1.0)
         T_map_odom = se2.compose(T_map_base, se2.inverse(keyscan.T_local_base))
         vote = _Vote(T_map_odom, cleared, violation <= CLEAR_VIOLATION)
         self._votes = [*(other for other in self._votes if self._agree(vote, other, keyscan)), vote]

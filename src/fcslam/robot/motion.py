@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fcslam.geometry import se2
+from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.odometry import WHEELS, OdometryModel
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, LaserScan, Sweep
-from fcslam.robot.motion_prediction import LONGEST_S, PREDICTED, MotionPrediction
+from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
 from fcslam.robot.odometry_gate import OdometryGate, WheelCheck
 
 
@@ -81,7 +82,7 @@ class RobotMotion:
 def _moving_on(scan: LaserScan, before: LaserScan) -> LaserScan:
     """The scan with the velocity since the one before, by odometry, in its sweep."""
     elapsed_s = scan.stamp - before.stamp
-    if scan.sweep is None or not 0.0 < elapsed_s <= LONGEST_S:
+    if scan.sweep is None or not 0.0 < elapsed_s <= LONGEST_GAP_S:
         return scan
     x, y, theta = (se2.log(se2.between(before.T_odom_base, scan.T_odom_base)) / elapsed_s).tolist()
     return replace(scan, sweep=scan.sweep._replace(velocity=(x, y, theta)))

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.odometry import OdometryModel
 from fcslam.records import FloatArray, LaserScan, Sweep, frozen
 
-LONGEST_S = 1.0
-"""After a longer gap between two scans the robot is assumed to stand still: nothing is known of its motion."""
 LEAST_SHARE, LARGEST_SHARE = 0.5, 3.0
 """Limits of the next motion as a share of the last one: intervals vary if scans are dropped, but also if stamps are
 wrong."""
@@ -56,7 +55,7 @@ class MotionPrediction:
         """The next scan with its pose in a frame of the prediction's own, and with the motion during its sweep."""
         elapsed_s = 0.0 if self._last is None else scan.stamp - self._last[0]
         self._T_odom_last = self._T_odom_base
-        if self._last is None or not elapsed_s <= LONGEST_S:
+        if self._last is None or not elapsed_s <= LONGEST_GAP_S:
             return replace(scan, T_odom_base=frozen(self._T_odom_base))
         sweep = scan.sweep
         if self._sweep is not None and self._goes_on(elapsed_s):
@@ -117,7 +116,7 @@ class MotionPrediction:
         """
         elapsed_s = math.inf if self._last is None else stamp - self._last[0]
         self.is_new, self._elapsed_s, self._sweep = False, 0.0, None
-        if self._last is not None and T_smooth_base is not None and 0.0 <= elapsed_s <= LONGEST_S:
+        if self._last is not None and T_smooth_base is not None and 0.0 <= elapsed_s <= LONGEST_GAP_S:
             self._sweep = sweep
             if elapsed_s > 0.0:  # otherwise it is the same scan, in the map of another session
                 self._motion = se2.log(se2.between(self._last[1], T_smooth_base))

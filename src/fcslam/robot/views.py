@@ -25,8 +25,6 @@ SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
 EVERY_M, EVERY_RAD = 1.0, 0.5
 """Travel or turn after which an image becomes a camera place; after the turn, about half of the view is new."""
-CEILING_M = 3.0
-"""Keypoints higher above the floor are on the ceiling, so the LiDAR does not measure them."""
 FEWEST_KEYPOINTS = 20
 """Least number of keypoints with a position; an image with fewer is not a place."""
 
@@ -136,7 +134,7 @@ class ViewExtractor:
 
     def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
-        positions, placed = locate_among(features.keypoints_px, image.camera, image.surroundings, CEILING_M)
+        positions, placed = locate_among(features.keypoints_px, image.camera, image.surroundings)
         if placed.sum() < FEWEST_KEYPOINTS:
             return None
         if self._folder is not None:

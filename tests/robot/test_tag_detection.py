@@ -13,7 +13,7 @@ from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import CameraSettings
 from fcslam.records import CameraImage, KeyscanId, TagFamily
 from fcslam.robot.frontend import RobotConfig
-from fcslam.robot.tags import TagDetector, TagsConfig
+from fcslam.robot.tag_detection import TagDetector, TagsConfig
 
 pytestmark = pytest.mark.slow
 
