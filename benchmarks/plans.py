@@ -32,7 +32,7 @@ from fcslam.lab.simulation.floorplan import Piece, PieceKind
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulationSettings, simulate_fleet
 from fcslam.lidar.scan import point_scan
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.mission.mission import Beginning, MissionConfig, run_mission
+from fcslam.mission.mission import MissionConfig, MissionInputs, run_mission
 from fcslam.mission.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.runs import Run
@@ -100,7 +100,7 @@ def mapped(scans: dict[str, list[LaserScan]]) -> SavedMission:
 
 
 def in_plan(mission: SavedMission, plan: OccupancyMap | None) -> Run:
-    return run_mission([], MissionConfig(), beginning=Beginning(mission, anchors=Anchors(plan and BuildingPlan(plan))))
+    return run_mission([], MissionConfig(), inputs=MissionInputs(mission, anchors=Anchors(plan and BuildingPlan(plan))))
 
 
 def longer_scan(scan: LaserScan) -> LaserScan:

@@ -16,9 +16,9 @@ from fcslam.lidar.frontend import LidarConfig
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.driving import side_by_side
 from fcslam.mission.mission import (
-    Beginning,
     Live,
     MissionConfig,
+    MissionInputs,
     Watch,
     check_robots,
     continued_config,
@@ -94,8 +94,8 @@ def map_recordings(
     robots = split_recordings(opened, split)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
-    beginning = Beginning(earlier, tuple(vetoes), floors, anchors)
-    run = run_recordings(robots, settings, beginning, processes, progress or (lambda _: None))
+    inputs = MissionInputs(earlier, tuple(vetoes), floors, anchors)
+    run = run_recordings(robots, settings, inputs, processes, progress or (lambda _: None))
     if output is not None:
         run.save(output, force)
     return run
@@ -104,7 +104,7 @@ def map_recordings(
 def run_recordings(
     recordings: Sequence[Source],
     settings: MissionConfig,
-    beginning: Beginning,
+    inputs: MissionInputs,
     processes: int,
     watch: Watch,
     live: Live = lambda _: None,
@@ -116,7 +116,7 @@ def run_recordings(
     """
     check_robots(recordings)
     sources.check_copies(recordings)
-    return run_mission(recordings, settings, watch, beginning, side_by_side(processes), live)
+    return run_mission(recordings, settings, watch, inputs, side_by_side(processes), live)
 
 
 def localize(

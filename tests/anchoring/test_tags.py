@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines
-from fcslam.anchoring.tags import read_survey
+from fcslam.anchoring.surveyed_tags import read_survey
 from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.geometry import se2

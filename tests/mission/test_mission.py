@@ -9,7 +9,7 @@ import yaml
 
 from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import mission
-from fcslam.mission.mission import Beginning, MissionConfig, continued_config, run_mission
+from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import EMPTY
 from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.sources import open_source, write_carmen
@@ -45,7 +45,10 @@ def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
     robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
     seen = []
     run = run_mission(
-        [Kidnapped()], settings.model_copy(update={"robot": robot}), seen.append, Beginning(vetoes=(Veto("r", "r+1"),))
+        [Kidnapped()],
+        settings.model_copy(update={"robot": robot}),
+        seen.append,
+        MissionInputs(vetoes=(Veto("r", "r+1"),)),
     )
     assert run.metrics["keyscans"].value == seen[-1].keyscans
     scans, moment = kidnapping()

@@ -16,7 +16,7 @@ from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import EditError, SourceError
 from fcslam.mission.localization import read_map
-from fcslam.mission.mission import Beginning, MissionCloud, continued_config, run_mission
+from fcslam.mission.mission import MissionCloud, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import edit_mission, mission_bytes, read_mission
 from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
 from fcslam.runs import open_run
@@ -195,7 +195,7 @@ def test_a_state_counts_only_if_nothing_but_the_packets_changed(logs, begun, res
 
 def test_a_state_that_makes_no_sense_is_left_out(begun, caplog):
     saved = replace(read_mission(begun), state={"cloud": {"fleet": {}, "log": {}}, "traffic": []})
-    run = run_mission([], continued_config(saved), beginning=Beginning(saved))
+    run = run_mission([], continued_config(saved), inputs=MissionInputs(saved))
     assert "all packets take effect again" in caplog.text
     assert run.pose_graph_g2o == open_run(begun).pose_graph_g2o
 

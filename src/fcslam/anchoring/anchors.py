@@ -14,7 +14,7 @@ from fcslam.anchoring.part import part_of, with_part
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
-from fcslam.anchoring.tags import MapTags, Survey, placed_by_tags, read_survey, tag_lines
+from fcslam.anchoring.surveyed_tags import MapTags, Survey, placed_by_tags, read_survey, tag_lines
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import InputError, SourceError

@@ -44,7 +44,7 @@ def demo(
     from fcslam.lab.simulation.noise import SCANNERS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
-    from fcslam.mission.mission import Beginning, MissionConfig
+    from fcslam.mission.mission import MissionConfig, MissionInputs
     from fcslam.sources import open_source
 
     began = time.perf_counter()
@@ -72,7 +72,7 @@ def demo(
     sources = [open_source(place) for place in recordings]
     begin(2, "map each robot, recognise places, fuse the maps")
     with live_page(output / RUN) if live else nullcontext() as page:
-        map_sources(sources, MissionConfig(seed=seed), Beginning(), output / RUN, console, force=True, page=page)
+        map_sources(sources, MissionConfig(seed=seed), MissionInputs(), output / RUN, console, force=True, page=page)
         begin(3, "evaluate: compare with the truth")
         report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console)
         begin(4, "draw")
@@ -106,8 +106,8 @@ def _prepare(output: Path) -> None:
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.evaluation.charts import fleet_charts
+    from fcslam.lab.evaluation.fleet_figure import Outline, write_figure
     from fcslam.lab.simulation.floorplan import PieceKind
-    from fcslam.maps.fleet_figure import Outline, write_figure
 
     with ProgressDisplay(console) as display:
         display.start("drawing")

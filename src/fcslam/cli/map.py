@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.mission.mission import Beginning, MissionConfig, Progress
+    from fcslam.mission.mission import MissionConfig, MissionInputs, Progress
     from fcslam.mission.mission_file import SavedMission
     from fcslam.page.live_map import LiveMap
     from fcslam.runs import RobotTrajectory, Run
@@ -119,7 +119,7 @@ def map_recordings(
         from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import split_recordings
         from fcslam.cluster.verifying import verifying
-        from fcslam.mission.mission import Beginning, continued_config
+        from fcslam.mission.mission import MissionInputs, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
         from fcslam.runs import prepare_output
@@ -140,8 +140,8 @@ def map_recordings(
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     with verifying(workers) as verify, live_page(output) if live else nullcontext() as page:
-        beginning = Beginning(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
-        map_sources(sources, settings, beginning, output, notices(quiet), force, page)
+        inputs = MissionInputs(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
+        map_sources(sources, settings, inputs, output, notices(quiet), force, page)
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
@@ -157,7 +157,7 @@ def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, st
 def map_sources(
     sources: "Sequence[Source]",
     settings: "MissionConfig",
-    beginning: "Beginning",
+    inputs: "MissionInputs",
     output: Path,
     console: "Console",
     force: bool = False,
@@ -178,16 +178,16 @@ def map_sources(
     began = time.perf_counter()
     with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
-        known = sum(len(track.stamps) for track in beginning.onto.tracks.values())
+        known = sum(len(track.stamps) for track in inputs.onto.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
         look = (lambda _: None) if page is None else page.look
-        run = run_recordings(sources, settings, beginning, cores(), progress, look)
+        run = run_recordings(sources, settings, inputs, cores(), progress, look)
         display.start("writing")
         run.save(output, force)
     if page is not None:
         page.finish(output)
     print_faults(console, faults)
-    _report(run, time.perf_counter() - began, output, settings, beginning.onto)
+    _report(run, time.perf_counter() - began, output, settings, inputs.onto)
     return run
 
 
@@ -292,7 +292,7 @@ def _session_lines(run: "Run", earlier: "SavedMission") -> Iterator[str]:
         robot, epoch = robot_and_epoch(session.robot)
         last, begin_s = before.get(robot, session), session.stamps[0]
         before[robot] = session
-        if epoch <= earlier.epochs(robot):  # the first session of a recording began with it
+        if epoch <= earlier.session_count(robot):  # the first session of a recording began with it
             first_s[robot] = begin_s
             continue
         remedy = ""

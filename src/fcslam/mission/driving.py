@@ -127,20 +127,20 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)
 
 
-def continued(legs: Iterator[Leg], first_epoch: int) -> Iterator[Leg]:
-    """The legs of a robot, with sessions renumbered from ``first_epoch``."""
-    if first_epoch == 0:
+def continued(legs: Iterator[Leg], first_session: int) -> Iterator[Leg]:
+    """The legs of a robot, with sessions renumbered from ``first_session``."""
+    if first_session == 0:
         yield from legs
         return
     for leg in legs:
-        packets = tuple(_readdressed(sized, first_epoch) for sized in leg.packets)
-        names = (session_name(leg.robot, first_epoch + epoch) for epoch in range(len(leg.tracks)))
+        packets = tuple(_readdressed(sized, first_session) for sized in leg.packets)
+        names = (session_name(leg.robot, first_session + epoch) for epoch in range(len(leg.tracks)))
         yield replace(leg, packets=packets, tracks=dict(zip(names, leg.tracks.values(), strict=True)))
 
 
-def _readdressed(sized: SizedPacket, first_epoch: int) -> SizedPacket:
+def _readdressed(sized: SizedPacket, first_session: int) -> SizedPacket:
     packet = sized.packet
-    data = readdress(sized.data, first_epoch + packet.epoch, packet.sequence)
+    data = readdress(sized.data, first_session + packet.epoch, packet.sequence)
     return SizedPacket(decode(data), data)
 
 

@@ -21,7 +21,7 @@ from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.maps.drawing import map_png
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, parse_map, server_files
 from fcslam.maps.ros_map import parse_ros_map
-from fcslam.mission.mission import Beginning, MissionConfig, continued_config, run_mission
+from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import read_mission
 from fcslam.records import FloatArray, LaserScan, checked_pose, frozen
 from fcslam.robot.frontend import RobotFrontend
@@ -271,7 +271,7 @@ def _place(robot: RobotFrontend, estimate: MapEstimate | None, drive: LocalizedD
 
 def _mission_map(path: Path, floor: str) -> OccupancyMap:
     saved = read_mission(path)
-    run = run_mission((), continued_config(saved), beginning=Beginning(saved))
+    run = run_mission((), continued_config(saved), inputs=MissionInputs(saved))
     floors = {trajectory.map_index: trajectory.floor for trajectory in run.trajectories.values()}
     number, floor = _map_on(floor, floors, path)
     files, stem = run.map_files, map_stem(number)

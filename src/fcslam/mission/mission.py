@@ -96,7 +96,7 @@ Live = Callable[["MissionCloud"], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Beginning:
+class MissionInputs:
     """What a mission knows before its recordings, and where it verifies closures."""
 
     onto: SavedMission = EMPTY
@@ -122,7 +122,7 @@ def run_mission(
     sources: Sequence[Source],
     config: MissionConfig,
     watch: Watch = lambda _: None,
-    beginning: Beginning = Beginning(),
+    inputs: MissionInputs = MissionInputs(),
     drive: Drive = one_by_one,
     live: Live = lambda _: None,
 ) -> Run:
@@ -132,21 +132,21 @@ def run_mission(
         sources: the recordings.
         config: all settings.
         watch: called with the progress.
-        beginning: what is known before the recordings.
+        inputs: what is known before the recordings.
         drive: runs the robots.
         live: called with the cloud after every packet.
     """
-    onto = beginning.onto
+    onto = inputs.onto
     check_robots(sources)
     recordings = [source.name for source in sources]
     known = [*onto.robots, *recordings]
-    _check_known("a veto", (name for veto in beginning.vetoes for name in (veto.robot_i, veto.robot_j)), known)
+    _check_known("a veto", (name for veto in inputs.vetoes for name in (veto.robot_i, veto.robot_j)), known)
     _check_known("a start", config.fleet.starts, known)
-    sources = on_floors(sources, beginning.floors)
-    cloud = MissionCloud(config, beginning)
+    sources = on_floors(sources, inputs.floors)
+    cloud = MissionCloud(config, inputs)
     meter = _Meter(watch, cloud, known)
     with drive(sources, config.robot) as robots:
-        new = [continued(legs, onto.epochs(name)) for legs, name in zip(robots, recordings, strict=True)]
+        new = [continued(legs, onto.session_count(name)) for legs, name in zip(robots, recordings, strict=True)]
         streams = [_packets(legs, meter) for legs in new]
         first, streams = _first(streams)
         if cloud.resume(first):
@@ -163,21 +163,21 @@ def run_mission(
 class MissionCloud:
     """The cloud of a mission within one process; it counts what is sent."""
 
-    def __init__(self, config: MissionConfig, beginning: Beginning = Beginning()) -> None:
+    def __init__(self, config: MissionConfig, inputs: MissionInputs = MissionInputs()) -> None:
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
-        self.config, self._beginning, onto = config, beginning, beginning.onto
+        self.config, self._inputs, onto = config, inputs, inputs.onto
         self.host = self._new_host()
         """The fleet."""
         self._traffic = Counter()
         self._packets: list[StoredPacket] = []
         self._refused = onto.refused
         numbers = itertools.count(len(onto.edits) + 1)
-        self.host.follow([*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in beginning.vetoes)])
+        self.host.follow([*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in inputs.vetoes)])
         for packet in onto.refused:
             self.host.refuse(packet.robot, packet.epoch, packet.sequence)
 
     def _new_host(self) -> Cloud:
-        return Cloud(self.config.fleet, self.config.seed, self._beginning.verify_pairs, self.config.map)
+        return Cloud(self.config.fleet, self.config.seed, self._inputs.verify_pairs, self.config.map)
 
     def resume(self, first: SizedPacket | None) -> bool:
         """Take over the state after all packets of the earlier mission, so that they need not be applied again.
@@ -188,7 +188,7 @@ class MissionCloud:
         Returns:
             Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
         """
-        onto = self._beginning.onto
+        onto = self._inputs.onto
         packets = sorted(onto.stored, key=lambda packet: packet.order)
         is_later = not packets or first is None or first.packet.order > packets[-1].order
         if onto.state is None or not is_later or self.host.edits != onto.edits or self.config.cloud != onto.config:
@@ -250,7 +250,7 @@ class MissionCloud:
         return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
 
     def _placed(self, result: FleetResult) -> Anchored:
-        anchors, is_fixed = self._beginning.anchors, any(robot.fixes for robot in result.robots)
+        anchors, is_fixed = self._inputs.anchors, any(robot.fixes for robot in result.robots)
         if anchors == Anchors() and not is_fixed and not result.sightings:
             return Anchored(result)
         by_hand = {change.session for change in in_force(self.host.edits) if isinstance(change, Placement)}

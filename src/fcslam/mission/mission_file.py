@@ -75,7 +75,7 @@ class SavedMission:
         """All packets in canonical order."""
         return sorted(chain.from_iterable(self.packets.values()), key=lambda sized: sized.packet.order)
 
-    def epochs(self, robot: str) -> int:
+    def session_count(self, robot: str) -> int:
         """How many sessions the robot had, counted with those without a packet."""
         return 1 + max((packet.epoch for packet in self.stored if packet.robot == robot), default=-1)
 

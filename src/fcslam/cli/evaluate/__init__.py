@@ -40,7 +40,7 @@ def fleet(
     report_fleet(run, truth, csv, notices())
     if figure is not None:
         from fcslam.lab.evaluation.charts import fleet_charts
-        from fcslam.maps.fleet_figure import write_figure
+        from fcslam.lab.evaluation.fleet_figure import write_figure
 
         with ProgressDisplay(notices()) as display:
             display.start("drawing")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from fcslam.errors import EvaluationError
+from fcslam.lab.evaluation.fleet_figure import IDENTITY, Chart, FleetCharts, MatchedPlaces, Outline
 from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
-from fcslam.maps.fleet_figure import IDENTITY, Chart, FleetCharts, MatchedPlaces, Outline
 from fcslam.metrics.trajectory import align
 from fcslam.records import ClosureStatus, FloatArray
 from fcslam.runs import LOCAL, ClosureRow, LocalMap, Run, open_run

@@ -11,8 +11,7 @@ from fcslam.cli import main
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.charts import fleet_charts
-from fcslam.maps import palette
-from fcslam.maps.fleet_figure import (
+from fcslam.lab.evaluation.fleet_figure import (
     MATCHES_DRAWN,
     RAY_M,
     WIDTH_PX,
@@ -24,6 +23,7 @@ from fcslam.maps.fleet_figure import (
     spread,
     write_figure,
 )
+from fcslam.maps import palette
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_tum
