@@ -30,10 +30,6 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
     Args:
         occupancy: the map.
         name: what messages call it.
-
-    Raises:
-        SourceError: it shows no wall beside free space, is too large, or its cells are too coarse or too fine to match
-            scans with.
     """
     side = occupancy.resolution_m
     if side > COARSEST_M:

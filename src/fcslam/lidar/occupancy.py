@@ -155,9 +155,6 @@ def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
 
     Returns:
         Counts, shape (H, W), in ``map``.
-
-    Raises:
-        ValueError: the number of ranges is not that of the beams, or a pose is not finite or too far away.
     """
     (grid,) = cast_periods([keyscans], config)
     return grid
@@ -176,9 +173,6 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
 
     Yields:
         Counts, shape (H, W), in ``map``; the next step changes them.
-
-    Raises:
-        ValueError: as ``cast``.
     """
     groups = [_by_laser(keyscans, config) for keyscans in periods]
     layout = _layout([beams for period in groups for beams in period], config)
@@ -215,9 +209,6 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
         base: the map; its cells keep their side.
         scans: newer scans, with poses in ``map``.
         config: usable range and thresholds.
-
-    Raises:
-        ValueError: as ``cast``.
     """
     side = base.resolution_m
     column, row = (round(value / side) for value in base.origin_xy)
@@ -320,7 +311,6 @@ def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
 
 
 def _counts(layout: _Layout, by_scan: bool = False) -> _Counts:
-    """Zeros."""
     shape = layout.height, layout.width
     hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
     scans, newest = (np.zeros(shape if by_scan else (0, 0), np.uint32) for _ in range(2))

@@ -76,9 +76,6 @@ def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) 
 
     Returns:
         Points and normals in ``base`` at the stamp, shape (N, 2).
-
-    Raises:
-        ValueError: the number of ranges is not the number of beams.
     """
     if ranges_m.shape != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {ranges_m.shape}")

@@ -1,4 +1,4 @@
-"""Checks what a user's program feeds into a live robot, and makes records of it."""
+"""Makes records of what a user's program feeds into a live robot. An ``InputError`` says what cannot be used."""
 
 import math
 from collections.abc import Mapping
@@ -20,11 +20,7 @@ Lasers = LaserModel | Mapping[str, LaserModel]
 
 
 def checked_robot(name: str) -> str:
-    """The name of a robot.
-
-    Raises:
-        InputError: a robot cannot be called so.
-    """
+    """The name of a robot."""
     try:
         check_robot(name)
     except PacketError as error:
@@ -34,11 +30,7 @@ def checked_robot(name: str) -> str:
 
 
 def checked_lasers(lasers: Lasers | None) -> dict[str, LaserModel]:
-    """The lasers by name; the name of the only one is empty.
-
-    Raises:
-        InputError: one of them cannot be a laser, or two are equal.
-    """
+    """The lasers by name; the name of the only one is empty."""
     if lasers is None:
         return {}
     named = dict(lasers) if isinstance(lasers, Mapping) else {"": lasers}
@@ -61,9 +53,6 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
     """A scan as a record; negative ranges are made invalid. The stamp and the pose were checked before.
 
     The ranges have shape (N,); N may vary from scan to scan, the field of view does not.
-
-    Raises:
-        InputError: the ranges are not numbers, or not as many as the laser can have beams.
     """
     try:
         ranges = np.array(ranges_m, np.float32)
@@ -83,11 +72,7 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
 
 
 def checked_camera(camera: CameraModel | None) -> CameraModel | None:
-    """The camera.
-
-    Raises:
-        InputError: it cannot be one.
-    """
+    """The camera."""
     if camera is None:
         return None
     translation_m, rotation = camera.T_base_camera
@@ -104,9 +89,6 @@ def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None
     """An image as a record, encoded as JPEG: grey values are enough for keypoints. The rest was checked before.
 
     The image has shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
-
-    Raises:
-        InputError: the image has another type, or another shape than those of the camera.
     """
     import cv2
 
@@ -122,11 +104,7 @@ def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None
 
 
 def checked_stamp(stamp: float, newest_s: float) -> float:
-    """A stamp, seconds.
-
-    Raises:
-        InputError: it is not finite, or far before ``newest_s``.
-    """
+    """A stamp, seconds."""
     if not math.isfinite(stamp):
         raise InputError(f"stamp: {stamp} is not a time; give seconds")
     if stamp < newest_s - MAX_STEP_BACK_S:

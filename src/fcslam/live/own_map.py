@@ -69,36 +69,20 @@ class OwnMap:
             return len(self._applying)
 
     def draw(self, session: str, T_map_own: FloatArray) -> OccupancyMap:
-        """The map that a session is in, moved by the pose of the robot's own map in ``map``, shape (3,).
-
-        Raises:
-            FcslamError: the worker has ended.
-        """
+        """The map that a session is in, moved by the pose of the robot's own map in ``map``, shape (3,)."""
         drawn: OccupancyMap = self._answer(_call_host, FleetHost.draw, session, T_map_own)
         return drawn
 
     def poses(self, session: str) -> FloatArray:
-        """``T_own_base`` of the session's keyscans so far, shape (K, 3), metres and radians.
-
-        Raises:
-            FcslamError: the worker has ended.
-        """
+        """``T_own_base`` of the session's keyscans so far, shape (K, 3), metres and radians."""
         return self._answer(_call_host, FleetHost.poses, session)
 
     def closures(self, session: str, T_map_own: FloatArray) -> FloatArray:
-        """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``.
-
-        Raises:
-            FcslamError: the worker has ended.
-        """
+        """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``."""
         return self._answer(_call_host, FleetHost.closures, session, T_map_own)
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
-        """The result of all packets so far; arguments as in ``MissionCloud.run``.
-
-        Raises:
-            FcslamError: the worker has ended.
-        """
+        """The result of all packets so far; arguments as in ``MissionCloud.run``."""
         return self._answer(MissionCloud.run, tracks, scans, recorded_s)
 
     def _submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:

@@ -40,11 +40,6 @@ def play(
     """Map a whole recording and send all packets; what a resumed robot did before is not paced.
 
     ``stay`` is called after the last record, before the recording ends.
-
-    Raises:
-        CloudError: the cloud rejects the robot; unconfirmed packets stay in the state folder.
-        StateError: the state folder cannot be used.
-        SourceError: the recording cannot be read.
     """
     for record in records:
         if isinstance(record, LaserScan) and not robot.status().is_catching_up:

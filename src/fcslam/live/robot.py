@@ -450,7 +450,6 @@ class Robot(LiveTracker):
         return self._own
 
     def _is_behind(self) -> bool:
-        """Whether a recording should wait."""
         uplink, own = self._uplink, self._own
         unstored, is_full = (0, False) if uplink is None else (uplink.unstored, uplink.is_full)
         with self._lock:
@@ -488,7 +487,6 @@ class Robot(LiveTracker):
         return scan if self._joint is None else self._joint.mark_teammates(scan, self._part, self._pose)
 
     def _take(self, packets: list[Packet]) -> None:
-        """Pass the next packets on."""
         if not packets:
             return
         self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
@@ -529,7 +527,6 @@ class Robot(LiveTracker):
         )
 
     def _tell(self) -> None:
-        """Tell what happened between two scans."""
         part, correction = self._part, self._map_poses.localizer(self._part).correction
         if part > self._newest_part:
             self._newest_part, self._applied = part, None

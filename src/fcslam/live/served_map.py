@@ -48,11 +48,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
 
 
 def _read(client: MapClient, server: str) -> Run:
-    """The maps of a cloud, all of one moment.
-
-    Raises:
-        UnavailableError: the cloud cannot be reached, or changes its maps all the time.
-    """
+    """The maps of a cloud, all of one moment."""
     for _ in range(_ATTEMPTS):
         served = [one for one in client.maps() if one.extent_m]
         if not served:

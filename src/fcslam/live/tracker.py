@@ -205,7 +205,6 @@ class LiveTracker(ABC):
             )
 
     def _tell_examined(self) -> None:
-        """Tell what the worker found wrong with a laser."""
         while self._examined and self._examined[0].done():
             examined = self._examined.popleft()
             error = examined.exception()

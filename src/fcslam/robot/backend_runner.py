@@ -48,12 +48,7 @@ class WorkerBackend:
     """Runs the back end in the only worker of an executor, which may be another process."""
 
     def __init__(self, robot: str, config: SessionConfig, executor: Executor, keyframes: Path | None = None) -> None:
-        """Start the back end; ``keyframes`` as in ``RobotBackend``.
-
-        Raises:
-            StateError: the folder of keyframes cannot be written.
-            FeatureError: the detector is a network whose weights cannot be used.
-        """
+        """Start the back end; ``keyframes`` as in ``RobotBackend``."""
         self._robot = robot
         self._executor = executor
         executor.submit(_begin, robot, config, keyframes).result()
@@ -83,7 +78,6 @@ class BlockExecutor(Executor):
         return task
 
     def _start(self) -> None:
-        """Pass the block on."""
         block, self._block = self._block, []
         if not block:
             return
@@ -117,7 +111,6 @@ def _run_all(tasks: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]]) -> lis
 
 
 def _hand_out(results: "Future[list[Any]]", tasks: Sequence[_BlockTask]) -> None:
-    """Give the tasks of a block that has ended their results."""
     error = results.exception()
     for number, task in enumerate(tasks):
         with suppress(InvalidStateError):
@@ -128,11 +121,7 @@ def _hand_out(results: "Future[list[Any]]", tasks: Sequence[_BlockTask]) -> None
 
 
 def worker_process() -> Executor:
-    """An executor with one worker, another process with a lower priority than this one.
-
-    Raises:
-        InputError: the host gives processes no semaphores.
-    """
+    """An executor with one worker, another process with a lower priority than this one."""
     return worker_pool(YIELD_TO_TRACKER)
 
 
@@ -142,9 +131,6 @@ def copied_worker() -> Iterator[Executor]:
 
     It is a copy of this process, made at once: begin this block before threads start, such as those of ROS. Objects
     that ``gc.freeze`` has frozen before stay shared.
-
-    Raises:
-        InputError: the host gives processes no semaphores.
     """
     executor = worker_pool(YIELD_TO_TRACKER, is_copy=True)
     try:

@@ -77,11 +77,7 @@ class Calibrated:
 
 
 def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
-    """Estimate the timing and the mounting of the first laser of a bag with one laser.
-
-    Raises:
-        SourceError: the bag cannot be mapped.
-    """
+    """Estimate the timing and the mounting of the first laser of a bag with one laser."""
     contradictions = _contradictions(bag)
     floors = tuple(found.floor for found in contradictions)
     if not any(floors):
@@ -123,11 +119,7 @@ def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Fo
 
 
 def contradictions_of(source: Source) -> tuple[str, ...]:
-    """Lines about the lasers of a recording of any format that contradict its odometry.
-
-    Raises:
-        SourceError: the recording cannot be mapped.
-    """
+    """Lines about the lasers of a recording of any format that contradict its odometry."""
     say = str if isinstance(source, RosBag) else _without_tf
     lines = []
     for laser, found in zip(source.survey().lasers, _contradictions(source), strict=True):
@@ -153,11 +145,7 @@ def _without_tf(found: Contradiction) -> str:
 
 
 def bodies_of(source: Source) -> tuple[str, ...]:
-    """Lines about the sectors in which lasers see the robot itself.
-
-    Raises:
-        SourceError: the recording cannot be mapped.
-    """
+    """Lines about the sectors in which lasers see the robot itself."""
     sectors = [
         [round(first_deg), round(last_deg)]
         for laser in source.survey().lasers
@@ -185,7 +173,6 @@ class _Found(NamedTuple):
 
 
 def _contradictions(source: Source) -> list[_Found]:
-    """Of each laser."""
     found = []
     for laser in source.survey().lasers:
         first = list(islice(_scans_of(laser, source), MOST_COMPARED))
@@ -264,11 +251,7 @@ def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
 
 
 def calibrated(source: Source, config: LidarConfig) -> Source:
-    """A recording with what its motion says against it; only a bag is corrected.
-
-    Raises:
-        SourceError: the recording cannot be mapped.
-    """
+    """A recording with what its motion says against it; only a bag is corrected."""
     if not isinstance(source, RosBag):
         said = contradictions_of(source)
         return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source

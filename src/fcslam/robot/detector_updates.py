@@ -43,11 +43,7 @@ class DetectorUpdates:
         self._applied = self._outbox.detector_updates()
 
     def store(self, file: DetectorFile, content: bytes) -> None:
-        """Store a downloaded detector. Called by the sender.
-
-        Raises:
-            StateError: the file cannot be written.
-        """
+        """Store a downloaded detector. Called by the sender."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             write_file(self._path(file), content)  # a resumed recording may need the old one

@@ -75,9 +75,6 @@ class RobotFrontend:
             config: its settings.
             backend: runs the back end beside this front end; None: it runs inline.
             mark: marks the beams of a scan that hit other robots, before it is matched.
-
-        Raises:
-            FeatureError: the detector of camera images is a network whose weights cannot be used.
         """
         self.robot = robot
         self.tracks: list[ScanTrack] = []
@@ -283,14 +280,12 @@ class RobotFrontend:
         self._map(scan, tracking)
 
     def _map(self, scan: LaserScan, tracking: TrackingResult) -> None:
-        """Continue from a localized scan."""
         self.packets.advance(scan.stamp)
         for input in self._session.map(scan, tracking, self._fixes.until(scan.stamp), self.motion.odometry.jumps):
             self._submit(input)
         self.newest = NewestScan(self.scan_poses[-1], tracking.tracked, tracking.quality, is_deferred=False)
 
     def _process_image(self, image: CameraImage) -> None:
-        """Describe an image, or defer it behind doubtful scans."""
         if self._deferred:
             self._deferred.add(image)
         else:
@@ -307,7 +302,6 @@ class RobotFrontend:
         self._begin(ScanTrack(self.scan_poses.floor))
 
     def _begin(self, track: ScanTrack) -> None:
-        """Begin a session with the poses ``track``."""
         self._session = Session(self.robot, len(self.tracks), self._config.lidar, self.motion.model, track)
         self._deferred.leave_cabin()
         self.tracks.append(track)

@@ -43,11 +43,7 @@ class KeyframeFolder:
     """Writes the keyframes of one start of a robot."""
 
     def __init__(self, folder: Path) -> None:
-        """``folder``: created if it does not exist.
-
-        Raises:
-            StateError: it cannot be written.
-        """
+        """``folder``: created if it does not exist."""
         self._folder = folder
         self._is_failed = False
         self.part = 0

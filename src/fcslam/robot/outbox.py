@@ -74,12 +74,7 @@ class Outbox:
     """Survives a crash of its process at any moment. Two threads may use it, two processes may not."""
 
     def __init__(self, path: Path, robot: str, limit_bytes: int) -> None:
-        """Open the file at ``path``, or create it.
-
-        Raises:
-            StateError: the file belongs to another robot, is open in another process, is not an outbox, is damaged, or
-                cannot be written.
-        """
+        """Open the file at ``path``, or create it."""
         self._path = path
         self._limit_bytes = limit_bytes
         self.epoch = -1
@@ -170,9 +165,6 @@ class Outbox:
 
         Returns:
             Number of dropped places.
-
-        Raises:
-            StateError: a packet differs from that of the interrupted run, so the recording is not the same.
         """
         dropped = 0
         with self._transaction() as connection:
@@ -387,7 +379,6 @@ def _insert(
 
 
 def _count(connection: sqlite3.Connection, which: str) -> tuple[int, int]:
-    """Number and total bytes of packets."""
     count, size = _one(connection, f"SELECT count(*), coalesce(sum(length(data)), 0) FROM packets WHERE {which}")
     return int(count), int(size)
 

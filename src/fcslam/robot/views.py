@@ -55,11 +55,7 @@ class ViewExtractor:
     """Picks images that show something new and describes them."""
 
     def __init__(self, config: ViewsConfig, folder: KeyframeFolder | None = None) -> None:
-        """Load the detector; ``folder`` keeps the keyframes that are in the image buffer.
-
-        Raises:
-            FeatureError: the detector is a network whose weights cannot be used.
-        """
+        """Load the detector; ``folder`` keeps the keyframes that are in the image buffer."""
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
         self._image_buffer = ImageBuffer()
@@ -114,11 +110,7 @@ class ViewExtractor:
         return tuple(self._image_buffer)
 
     def set_detector(self, file: DetectorFile, path: Path) -> None:
-        """Use a downloaded network from now on.
-
-        Raises:
-            FeatureError: the file is not the announced one, or cannot be used; nothing has changed.
-        """
+        """Use a downloaded network from now on."""
         self._detector = open_detector_file(file, path, self._config.onnx)
 
     def reset(self) -> None:

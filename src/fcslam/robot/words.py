@@ -77,11 +77,7 @@ class WordSender:
     """Turns what one robot would send into words, session after session; the vocabulary never changes."""
 
     def __init__(self, config: WordsConfig) -> None:
-        """Read the vocabularies.
-
-        Raises:
-            InputError: their file cannot be read.
-        """
+        """Read the vocabularies."""
         assert config.vocabulary is not None, "checked with the settings"
         self._path = config.vocabulary
         self._vocabularies = {found.channel: found for found in read_vocabularies(config.vocabulary)}

@@ -33,11 +33,7 @@ class WorkerLocalizer:
     """Runs a ``MapLocalizer`` in the only worker of an executor; a ``BackendRunner`` for ``RobotFrontend``."""
 
     def __init__(self, robot: str, occupancy: OccupancyMap, initial: FloatArray | None, executor: Executor) -> None:
-        """Load the map into the worker; arguments as for ``MapLocalizer``.
-
-        Raises:
-            SourceError: nothing can be localized in the map.
-        """
+        """Load the map into the worker; arguments as for ``MapLocalizer``."""
         self._robot, self._executor = robot, executor
         self.state = MapState(0, None, 0, 0)
         """After the newest input that the worker has handled."""
