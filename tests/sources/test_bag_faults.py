@@ -76,14 +76,14 @@ def test_a_scan_in_a_frame_with_an_endless_name_is_no_scan(tmp_path, name):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_an_empty_bag(tmp_path, name):
-    assert "the bag has no topics" in refusal(save(tmp_path / name, []))
+    assert "there are no topics" in refusal(save(tmp_path / name, []))
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_no_scans(tmp_path, name):
     message = refusal(save(tmp_path / name, without(drive(20), "/scan")))
     assert "no laser scans (sensor_msgs/LaserScan)" in message
-    assert "/odom (nav_msgs/Odometry, 42)" in message
+    assert "/odom (nav_msgs/Odometry)" in message
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -114,11 +114,11 @@ def test_odometry_may_be_left_out(tmp_path):
         ),
         (
             BagOptions(scan_topics=("/odom",)),
-            ["/odom has 42 messages of type nav_msgs/Odometry", "needs sensor_msgs/LaserScan"],
+            ["/odom has the type nav_msgs/Odometry", "needs sensor_msgs/LaserScan"],
         ),
         (
             BagOptions(odom_topic="/chatter"),
-            ["/chatter has 1 messages of type std_msgs/String", "needs nav_msgs/Odometry, or tf"],
+            ["/chatter has the type std_msgs/String", "needs nav_msgs/Odometry, or tf"],
         ),
     ],
 )

@@ -14,7 +14,6 @@ Publish = Callable[[bytes], None]
 
 TRIGGER: Final = "std_srvs/Trigger"
 """Type of all services: a request without fields."""
-_TOPICS_NAMED = 15
 
 
 class Answer(NamedTuple):
@@ -83,13 +82,3 @@ def qos_conflict(offered: Quality, requested: Quality) -> str | None:
 def published(endpoints: Sequence[Endpoint]) -> dict[str, str]:
     """The topics that others publish, with their types, in the order of their names."""
     return {point.topic: point.kind for point in sorted(endpoints) if point.publishes and not point.own}
-
-
-def named_topics(endpoints: Sequence[Endpoint]) -> str:
-    """A list of the topics that others publish, with their types, for messages."""
-    topics = published(endpoints)
-    if not topics:
-        return "nobody publishes anything that this process sees"
-    named = ", ".join(f"{topic} ({kind})" for topic, kind in list(topics.items())[:_TOPICS_NAMED])
-    more = f" and {len(topics) - _TOPICS_NAMED} more" if len(topics) > _TOPICS_NAMED else ""
-    return f"the topics are {named}{more}"

@@ -1,26 +1,14 @@
-"""Which topics of a ROS network a robot reads: those that the user names, or else those of the right types in its
-namespace."""
+"""Which topics of a ROS network a robot reads, by the rules for bags."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
-from fcslam.errors import NetworkError
-from fcslam.ros.network import Endpoint, named_topics, published
-from fcslam.sources.bags.codec import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    FIX,
-    IMAGE,
-    ODOMETRY,
-    POINT_CLOUD,
-    SCAN,
-    SCANS,
-    TRANSFORMS,
-)
+from fcslam.errors import NetworkError, SourceError
+from fcslam.ros.network import Endpoint, published
+from fcslam.sources.bags.codec import FIX, IMAGE, ODOMETRY, TRANSFORMS
+from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.robots import is_truth
-from fcslam.sources.bags.topics import info_beside, is_depth
-from fcslam.sources.bags.transforms import last_part
+from fcslam.sources.bags.topics import KnownTopics, calibration_beside, choose_topics
 
 TF, TF_STATIC = "tf", "tf_static"
 
@@ -50,75 +38,54 @@ def resolved(namespace: str, name: str) -> str:
 
 
 def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options: BagOptions) -> SensorTopics:
-    """Choose the topics to read in ``namespace``, by these rules:
+    """Choose the topics to read in ``namespace``, by the rules for bags; nobody knows the fields of view.
 
-    - laser: laser scans before point clouds and these before depth images, one echo a beam, the name ``scan``, first by
-      name;
-    - odometry: the name ``odom``, first by name, else tf; ground truth only if the user names it;
-    - camera: calibrated, compressed images, first by name;
-    - fixes of satellite navigation: first by name;
-    - tf: the namespace's own if there is one, else that of all robots.
+    Fixes of satellite navigation are those of the topic that is first by name. The topics of tf are the namespace's own
+    if there is one, else that of all robots.
 
     Raises:
         NetworkError: a required topic is missing, or a named topic is missing or of another type; the message lists the
             topics that are there.
     """
     known = published(endpoints)
-    inside = [topic for topic in known if topic.startswith(f"{namespace}/")]
-    notes: list[str] = []
-
-    def named(name: str, option: str, *kinds: str) -> str:
-        """The full name of a topic that must have one of these types."""
-        topic = resolved(namespace, name)
-        if known.get(topic) not in kinds:
-            what = f"has the type {known[topic]}" if topic in known else "is not there"
-            needed = f"{option} needs {' or '.join(kinds[:2])}"
-            raise NetworkError(f"topic {topic} {what}; {needed}; {named_topics(endpoints)}")
-        return topic
-
-    scans = [named(name, "--sensors scan-topic", *SCANS, IMAGE) for name in options.scan_topics]
-    if not scans:
-        depths = [
-            topic for topic in inside if known[topic] == IMAGE and is_depth(topic) and info_beside(topic) in known
-        ]
-        candidates = [*(topic for topic in inside if known[topic] in SCANS), *depths]
-        if not candidates:
-            raise NetworkError(
-                f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images in {namespace or '/'}; start "
-                f"the driver; {named_topics(endpoints)}"
-            )
-        rank = [*SCANS, IMAGE].index
-        scans = [min(candidates, key=lambda topic: (rank(known[topic]), last_part(topic) != "scan", topic))]
-        notes += _note("laser scans", "--sensors scan-topic", scans[0], candidates)
-    odometry = None if options.odom_topic in (None, NO_ODOMETRY) else resolved(namespace, options.odom_topic)
-    if options.odom_topic == NO_ODOMETRY:
-        notes.append("reads no odometry, as --sensors odom-topic=none says")
-    elif odometry is None:
-        candidates = [topic for topic in inside if known[topic] == ODOMETRY and not is_truth(topic)]
-        odometry = min(candidates, key=lambda topic: (last_part(topic) != "odom", topic), default=None)
-        notes += _note("odometry", "--sensors odom-topic", odometry, candidates)
-    else:
-        named(odometry, "--sensors odom-topic", ODOMETRY, TRANSFORMS)
+    every = [Topic(name, kind, 1) for name, kind in known.items()]
+    inside = [topic for topic in every if topic.name.startswith(f"{namespace}/")]
     own_or_common = {f"{namespace}/{name}": f"/{name}" for name in (TF, TF_STATIC)}  # they may appear later
-    transforms = tuple(own if own in known else common for own, common in own_or_common.items())
-    if odometry is not None and known[odometry] != ODOMETRY:
-        transforms, odometry = tuple(dict.fromkeys((odometry, *transforms))), None
-    images = [topic for topic in inside if known[topic] in (COMPRESSED_IMAGE, IMAGE)]
-    if options.camera_topic is not None:
-        images = [named(options.camera_topic, "--sensors camera-topic", COMPRESSED_IMAGE, IMAGE)]
-    infos = {topic: info_beside(topic) for topic in images if not is_depth(topic)}
-    calibrated = [topic for topic, info in infos.items() if known.get(info) == CAMERA_INFO]
-    camera = min(calibrated, key=lambda topic: (known[topic] != COMPRESSED_IMAGE, topic), default=None)
-    if options.camera_topic is not None and camera is None:
-        raise NetworkError(f"topic {images[0]} has no calibration: {info_beside(images[0])} is not there; publish it")
-    info = None if camera is None else infos[camera]
-    depth_infos = [info_beside(topic) for topic in scans if known[topic] == IMAGE]
-    fixes = min((topic for topic in inside if known[topic] == FIX), default=None)
-    read = (*scans, *depth_infos, *transforms, *filter(None, (odometry, camera, info, fixes)))
-    kinds = {topic: known.get(topic, TRANSFORMS) for topic in read}
-    return SensorTopics(kinds, tuple(scans), odometry, transforms, camera, info, fixes, tuple(notes))
+    transforms = [Topic(own if own in known else common, TRANSFORMS, 1) for own, common in own_or_common.items()]
+    wanted = replace(
+        options,
+        scan_topics=tuple(resolved(namespace, name) for name in options.scan_topics),
+        odom_topic=options.odom_topic
+        if options.odom_topic in (None, NO_ODOMETRY)
+        else resolved(namespace, options.odom_topic),
+        camera_topic=options.camera_topic and resolved(namespace, options.camera_topic),
+    )
+    place = f" in {namespace or '/'}"
+    try:
+        chosen = choose_topics(
+            KnownTopics(inside, tuple(transforms), "", every, place, "start the driver"),
+            wanted,
+            field_of_view_rad=lambda _: 0.0,
+            has_images=lambda _: True,
+        )
+    except SourceError as error:
+        raise NetworkError(str(error)) from error
+    odometry = next((topic for topic in chosen.odometry if topic.type == ODOMETRY), None)
+    transforms = list(dict.fromkeys((*(topic for topic in chosen.odometry if topic != odometry), *transforms)))
+    depth_infos = [calibration_beside(topic, every) for topic in chosen.scans if topic.type == IMAGE]
+    fixes = min((topic for topic in inside if topic.type == FIX), default=None)
+    read = (*chosen.scans, *depth_infos, *transforms, odometry, chosen.camera, chosen.camera_info, fixes)
+    return SensorTopics(
+        {topic.name: topic.type for topic in read if topic is not None},
+        _names(chosen.scans),
+        odometry and odometry.name,
+        _names(transforms),
+        chosen.camera and chosen.camera.name,
+        chosen.camera_info and chosen.camera_info.name,
+        fixes and fixes.name,
+        chosen.notes,
+    )
 
 
-def _note(what: str, option: str, chosen: str | None, candidates: Sequence[str]) -> list[str]:
-    others = ", ".join(topic for topic in candidates if topic != chosen)
-    return [f"reads {what} from {chosen}, not from {others} ({option} chooses)"] if others else []
+def _names(topics: Iterable[Topic]) -> tuple[str, ...]:
+    return tuple(topic.name for topic in topics)

@@ -85,7 +85,7 @@ class BagScans:
     def _cloud(self, message: BagMessage) -> CloudMessage:
         topic = message.topic
         if topic not in self._calibrations:
-            info = calibration_beside(topic, self._robot) if topic.type == IMAGE else None
+            info = calibration_beside(topic, self._robot.topics) if topic.type == IMAGE else None
             self._calibrations[topic] = calibration_in(self._robot, info)
         return cloud_of(message.content, topic.type, message.bag_time_ns, self._calibrations[topic])
 

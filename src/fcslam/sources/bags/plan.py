@@ -22,7 +22,7 @@ from fcslam.sources.bags.pairing import Message
 from fcslam.sources.bags.rig import usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.sectors import are_sectors, cloud_sector_rad, joined_turns
-from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
+from fcslam.sources.bags.topics import Candidates, KnownTopics, Topics, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import SCANS_THAT_VOTE
@@ -144,7 +144,7 @@ class BagPlan(NamedTuple):
 
 def candidates_of(robot: BagRobot) -> Candidates:
     """The topics of a robot that can be read."""
-    found = find_candidates(robot, partial(_view_rad, robot), partial(_has_images, robot))
+    found = find_candidates(_known_topics(robot), partial(_view_rad, robot), partial(_has_images, robot))
     return found._replace(measured=[topic for topic in found.measured if not _odometry_error(robot, topic)])
 
 
@@ -155,7 +155,7 @@ def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
         SourceError: a topic is missing, none of a laser's scans can be read, or it is not clear which odometry or
             which transforms are the robot's.
     """
-    topics = choose_topics(robot, options, partial(_view_rad, robot), partial(_has_images, robot))
+    topics = choose_topics(_known_topics(robot), options, partial(_view_rad, robot), partial(_has_images, robot))
     tree = robot.bag.census.tree(robot.transforms)
     scans = BagScans(
         robot, topics.scans, options, tree, lambda frame: _base_frame_of(frame, robot, options, topics, tree)
@@ -180,6 +180,10 @@ def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
     clocks = {name: counted[stamped] for stamped, name in read.items() if stamped in counted}
     calibration = calibration_in(robot, topics.camera_info)
     return BagPlan(topics, tree, scans, lasers, odometry, ahead_s, clocks, calibration, tuple(notes))
+
+
+def _known_topics(robot: BagRobot) -> KnownTopics:
+    return KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
 
 
 def _laser(robot: BagRobot, scans: BagScans, topic: Topic, frame: str | None) -> RecordedLaser:

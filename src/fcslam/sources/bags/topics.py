@@ -1,4 +1,4 @@
-"""Chooses the topics of a bag: those that the user names, or else by fixed rules, with a note."""
+"""Chooses the topics of a bag or of a live robot: those that the user names, or else by fixed rules, with a note."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -14,27 +14,52 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     LASER_SCANS,
     ODOMETRY,
+    OLD_TRANSFORMS,
     POINT_CLOUD,
     SCAN,
     SCANS,
+    TRANSFORMS,
 )
-from fcslam.sources.bags.container import Topic, is_transforms
+from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.robots import BagRobot, is_truth, slashed
+from fcslam.sources.bags.robots import is_truth, slashed
 from fcslam.sources.bags.transforms import last_part
 
 _NAMED_AT_MOST = 15
-_NEEDED = {
-    "--sensors scan-topic": f"{SCAN}, {POINT_CLOUD} or a depth image",
-    "--sensors odom-topic": f"{ODOMETRY}, or tf",
-    "--sensors camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
+_NEEDED: Mapping[str, tuple[tuple[str, ...], str]] = {
+    "--sensors scan-topic": ((*SCANS, IMAGE), f"{SCAN}, {POINT_CLOUD} or a depth image"),
+    "--sensors odom-topic": ((ODOMETRY, TRANSFORMS, OLD_TRANSFORMS), f"{ODOMETRY}, or tf"),
+    "--sensors camera-topic": ((COMPRESSED_IMAGE, IMAGE), f"{COMPRESSED_IMAGE} or {IMAGE}"),
 }
+"""Types of the topics that each option may name."""
 _SAME_VIEW_RAD = 0.1
 """Fields of view that differ by less are equally wide."""
 
 
+class KnownTopics(NamedTuple):
+    """The topics from which those of one robot are chosen."""
+
+    own: Sequence[Topic]
+    """Those of the robot."""
+    transforms: tuple[Topic, ...]
+    """Those of tf."""
+    label: str
+    """What messages begin with: the bag, or nothing."""
+    others: Sequence[Topic] = ()
+    """Topics that are read only if the user names them."""
+    place: str = ""
+    """Where the topics are, at the end of a sentence."""
+    remedy: str = "record them"
+    """How there are scans."""
+
+    @property
+    def heard(self) -> list[Topic]:
+        """Those of the robot that have messages."""
+        return [topic for topic in self.own if topic.message_count]
+
+
 class Topics(NamedTuple):
-    """The topics of a bag that are read."""
+    """The topics that are read."""
 
     scans: tuple[Topic, ...]
     """One for each laser."""
@@ -62,7 +87,7 @@ class Candidates(NamedTuple):
 
 
 def choose_topics(
-    robot: BagRobot,
+    known: KnownTopics,
     options: BagOptions,
     field_of_view_rad: Callable[[Topic], float],
     has_images: Callable[[Topic], bool],
@@ -77,51 +102,46 @@ def choose_topics(
     Raises:
         SourceError: a required topic is missing, or a named topic is missing or of another type.
     """
-    heard, scans = _heard(robot), _scans(robot)
-    if not scans:
+    heard, scans = known.heard, _scans(known)
+    if not scans and not options.scan_topics:
         packed = [topic.name for topic in heard if topic.type == COMPRESSED_IMAGE and is_depth(topic.name)]
         bare = [topic.name for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
-        remedy = "record them"
+        remedy = known.remedy
         if bare:
             remedy = f"the depth images of {bare[0]} need their {info_beside(bare[0])}"
         if packed:
             remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
-        raise SourceError(
-            f"{robot.bag.path}: no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images; {remedy}; "
-            f"{_known(robot.topics)}"
-        )
-    readable = [*scans, *_images(robot)]
-    lasers = [
-        topic for name in options.scan_topics for topic in _candidates(robot, readable, name, "--sensors scan-topic")
-    ]
+        what = f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images"
+        raise SourceError(f"{known.label}{what}{known.place}; {remedy}; {_listed(known)}")
+    lasers = [_named(known, name, "--sensors scan-topic") for name in options.scan_topics]
     if not lasers:
         preferred = _preferred(scans)
         lasers = [_best_scan(preferred, [_views_rad(preferred, field_of_view_rad)])]
-    transforms, wanted = robot.transforms, options.odom_topic
-    able = [*_measured(robot), *transforms]
-    if wanted is not None:
-        able = [topic for topic in heard if topic.type == ODOMETRY or is_transforms(topic)]
-    odometries = [] if wanted == NO_ODOMETRY else _candidates(robot, able, wanted, "--sensors odom-topic")
-    camera, camera_info, notes = _choose_camera(robot, options.camera_topic, has_images)
+    odometries = [*_measured(known), *known.transforms]
+    if options.odom_topic == NO_ODOMETRY:
+        odometries = []
+    elif options.odom_topic is not None:
+        odometries = [_named(known, options.odom_topic, "--sensors odom-topic")]
+    camera, camera_info, notes = _choose_camera(known, options.camera_topic, has_images)
     if not options.scan_topics:
-        notes = [*_note(robot, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
+        notes = [*_note(known, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
     if measured := [topic for topic in odometries if topic.type == ODOMETRY]:
         odometries = [_best_odometry(measured)]
-        notes += _note(robot, "odometry", "--sensors odom-topic", odometries[0], measured)
-    return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
+        notes += _note(known, "odometry", "--sensors odom-topic", odometries[0], measured)
+    return Topics(tuple(lasers), tuple(odometries), known.transforms, camera, camera_info, tuple(notes))
 
 
 def find_candidates(
-    robot: BagRobot, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
+    known: KnownTopics, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
 ) -> Candidates:
-    """The topics of ``robot`` from which ``choose_topics`` would choose.
+    """The topics from which ``choose_topics`` would choose.
 
     Raises:
         SourceError: the bag cannot be read.
     """
-    scans, images = _preferred(_scans(robot)), _images(robot)
-    calibrated = [topic for topic in images if _calibration_of(topic, robot) and has_images(topic)]
-    return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(robot), calibrated)
+    scans, images = _preferred(_scans(known)), _images(known)
+    calibrated = [topic for topic in images if _calibration_of(topic, known) and has_images(topic)]
+    return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(known), calibrated)
 
 
 def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[BagOptions, tuple[str, ...]]:
@@ -152,14 +172,13 @@ def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[Ba
     return options, tuple(notes)
 
 
-def _heard(robot: BagRobot) -> list[Topic]:
-    return [topic for topic in robot.topics if topic.message_count]
-
-
-def _scans(robot: BagRobot) -> list[Topic]:
-    depths = [each for each in _heard(robot) if each.type == IMAGE and is_depth(each.name)]
-    calibrated = [each for each in depths if calibration_beside(each, robot)]
-    return [topic for topic in _heard(robot) if topic.type in SCANS or topic in calibrated]
+def _scans(known: KnownTopics) -> list[Topic]:
+    return [
+        topic
+        for topic in known.heard
+        if topic.type in SCANS
+        or (topic.type == IMAGE and is_depth(topic.name) and calibration_beside(topic, (*known.own, *known.others)))
+    ]
 
 
 def _preferred(scans: Sequence[Topic]) -> list[Topic]:
@@ -168,8 +187,8 @@ def _preferred(scans: Sequence[Topic]) -> list[Topic]:
     return next(filter(None, kinds), [])
 
 
-def _measured(robot: BagRobot) -> list[Topic]:
-    return [topic for topic in _heard(robot) if topic.type == ODOMETRY and not is_truth(topic.name)]
+def _measured(known: KnownTopics) -> list[Topic]:
+    return [topic for topic in known.heard if topic.type == ODOMETRY and not is_truth(topic.name)]
 
 
 def _common(candidates: Sequence[Sequence[Topic]]) -> list[Topic]:
@@ -205,25 +224,27 @@ def _fleet_note(what: str, option: str, chosen: Topic, candidates: Sequence[Sequ
 
 
 def _choose_camera(
-    robot: BagRobot, wanted: str | None, has_images: Callable[[Topic], bool]
+    known: KnownTopics, wanted: str | None, has_images: Callable[[Topic], bool]
 ) -> tuple[Topic | None, Topic | None, list[str]]:
     """Topics of images and of their calibration, and notes about the choice."""
-    images = _images(robot)
-    cameras = [topic for topic in _candidates(robot, images, wanted, "--sensors camera-topic") if has_images(topic)]
+    images = _images(known)
+    if wanted is not None:
+        images = [_named(known, wanted, "--sensors camera-topic")]
+    cameras = list(filter(has_images, images))
     if not cameras:
         names = ", ".join(topic.name for topic in images)
-        note = f"{robot.bag.path}: no images of {names} can be read, the camera is left out"
+        note = f"{known.label}no images of {names} can be read, the camera is left out"
         return None, None, [note] * bool(images)
-    info_of = {camera: _calibration_of(camera, robot) for camera in cameras}
+    info_of = {camera: _calibration_of(camera, known) for camera in cameras}
     chosen = min(cameras, key=lambda topic: (info_of[topic] is None, *_camera_rank(topic)))
     if info_of[chosen] is None:
-        note = f"{robot.bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"
+        note = f"{known.label}no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"
         return None, None, [note]
-    return chosen, info_of[chosen], _note(robot, "images", "--sensors camera-topic", chosen, cameras)
+    return chosen, info_of[chosen], _note(known, "images", "--sensors camera-topic", chosen, cameras)
 
 
-def _images(robot: BagRobot) -> list[Topic]:
-    images = [topic for topic in _heard(robot) if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+def _images(known: KnownTopics) -> list[Topic]:
+    images = [topic for topic in known.heard if topic.type in (COMPRESSED_IMAGE, IMAGE)]
     return [topic for topic in images if not is_depth(topic.name)]
 
 
@@ -231,17 +252,17 @@ def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
     return -topic.message_count, topic.type != COMPRESSED_IMAGE, topic.name
 
 
-def _calibration_of(camera: Topic, robot: BagRobot) -> Topic | None:
+def _calibration_of(camera: Topic, known: KnownTopics) -> Topic | None:
     """The calibration topic beside the images, or the only one if there is only one camera."""
-    infos = [topic for topic in _heard(robot) if topic.type == CAMERA_INFO]
-    only = infos[0] if len(infos) == len(_images(robot)) == 1 else None
-    return calibration_beside(camera, robot) or only
+    infos = [topic for topic in known.heard if topic.type == CAMERA_INFO]
+    only = infos[0] if len(infos) == len(_images(known)) == 1 else None
+    return calibration_beside(camera, (*known.own, *known.others)) or only
 
 
-def calibration_beside(camera: Topic, robot: BagRobot) -> Topic | None:
+def calibration_beside(camera: Topic, topics: Sequence[Topic]) -> Topic | None:
     """The calibration topic beside the images."""
     name = slashed(info_beside(camera.name))
-    infos = (topic for topic in _heard(robot) if topic.type == CAMERA_INFO)
+    infos = (topic for topic in topics if topic.type == CAMERA_INFO and topic.message_count)
     return next((info for info in infos if slashed(info.name) == name), None)
 
 
@@ -255,31 +276,28 @@ def is_depth(name: str) -> bool:
     return "depth" in name.lower()
 
 
-def _candidates(robot: BagRobot, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:
-    """All candidates, or the one that the user names."""
-    if wanted is None:
-        return list(candidates)
-    chosen = [topic for topic in candidates if slashed(topic.name) == slashed(wanted)]
-    if not chosen:
-        there = [topic for topic in robot.topics if slashed(topic.name) == slashed(wanted)]
-        what = f"has {there[0].message_count} messages of type {there[0].type}" if there else "is not there"
-        raise SourceError(
-            f"{robot.bag.path}: topic {wanted} {what}; {option} needs {_NEEDED[option]}; {_known(robot.topics)}"
-        )
-    return chosen[:1]
+def _named(known: KnownTopics, wanted: str, option: str) -> Topic:
+    """The topic that the user names by an option."""
+    kinds, needed = _NEEDED[option]
+    there = [topic for topic in (*known.own, *known.others) if slashed(topic.name) == slashed(wanted)]
+    fitting = [topic for topic in there if topic.type in kinds and topic.message_count]
+    if fitting:
+        return fitting[0]
+    what = "is not there"
+    if there:
+        what = f"has the type {there[0].type}" if there[0].message_count else "has no messages"
+    raise SourceError(f"{known.label}topic {wanted} {what}; {option} needs {needed}; {_listed(known)}")
 
 
-def _note(robot: BagRobot, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
+def _note(known: KnownTopics, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
     others = ", ".join(topic.name for topic in candidates if topic != chosen)
-    note = f"{robot.bag.path}: reads {what} from {chosen.name}, not from {others} ({option} chooses)"
-    return [note] * bool(others)
+    return [f"{known.label}reads {what} from {chosen.name}, not from {others} ({option} chooses)"] * bool(others)
 
 
-def _known(topics: Sequence[Topic]) -> str:
+def _listed(known: KnownTopics) -> str:
+    topics = sorted({*known.own, *known.others})
     if not topics:
-        return "the bag has no topics"
-    named = ", ".join(
-        f"{one_line(topic.name)} ({one_line(topic.type)}, {topic.message_count})" for topic in topics[:_NAMED_AT_MOST]
-    )
+        return "there are no topics"
+    named = ", ".join(f"{one_line(topic.name)} ({one_line(topic.type)})" for topic in topics[:_NAMED_AT_MOST])
     more = f" and {len(topics) - _NAMED_AT_MOST} more" if len(topics) > _NAMED_AT_MOST else ""
     return f"the topics are {named}{more}"
