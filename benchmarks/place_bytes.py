@@ -3,8 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/place_bytes.py
 
 Packets of two split logs, of the five runs of Wean Hall and of two simulated fleets with cameras (seeds 101 and 105; it
-needs a GL library, or FLEETS that `fcslam tools simulate` recorded), none of which the weights of
-`src/fcslam/wire/predictors` were fitted to.
+needs a GL library, or FLEETS that `fcslam tools simulate` recorded).
 "Plain" is the same packet with 2 bytes a range, 2 a coordinate and 32 a descriptor; "deflated" is that with each of
 the three fields deflated by zlib at level 9. "A place with 300 descriptors" is every place that has as many, cut to
 its 300 strongest. Times are processor time of whole packets with all their checks.

@@ -258,7 +258,7 @@ def test_reading_is_the_inverse_of_writing(begun, tmp_path):
         assert again.tracks[name].T_keyscan_base.tobytes() == track.T_keyscan_base.tobytes()
 
 
-GOLDEN = Path(__file__).parent / "golden" / "mission_7.fcslam"
+GOLDEN = Path(__file__).parent / "golden" / "mission_8.fcslam"
 
 
 def test_the_golden_mission_means_what_it_says():
@@ -279,13 +279,13 @@ def test_a_mission_is_mapped_again_with_its_edits():
     assert b"Room 1" in run.map_files["map_areas.geojson"]
 
 
-@pytest.mark.parametrize("version", [6, 8])
+@pytest.mark.parametrize("version", [7, 9])
 def test_a_mission_file_of_another_version_is_refused(tmp_path, version):
     other = tmp_path / "mission.fcslam"
     shutil.copy(GOLDEN, other)
     with closing(sqlite3.connect(other)) as connection:
         connection.execute(f"PRAGMA user_version={version}")
-    with pytest.raises(SourceError, match=f"a file of version {version}; this fcslam reads version 7"):
+    with pytest.raises(SourceError, match=f"a file of version {version}; this fcslam reads version 8"):
         read_mission(other)
 
 

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from fcslam.errors import PacketError
 from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.limits import VERSION
 from fcslam.wire.packets import decode, encode, read_label
 from tests.wire.examples import EXAMPLES, same
 
@@ -96,5 +97,5 @@ def values(field):
 @settings(max_examples=300)
 @given(messages(pb.Packet.DESCRIPTOR), st.booleans())
 def test_any_protobuf_message(message, known_version):
-    message.version = 1 if known_version else message.version
+    message.version = VERSION if known_version else message.version
     receive(message.SerializeToString())

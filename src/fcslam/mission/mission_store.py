@@ -34,7 +34,7 @@ APPLIED = "applied"
 """A fact: how many packets took effect."""
 CONFIG = "config"
 """A fact: the mission's configuration."""
-VERSION = 7
+VERSION = 8
 """Version of the schema and of the packets."""
 MOST_PACKETS = 2**53
 """No mission has as many."""

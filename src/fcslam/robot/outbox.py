@@ -25,7 +25,7 @@ from fcslam.wire.packets import encode, readdress
 PLACES_SHARE = 0.75
 """Share of the outbox up to which places are accepted; the rest is for packets that the map cannot do without."""
 
-_VERSION = 2
+_VERSION = 3
 """Version of the schema and of the packets."""
 _SCHEMA = """
 CREATE TABLE robot (name TEXT NOT NULL, agent TEXT NOT NULL);

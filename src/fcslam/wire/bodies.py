@@ -170,8 +170,7 @@ def _round_information(body: Measurement) -> Measurement:
 
 def _write_place(place: Place) -> pb.Place:
     codes, order = _in_order(place)
-    descriptors = pack_descriptors(place.descriptors[order], codes, place.channel)
-    return pb.Place(**_described(place, codes), descriptors=descriptors)
+    return pb.Place(**_described(place, codes), descriptors=pack_descriptors(place.descriptors[order]))
 
 
 def _write_word_place(place: WordPlace) -> pb.WordPlace:
@@ -210,24 +209,24 @@ def _round_word_place(place: WordPlace) -> WordPlace:
 
 
 def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
-    described, channel, codes = _read_described(message, envelope, "place")
-    return Place(*described, frozen(unpack_descriptors(message.descriptors, codes, channel), np.uint8))
+    described = _read_described(message, envelope, "place")
+    return Place(*described, frozen(unpack_descriptors(message.descriptors, message.count), np.uint8))
 
 
 def _read_word_place(message: pb.WordPlace, envelope: pb.Packet) -> WordPlace:
-    described, _, _ = _read_described(message, envelope, "word place")
+    described = _read_described(message, envelope, "word place")
     return WordPlace(*described, frozen(unpack_words(message.words, message.count), np.uint16))
 
 
 def _read_described(
     message: pb.Place | pb.WordPlace, envelope: pb.Packet, what: str
-) -> tuple[tuple[KeyscanId, Channel, str, int, int, NDArray[np.float32]], Channel, KeypointCodes]:
-    """The fields that both kinds of places have, the channel, and the keypoints as they are sent."""
+) -> tuple[KeyscanId, Channel, str, int, int, NDArray[np.float32]]:
+    """The fields that both kinds of places have."""
     _check_at_most(message.count, limits.MAXIMUM_KEYPOINTS, f"{what}: keypoints")
     channel = read_channel(message.channel)
     codes = unpack_keypoints(message.keypoints, message.count, limits.KEYPOINT_AXES[channel])
     number, keypoints = KeyscanId(envelope.robot, message.number), dequantise_keypoints(codes)
-    return (number, channel, message.detector_version, message.first, message.last, keypoints), channel, codes
+    return number, channel, message.detector_version, message.first, message.last, keypoints
 
 
 def _write_map_tile(tile: MapTile) -> pb.MapTile:
@@ -354,21 +353,6 @@ def _same(body: Any) -> Any:
     return body
 
 
-def _hello_version(hello: Hello) -> int:
-    floored = limits.FLOOR_VERSION if hello.floor else limits.PROTOCOL_VERSION
-    return limits.WORDS_VERSION if hello.vocabularies else floored
-
-
-def _keyscan_version(keyscan: Keyscan) -> int:
-    if not len(keyscan.ranges_m):
-        return limits.WORDS_VERSION
-    return limits.PROTOCOL_VERSION if keyscan.sweep is None else limits.SWEEP_VERSION
-
-
-def _place_version(place: Place) -> int:
-    return limits.CAMERA_VERSION if place.channel is Channel.CAMERA else limits.PROTOCOL_VERSION
-
-
 def _always(number: int) -> Callable[[Any], int]:
     return lambda _: number
 
@@ -382,7 +366,6 @@ _KEYPOINT_BYTES = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values())
 _RANGES = _for_each(limits.BYTES_PER_RANGE, limits.MAXIMUM_BEAMS)
 _DESCRIBED = _for_each(_KEYPOINT_BYTES + CODE_BYTES, limits.MAXIMUM_KEYPOINTS)
 _IN_WORDS = _for_each(_KEYPOINT_BYTES + limits.BYTES_PER_WORD, limits.MAXIMUM_KEYPOINTS)
-_WORDS, _TAG, _FIX = map(_always, (limits.WORDS_VERSION, limits.TAG_VERSION, limits.FIX_VERSION))
 
 
 class Codec(NamedTuple):
@@ -393,21 +376,19 @@ class Codec(NamedTuple):
     read: Callable[[Any, pb.Packet], Any]
     round: Callable[[Any], Any] = _same
     """Return a record as it is after writing and reading, without doing either; most kinds keep every number."""
-    version: Callable[[Any], int] = _always(limits.PROTOCOL_VERSION)
-    """Version of the packet of a record."""
     unpacked_bytes: Callable[[Any], int] = _always(0)
     """Bytes of the streams of a message, unpacked, by its counts."""
 
 
 CODECS = {
-    PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello, version=_hello_version),
-    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _same, _keyscan_version, _RANGES),
+    PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
+    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, unpacked_bytes=_RANGES),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, _place_version, _DESCRIBED),
-    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place, _WORDS, _IN_WORDS),
-    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, _same, _WORDS, _always(limits.BYTES_PER_TILE)),
-    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information, _TAG),
-    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix, version=_FIX),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, _DESCRIBED),
+    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place, _IN_WORDS),
+    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, unpacked_bytes=_always(limits.BYTES_PER_TILE)),
+    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information),
+    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

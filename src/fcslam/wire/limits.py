@@ -1,21 +1,9 @@
-"""All limits of the format, versions 2 to 9. Packets beyond a limit are neither written nor read."""
+"""All limits of the format. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
-PROTOCOL_VERSION = 2
-FLOOR_VERSION = 3
-"""Version of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
-WORDS_VERSION = 4
-"""Version of packets that only a robot with words in place of descriptors sends."""
-SWEEP_VERSION = 6
-"""Version of a keyscan whose beams were measured at different times."""
-TAG_VERSION = 7
-"""Version of a tag sighting."""
-FIX_VERSION = 8
-"""Version of a fix of satellite navigation."""
-CAMERA_VERSION = 9
-"""Version of a place of the camera: the weights that its descriptors are coded by fit the bundled network."""
-VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, SWEEP_VERSION, TAG_VERSION, FIX_VERSION, CAMERA_VERSION)
+VERSION = 10
+"""The only version that is written and read; a change of the schema, a unit or a limit makes another one."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""

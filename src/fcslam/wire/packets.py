@@ -33,7 +33,7 @@ def encode(packet: Packet) -> bytes:
     kind, codec = CODEC_OF_TYPE[type(packet.body)]
     body: dict[str, Any] = {kind: codec.write(packet.body)}
     message = pb.Packet(
-        version=codec.version(packet.body),
+        version=limits.VERSION,
         robot=packet.robot,
         epoch=packet.epoch,
         sequence=packet.sequence,
@@ -77,15 +77,13 @@ def decode(data: bytes) -> Packet:
     """Decode a packet and check everything that does not depend on other packets.
 
     Raises:
-        PacketError: ``data`` is not a valid packet of a known version; the message says why.
+        PacketError: ``data`` is not a valid packet of this version; the message says why.
     """
     message, kind = _parse(data)
     codec = CODECS[kind]
     body = codec.read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
     check(packet)
-    if message.version != (version := codec.version(body)):
-        raise PacketError(f"version {message.version} of a packet of version {version}")
     return packet
 
 
@@ -93,7 +91,7 @@ def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
     """The same packet with another epoch and sequence number.
 
     Raises:
-        PacketError: ``data`` is not a packet of a known version; the message says why.
+        PacketError: ``data`` is not a packet of this version; the message says why.
     """
     message, _ = _parse(data)
     message.epoch, message.sequence = epoch, sequence
@@ -104,7 +102,7 @@ def read_label(data: bytes) -> Label:
     """Robot, kind and channel of a packet; its body is not decoded or checked.
 
     Raises:
-        PacketError: ``data`` is not a packet of a known version, or a place of an unknown channel.
+        PacketError: ``data`` is not a packet of this version, or a place of an unknown channel.
     """
     message, kind = _parse(data)
     check_name(message.robot, "robot")
@@ -134,7 +132,7 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
     except (DecodeError, PacketError):
         return None
     numbered = message.epoch <= limits.MAXIMUM_EPOCH and message.sequence <= limits.MAXIMUM_SEQUENCE
-    known = message.version in limits.VERSIONS and numbered
+    known = message.version == limits.VERSION and numbered
     return (message.robot, message.epoch, message.sequence) if known else None
 
 
@@ -146,9 +144,8 @@ def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
         message.ParseFromString(data)
     except DecodeError as error:
         raise PacketError("not a protobuf message of a packet") from error
-    if message.version not in limits.VERSIONS:
-        known = f"{limits.VERSIONS[0]} to {limits.VERSIONS[-1]}"
-        raise PacketError(f"version {message.version} is unknown, this side speaks versions {known}")
+    if message.version != limits.VERSION:
+        raise PacketError(f"version {message.version} is unknown, this side speaks version {limits.VERSION}")
     message.DiscardUnknownFields()
     if message.ByteSize() != len(data):
         raise PacketError("unknown, repeated or overlong fields")

@@ -29,7 +29,7 @@ from fcslam.service.http import operations
 from fcslam.service.http import prometheus as measures
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.batches import read_batch
-from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, VERSION
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER, ScriptedMatcher
@@ -138,7 +138,7 @@ def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
 
 
 def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkeypatch):
-    """A place of 2,048 keypoints at one point, whose descriptors are what is most to be expected: a few bytes."""
+    """Places that announce 2,048 keypoints in a few bytes."""
 
     def unread(*_):
         raise AssertionError("it is unpacked")
@@ -146,7 +146,7 @@ def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkey
     def batch(first, count):
         numbers = range(first, first + count)
         body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
-        return [pb.Packet(version=2, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
+        return [pb.Packet(version=VERSION, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
 
     assert sum(map(len, batch(0, 100))) < 4000
     monkeypatch.setattr(intake, "decode", unread)
