@@ -261,6 +261,11 @@ class MissionStore:
                 if is_news(None if known is None else known.correction, correction.correction):
                     _write_correction(database, correction)
 
+    def received_s(self, count: int) -> float:
+        """When the oldest of the ``count`` newest packets arrived, seconds since 1970."""
+        newest = "SELECT received FROM packets ORDER BY arrival DESC LIMIT 1 OFFSET ?"
+        return float(self._database.rows(newest, (count - 1,))[0][0])
+
     def applied(self) -> int:
         """How many packets took effect, before restarts too."""
         return int(self.fact(APPLIED) or 0)

@@ -40,16 +40,17 @@ class OpenMission:
         folder: MissionFolder,
         store: MissionStore,
         intake: Intake,
-        find_worker: Callable[[], RunningWorker],
+        worker: RunningWorker | None,
         wall_clock: Callable[[], float],
     ) -> None:
         self.folder, self.store, self.intake = folder, store, intake
-        self._find_worker, self._wall_clock = find_worker, wall_clock
+        self._worker, self._wall_clock = worker, wall_clock
 
     @property
     def worker(self) -> RunningWorker:
         """The mission's worker as it is now."""
-        return self._find_worker()
+        assert self._worker is not None
+        return self._worker
 
     @property
     def name(self) -> str:
@@ -217,8 +218,7 @@ class Missions:
         except BaseException:
             store.close()
             raise
-        worker = self._launch(folder)
-        mission = OpenMission(folder, store, intake, lambda: worker, self._wall_clock)
+        mission = OpenMission(folder, store, intake, self._launch(folder), self._wall_clock)
         try:
             with translate_errors(self._open_file):
                 write_file(self._open_file, name + "\n")

@@ -77,7 +77,7 @@ class Desk:
     def __init__(self, root: Path, tokens: Sequence[TokenEntry] | None = tuple(ENTRIES), **options: object) -> None:
         """``options`` of uvicorn."""
         self.now = 0.0
-        missions = Missions(root, CloudConfig(), lambda: self.now, lambda: 1e9, InlineWorker)
+        missions = Missions(root, CloudConfig(), lambda: self.now, lambda: 1e9 + self.now, InlineWorker)
         self.state = ServiceState(
             missions,
             Authenticator(tokens),

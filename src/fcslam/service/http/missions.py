@@ -2,14 +2,15 @@
 
 import shutil
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
-from fastapi.responses import StreamingResponse
+from fastapi.responses import FileResponse
 from pydantic import Field
+from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.config import StrictModel
@@ -27,7 +28,6 @@ from fcslam.storage.database import translate_errors
 FILE = "application/vnd.sqlite3"
 """Media type of an exported mission."""
 ZIP = "application/zip"
-CHUNK_BYTES = 2**20
 LONGEST_IMPORT_BYTES = 64 * 2**30
 
 RunNumber = Annotated[int, PathParameter(ge=1, le=2**31 - 1, description="that `POST /finalize` returned")]
@@ -92,12 +92,12 @@ def mission_router(state: ServiceState) -> APIRouter:
         return _missions(state)
 
     @router.get("/missions/{name}/export", dependencies=as_admin, **file_of(FILE, refused=(400, 404, 507)))
-    async def export_mission(name: Name) -> StreamingResponse:
+    async def export_mission(name: Name) -> FileResponse:
         """A mission as one file."""
         return await _download(state, f"{name}.sqlite", FILE, lambda path: state.missions.export(name, path))
 
     @router.get("/missions/{name}/runs/{number}.zip", dependencies=as_admin, **file_of(ZIP, refused=(400, 404, 507)))
-    async def download_run(name: Name, number: RunNumber) -> StreamingResponse:
+    async def download_run(name: Name, number: RunNumber) -> FileResponse:
         """A result as one file: the run folder in a ZIP archive."""
         run = state.missions.result(name, number) if name in state.missions.names else None
         if run is None:
@@ -113,9 +113,7 @@ def _pack(folder: Path, archive: Path) -> None:
         shutil.make_archive(str(archive.with_suffix("")), "zip", folder)
 
 
-async def _download(
-    state: ServiceState, name: str, media_type: str, write: Callable[[Path], None]
-) -> StreamingResponse:
+async def _download(state: ServiceState, name: str, media_type: str, write: Callable[[Path], None]) -> FileResponse:
     """Send a file that ``write`` makes in a folder of its own, which is removed afterwards."""
     folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=EXPORT)
     path = Path(folder.name) / name
@@ -124,8 +122,7 @@ async def _download(
     except BaseException:
         folder.cleanup()
         raise
-    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return StreamingResponse(_content(path, folder), media_type=media_type, headers=headers)
+    return FileResponse(path, media_type=media_type, filename=name, background=BackgroundTask(folder.cleanup))
 
 
 def _missions(state: ServiceState) -> MissionList:
@@ -141,12 +138,3 @@ async def _receive(request: Request, path: Path) -> None:
                 raise HTTPException(413, f"the file is over {LONGEST_IMPORT_BYTES} bytes")
             with translate_errors(path):
                 await run_in_threadpool(file.write, chunk)
-
-
-async def _content(path: Path, folder: "tempfile.TemporaryDirectory[str]") -> AsyncIterator[bytes]:
-    try:
-        with path.open("rb") as file:
-            while chunk := await run_in_threadpool(file.read, CHUNK_BYTES):
-                yield chunk
-    finally:
-        folder.cleanup()

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import cast
@@ -18,15 +18,13 @@ from fcslam.wire.packets import read_label
 
 _AT_ONCE = 10_000
 """Packets counted in one query of the store."""
-_MOST_NOTED = 100_000
-"""Most arrivals whose times are kept; later ones are not noted while these wait."""
 
 
 class ServiceMetrics:
     """Counts replies and refusals; reads everything else from the mission on request."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self, wall_clock: Callable[[], float] = time.time) -> None:
+        self._wall_clock = wall_clock
         self._registry = CollectorRegistry()
         self._answered = Counter(
             "fcslam_answer_bytes",
@@ -36,7 +34,6 @@ class ServiceMetrics:
         )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
         self._uplink = _Uplink()
-        self._arrivals = _Arrivals()
 
     def answer(self, robot: str, batch: bytes) -> None:
         """Count the bytes of a reply."""
@@ -46,10 +43,6 @@ class ServiceMetrics:
     def answer_map(self, robot: str, size: int) -> None:
         """Count the bytes of tiles of the joint map."""
         self._answered.labels(robot, "joint_map").inc(size)
-
-    def arrived(self, mission: OpenMission) -> None:
-        """Note when packets of a mission arrived."""
-        self._arrivals.add(mission.folder.name, mission.intake.ready_count(), self._clock())
 
     def refuse(self, status: int) -> None:
         """Count a refused request."""
@@ -62,8 +55,7 @@ class ServiceMetrics:
 
     def _gauges(self, mission: OpenMission) -> Iterator[Metric]:
         ready, applied, worker = mission.intake.ready_count(), mission.store.applied(), mission.worker
-        self.arrived(mission)  # packets from before this start, if nobody noted them
-        age_s = self._arrivals.age_s(applied, self._clock())
+        age_s = self._wall_clock() - mission.store.received_s(ready - applied) if ready > applied else 0.0
         for name, text, value in (
             ("packets_stored", "Packets of the open mission", ready),
             ("packets_queued", "Packets without effect so far", ready - applied),
@@ -73,33 +65,6 @@ class ServiceMetrics:
             ("worker_up", "Whether the worker runs", float(worker.pid is not None)),
         ):
             yield GaugeMetricFamily(f"fcslam_{name}", text, value)
-
-
-class _Arrivals:
-    """When packets arrived that have no effect yet."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._mission = ""
-        self._noted: deque[tuple[int, float]] = deque()
-        """How many packets there were from when on; the oldest first."""
-
-    def add(self, mission: str, packets: int, now_s: float) -> None:
-        """Note how many packets a mission has now."""
-        with self._lock:
-            if mission != self._mission:
-                self._mission = mission
-                self._noted.clear()
-            is_new = not self._noted or packets > self._noted[-1][0]
-            if is_new and len(self._noted) < _MOST_NOTED:
-                self._noted.append((packets, now_s))
-
-    def age_s(self, applied: int, now_s: float) -> float:
-        """Age of the oldest packet after the first ``applied`` ones; 0 if all are applied."""
-        with self._lock:
-            while self._noted and self._noted[0][0] <= applied:
-                self._noted.popleft()
-            return now_s - self._noted[0][1] if self._noted else 0.0
 
 
 def _stages(mission: OpenMission) -> Iterator[Metric]:

@@ -77,7 +77,6 @@ def robot_router(state: ServiceState) -> APIRouter:
         reply = await run_in_threadpool(take)
         mission.worker.notify()
         state.measures.answer(robot, reply.batch)
-        state.measures.arrived(mission)
         headers = {REFUSED_HEADER: str(reply.refused), REMOVED_HEADER: str(int(reply.removed))}
         return Response(reply.batch, media_type=MEDIA_TYPE, headers=headers)
 

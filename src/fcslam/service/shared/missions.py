@@ -53,9 +53,11 @@ class SharedMission(OpenMission):
         self._number, self._server, self._instance = number, server, instance
         self._fetching = threading.Lock()
         self._joint_at_s = -math.inf
-        super().__init__(folder, store, intake, self._find_worker, time.time)
+        super().__init__(folder, store, intake, None, time.time)
 
-    def _find_worker(self) -> RunningWorker:
+    @property
+    def worker(self) -> RunningWorker:
+        """As in ``OpenMission``; it may be on another instance."""
         here = self._instance.worker(self._number)
         if here is not None:
             return here
