@@ -4,8 +4,8 @@ import pytest
 
 from fcslam.errors import EvaluationError
 from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, write_rows
-from fcslam.service import learning_rounds
-from fcslam.service.learning_rounds import MOST_ROUNDS, read_rounds
+from fcslam.service import summaries
+from fcslam.service.summaries import MOST_ROUNDS, read_rounds
 
 
 def test_the_table_of_a_training_is_read(tmp_path):
@@ -13,7 +13,7 @@ def test_the_table_of_a_training_is_read(tmp_path):
         1, "light-a", ("anna", "bob"), {"cleo": "too late"}, {"triplet": 0.5}, {"mma_3px": 0.25}, 0.4, released=True
     )
     second = RoundReport(2, "light-b", ("bob",), losses={"triplet": float("nan")})
-    assert learning_rounds.ROUNDS_FILE == ROUNDS_FILE
+    assert summaries.ROUNDS_FILE == ROUNDS_FILE
     write_rows(tmp_path / ROUNDS_FILE, [first.row(), second.row()])
     one, two = read_rounds(tmp_path)
     assert (one.round, one.version, one.released, one.robots) == (1, "light-a", True, ["anna", "bob"])

@@ -35,8 +35,7 @@ from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.missions import SharedMissions
 from fcslam.service.shared.registry import KnownMission
 from fcslam.service.shared.schema import prepare
-from fcslam.service.shared.standby import StandbyWorkers
-from fcslam.service.supervisor import WORKER, RunningWorker, Supervisor
+from fcslam.service.supervisor import WORKER, RunningWorker, StandbyWorkers, Supervisor
 from fcslam.storage.postgres import Postgres, is_server, take_password
 from fcslam.wire.http_transport import is_loopback
 

@@ -9,6 +9,7 @@ import hashlib
 import logging
 import ssl
 import threading
+import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from functools import cache
@@ -30,7 +31,7 @@ CONNECT_S: Final = 10.0
 ANSWER_S: Final = 5.0
 """Longest wait for a scheduler that answered before."""
 CHECK_S: Final = 120.0
-"""Longest wait for the check of a worker, which compiles its code first."""
+"""Longest wait for the first check of workers, which compile their code first."""
 LOOK_EVERY_S: Final = 1.0
 """Between two looks at which workers there are, and for a scheduler that went away."""
 
@@ -55,10 +56,15 @@ class DaskCluster:
         """By address, of the workers that passed the check."""
         self._refused: set[str] = set()
         """Addresses of workers that did not."""
+        self._asked: dict[str, Any] = {}
+        """Answers of workers that are checked now, by address."""
         self._is_gone = False
         self._ending = threading.Event()
         try:
-            refusals = self._look()
+            refusals, until = self._look(), time.monotonic() + CHECK_S
+            while self._asked and time.monotonic() < until:
+                time.sleep(0.05)
+                refusals += self._look()
             if must_connect and refusals:
                 raise InputError(f"{address}: worker {refusals[0]}")
             if must_connect and not self._executors:
@@ -130,12 +136,14 @@ class DaskCluster:
         names = {address: str(about["name"]) for address, about in identity["workers"].items()}
         self._refused &= names.keys()
         self._executors = {address: worker for address, worker in self._executors.items() if address in names}
-        new = [address for address in names if address not in self._executors and address not in self._refused]
+        new = names.keys() - self._executors.keys() - self._refused - self._asked.keys()
         # Not pure: Dask would look for a result of the same arguments, and hash all of them.
-        asked = {address: client.submit(identify, workers=[address], pure=False) for address in new}
+        self._asked = {address: answer for address, answer in self._asked.items() if address in names} | {
+            address: client.submit(identify, workers=[address], pure=False) for address in new
+        }
         refusals = []
-        for address, answer in asked.items():
-            refusal = _refusal(answer)
+        for address in [address for address, answer in self._asked.items() if answer.done()]:
+            refusal = _refusal(self._asked.pop(address))
             if refusal is None:
                 worker = client.get_executor(workers=[address], pure=False)
                 self._executors = {**self._executors, address: worker}
@@ -157,7 +165,7 @@ class DaskCluster:
         self._client.loop.asyncio_loop.set_exception_handler(_note)
 
     def _disconnect(self) -> None:
-        self._executors = {}
+        self._executors, self._asked = {}, {}
         client, self._client = self._client, None
         if client is not None:
             try:
@@ -170,7 +178,7 @@ def _refusal(answer: Any) -> str | None:
     """Why a worker may not verify closures, by its answer to ``identify``; None: it may."""
     here = identify()
     try:
-        there = CodeIdentity(*answer.result(timeout=CHECK_S))
+        there = CodeIdentity(*answer.result())
     except Exception as error:
         return f"cannot verify closures ({_text(error)}); install fcslam {here.version} there"
     if there[:2] != here[:2]:

@@ -18,7 +18,7 @@ from fcslam.runs.folder import identity
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.events import EventStream
-from fcslam.service.http.local_names import LocalNames
+from fcslam.service.http.middleware import LocalNames
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.viewed_mission import ViewedMission
 

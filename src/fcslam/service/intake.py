@@ -13,7 +13,6 @@ from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, sessio
 from fcslam.errors import FcslamError, PacketError
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import Channel, DetectorFile, Place, WordPlace
-from fcslam.service.token_buckets import TokenBuckets
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import UPLINK, PacketKind
@@ -72,6 +71,28 @@ class SessionState(NamedTuple):
     epoch: int
     next: int
     """Number of the first packet that is missing."""
+
+
+class TokenBuckets:
+    """How much each of several clients may do on average, and how much at once. Any thread may call."""
+
+    def __init__(self, clock: Callable[[], float], rate: float, burst: float) -> None:
+        """``rate``: tokens per second that fill each bucket; ``burst``: those in a full one, as at first."""
+        self._clock, self._rate, self._burst = clock, rate, burst
+        self._level: dict[str, tuple[float, float]] = {}
+        """Level of each bucket and its time."""
+        self._lock = threading.Lock()
+
+    def wait_s(self, name: str, cost: float) -> float:
+        """Take ``cost`` tokens; if there are too few, how long to wait, and none is taken."""
+        with self._lock:
+            now = self._clock()
+            level, then = self._level.get(name, (self._burst, now))
+            level = min(self._burst, level + (now - then) * self._rate) - cost
+            if level < 0.0:
+                return -level / self._rate
+            self._level[name] = level, now
+            return 0.0
 
 
 class Agents:

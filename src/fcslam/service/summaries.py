@@ -1,5 +1,6 @@
 """A viewed mission as the page and the REST interface show it: summaries of the run folder and of the store."""
 
+import csv
 import json
 import math
 import shutil
@@ -8,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
@@ -26,6 +27,7 @@ from fcslam.service.http.responses import (
     ClosureSummary,
     EditSummary,
     FleetSummary,
+    LearningRound,
     MapJoin,
     MapSeparation,
     MapSummary,
@@ -37,6 +39,11 @@ from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import open_file, read_bytes
 
 _Model = TypeVar("_Model", bound=StrictModel)
+ROUNDS_FILE: Final = "rounds.csv"
+"""In the output folder of `fcslam tools federate`."""
+MOST_ROUNDS: Final = 10_000
+_LOSS = "loss_"
+_MEASURES = ("repeatability", "mma_3px", "revisit_recall", "places_found")
 
 
 def fleet_summary(mission: ViewedMission, read_only: bool, may_edit: bool) -> FleetSummary:
@@ -223,6 +230,39 @@ def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
         header = image.read(HEADER_BYTES)
     area = area_of(stem, header, read_bytes(folder / f"{stem}.yaml", folder).decode(errors="replace"))
     return {"zoom": finest_zoom(area.resolution_m), "extent": area.extent_m}
+
+
+def read_rounds(folder: Path) -> list[LearningRound]:
+    """The rounds so far, oldest first; none before the first one is done.
+
+    Raises:
+        EvaluationError: the table is damaged.
+    """
+    path = folder / ROUNDS_FILE
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [_round(row) for row, _ in zip(csv.DictReader(file), range(MOST_ROUNDS), strict=False)]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise EvaluationError(f"{path}: is not a table of rounds ({error})") from error
+
+
+def _round(row: dict[str, str]) -> LearningRound:
+    numbers = {
+        name: float(text) for name, text in row.items() if (name.startswith(_LOSS) or name in _MEASURES) and text
+    }
+    known = {name: number for name, number in numbers.items() if math.isfinite(number)}
+    return LearningRound(
+        round=int(row["round"]),
+        version=row["version"],
+        released=row["released"] == "1",
+        robots=[robot for robot in row["robots"].split(" | ") if robot],
+        left_out=row["left_out"],
+        reason=row.get("reason") or "",
+        losses={name.removeprefix(_LOSS): number for name, number in known.items() if name.startswith(_LOSS)},
+        measures={name: number for name, number in known.items() if name in _MEASURES},
+    )
 
 
 def run_of(mission: ViewedMission) -> Run:

@@ -1,14 +1,16 @@
 """Keeps one process running, and starts it again when it dies."""
 
+import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from fcslam.cloud.stage_times import StageTotal
-from fcslam.processes import Child
+from fcslam.processes import Child, module_command
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0
 """Pause before another start; it doubles with each crash."""
@@ -22,6 +24,8 @@ STAGES = "stages"
 """The event by which a worker reports how often each of its stages ran, and how many seconds it took in all."""
 WORKER = "fcslam.service.worker"
 """The module of workers."""
+STANDBY_WORKERS = 2
+"""Standby workers that an instance keeps."""
 STANDBY = "--standby"
 """The only argument of a worker that gets its other arguments later, as a line of JSON on stdin."""
 
@@ -139,3 +143,37 @@ class Elsewhere(NamedTuple):
 
 RunningWorker = Supervisor | Elsewhere
 """A worker, wherever it runs."""
+
+
+class StandbyWorkers:
+    """Workers that have compiled their code before there is a mission for them. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._is_closed = False
+        self._waiting = [_new() for _ in range(STANDBY_WORKERS)]
+
+    def start(self, arguments: Sequence[str]) -> Child:
+        """Let a worker begin with these arguments; another one stands by in its place."""
+        with self._lock:
+            alive = [worker for worker in self._waiting if worker.pid is not None]
+            worker, self._waiting = (alive[0], alive[1:]) if alive else (_new(), [])
+            while len(self._waiting) < STANDBY_WORKERS and not self._is_closed:
+                self._waiting.append(_new())
+        worker.send(json.dumps(list(arguments)))
+        return worker
+
+    def close(self) -> None:
+        """End the standby workers."""
+        with self._lock:
+            self._is_closed = True
+            for worker in self._waiting:
+                worker.stop()
+            for worker in self._waiting:
+                deque(worker.events(), 0)
+                worker.wait()
+            self._waiting = []
+
+
+def _new() -> Child:
+    return Child(module_command(WORKER, STANDBY))

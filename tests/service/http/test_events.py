@@ -2,13 +2,13 @@
 
 import pytest
 
-from fcslam.service.http import event_stream
+from fcslam.service.http import viewers
 from tests.service.http.desk import ENTRIES, Desk
 
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    monkeypatch.setattr(event_stream, "BEAT_S", 0.0)
+    monkeypatch.setattr(viewers, "BEAT_S", 0.0)
     with Desk(tmp_path / "data") as opened:
         yield opened
 

@@ -5,7 +5,7 @@ import numpy as np
 from fcslam.robot import sender as sending
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import Sender
-from fcslam.service.token_buckets import TokenBuckets
+from fcslam.service.intake import TokenBuckets
 from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.keys import Credentials
 from fcslam.wire.packets import decode

@@ -5,7 +5,7 @@ import asyncio
 import httpx
 import pytest
 
-from fcslam.service.http.local_names import LocalNames, is_local_name
+from fcslam.service.http.middleware import LocalNames, is_local_name
 
 
 @pytest.mark.parametrize(

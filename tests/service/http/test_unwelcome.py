@@ -13,9 +13,9 @@ import pytest
 import uvicorn
 
 from fcslam.service.credentials import make_credentials
-from fcslam.service.http import protocol, unauthenticated
+from fcslam.service.http import middleware, protocol
+from fcslam.service.http.middleware import UnauthenticatedLimit
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
-from fcslam.service.http.unauthenticated import UnauthenticatedLimit
 from tests.service.http.desk import A
 
 API = "/api/v1"
@@ -47,7 +47,7 @@ def test_requests_without_a_token_are_limited_and_those_with_one_are_not(desk):
         began = time.monotonic()
         assert desk.ask("GET", f"{API}/robots/a/state", "a").status_code == 200
         assert connection.recv(1 << 20).count(b"HTTP/1.1") < many
-        assert time.monotonic() - began < many / unauthenticated.PER_S, "the robot does not wait for them"
+        assert time.monotonic() - began < many / middleware.PER_S, "the robot does not wait for them"
 
 
 def test_requests_without_a_token_wait_for_each_other_and_addresses_take_turns():
@@ -62,13 +62,13 @@ def test_requests_without_a_token_wait_for_each_other_and_addresses_take_turns()
         await asyncio.gather(*(gate({"type": "http", "client": who, "state": {}}, None, None) for who in many))
 
     asyncio.run(ask())
-    assert answered.index("robot") <= unauthenticated.AT_ONCE
-    assert answered.index("other") <= unauthenticated.AT_ONCE + 3
+    assert answered.index("robot") <= middleware.AT_ONCE
+    assert answered.index("other") <= middleware.AT_ONCE + 3
     assert len(answered) == 62
 
 
 def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
-    monkeypatch.setattr(unauthenticated, "MOST_WAITING", 2)
+    monkeypatch.setattr(middleware, "MOST_WAITING", 2)
     told = []
 
     async def app(scope, receive, send):
@@ -83,7 +83,7 @@ def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
         await asyncio.gather(*crowd)
 
     asyncio.run(ask())
-    assert told.count(429) == 30 - int(unauthenticated.AT_ONCE) - 2
+    assert told.count(429) == 30 - int(middleware.AT_ONCE) - 2
 
 
 @pytest.mark.slow

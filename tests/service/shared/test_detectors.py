@@ -3,7 +3,7 @@
 import threading
 
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.service.shared.detectors import SharedDetectors
+from fcslam.service.shared.files import SharedDetectors
 from fcslam.service.shared.instance import Hooks, Instance
 
 

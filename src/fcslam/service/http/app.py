@@ -9,26 +9,19 @@ from typing import Any
 
 from fastapi import APIRouter, FastAPI
 from starlette.responses import Response
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import fcslam
 from fcslam.service.http.decisions import decision_router
-from fcslam.service.http.event_stream import event_router
 from fcslam.service.http.joint_maps import joint_map_router
-from fcslam.service.http.limits import CONTENT
-from fcslam.service.http.local_names import LocalNames
+from fcslam.service.http.middleware import LocalNames, NamedMissions, UnauthenticatedLimit, Watch
 from fcslam.service.http.missions import mission_router
-from fcslam.service.http.named_missions import NamedMissions
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.robots import detector_router, robot_router
-from fcslam.service.http.state import ACTOR, ServiceState
-from fcslam.service.http.unauthenticated import UnauthenticatedLimit
-from fcslam.service.http.viewers import fleet_router, map_router
+from fcslam.service.http.state import ServiceState
+from fcslam.service.http.viewers import event_router, fleet_router, map_router
 
 PREFIX = "/api/v1"
-LONGEST_ACTION = 300
-"""Characters of a request in the audit log; anybody with a token chooses the rest."""
 VIEWER_ROUTERS = (fleet_router, map_router, event_router)
 """Routes of the page; they read."""
 ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, decision_router)
@@ -89,38 +82,8 @@ def create_app(
         app.include_router(router)
     if local_names:
         app.add_middleware(LocalNames)
-    app.add_middleware(_Watch, state=state)
+    app.add_middleware(Watch, state=state)
     app.add_middleware(UnauthenticatedLimit, is_known=state.is_known)
     if named is not None:
         app.add_middleware(NamedMissions, named=named)
     return app
-
-
-class _Watch:
-    """Counts answers that refuse, and writes the audit log.
-
-    Plain ASGI: a middleware of Starlette's own base runs a task for every request.
-    """
-
-    def __init__(self, app: ASGIApp, state: ServiceState) -> None:
-        self._app, self._state = app, state
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def watched(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                self._note(scope, message["status"])
-            await send(message)
-
-        await self._app(scope, receive, watched)
-
-    def _note(self, scope: Scope, status: int) -> None:
-        address = (scope.get("client") or ("",))[0]
-        if status >= 400:
-            self._state.measures.refuse(status)
-        if status == 401:
-            self._state.audit.refuse_login(address)
-        known = scope.get("state", {})
-        if ACTOR in known:
-            asked = f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
-            action = f"{scope['method']} {scope['path']}{asked}"[:LONGEST_ACTION]
-            self._state.audit.record(known[ACTOR], address, action, status, known.get(CONTENT, {}))

@@ -8,7 +8,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
 from fcslam.service.http.responses import content
-from fcslam.service.token_buckets import TokenBuckets
+from fcslam.service.intake import TokenBuckets
 from fcslam.wire.batches import LENGTH, read_batch
 from fcslam.wire.packets import unpacked_size
 

@@ -16,7 +16,7 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from fcslam.service.http.unauthenticated import WAITING
+from fcslam.service.http.middleware import WAITING
 
 MOST_CONNECTIONS = 4096
 """Connections without a request in progress; of more, one of the address that has most is closed."""

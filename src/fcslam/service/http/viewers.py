@@ -1,15 +1,16 @@
-"""Routes for viewers: the live run as numbers and as files."""
+"""Routes for viewers: the live run as numbers and as files, and events as they happen (server-sent events)."""
 
 import asyncio
 import hashlib
-from collections.abc import Iterator
+import json
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, Response, StreamingResponse
 from pydantic import Field, TypeAdapter
 from starlette.concurrency import run_in_threadpool
 
@@ -39,7 +40,6 @@ from fcslam.service.http.responses import (
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
 from fcslam.service.keyscans import live_scan, overlay_png
-from fcslam.service.learning_rounds import read_rounds
 from fcslam.service.map_layers import map_shapes, walls_of
 from fcslam.service.summaries import (
     all_edits,
@@ -50,6 +50,7 @@ from fcslam.service.summaries import (
     map_separations,
     map_summaries,
     newest_closures,
+    read_rounds,
     run_of,
     sessions_of,
     trajectories_zip,
@@ -57,6 +58,15 @@ from fcslam.service.summaries import (
 from fcslam.untrusted import check_file, read_bytes
 from fcslam.wire.limits import MAXIMUM_EPOCH
 
+EVENTS = "text/event-stream"
+VIEWERS = Role.VIEWER, Role.ADMIN
+BEAT_S = 5.0
+"""Something comes at least so often, so that a client notices a dead connection."""
+MOST_STREAMS = 200
+"""Streams at a time: each costs the process a look four times a second. A further one ends the oldest, whose client
+asks again if it is still there."""
+LOOK_S = 0.25
+"""How often a stream asks whether it may go on."""
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
 Index = Annotated[int, PathParameter(ge=0, le=MOST)]
@@ -82,9 +92,7 @@ _SHAPES = TypeAdapter(list[MapShape])
 
 def fleet_router(state: ViewerState) -> APIRouter:
     """Robots, closures, edits and learning."""
-    router = APIRouter(
-        tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503, 507)
-    )
+    router = APIRouter(tags=["fleet"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503, 507))
 
     @router.get("/fleet")
     def get_fleet(request: Request) -> FleetSummary:
@@ -155,9 +163,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
 
 def map_router(state: ViewerState) -> APIRouter:
     """The run's files."""
-    router = APIRouter(
-        tags=["maps"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503)
-    )
+    router = APIRouter(tags=["maps"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503))
 
     @router.get("/maps")
     def get_maps() -> list[MapSummary]:
@@ -261,6 +267,44 @@ def map_router(state: ViewerState) -> APIRouter:
         known = after if after <= len(poses) and digest == hashlib.sha256(poses[:after]).hexdigest() else 0
         headers = {"Fcslam-After": str(known), "Fcslam-Digest": hashlib.sha256(poses).hexdigest()}
         return Response(poses[known:], media_type=TEXT, headers=headers)
+
+    return router
+
+
+def event_router(state: ViewerState) -> APIRouter:
+    """One stream."""
+    router = APIRouter(tags=["viewers"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503))
+
+    streams: list[object] = []
+
+    async def lines(request: Request) -> AsyncIterator[str]:
+        mine = object()
+        streams.append(mine)
+        del streams[:-MOST_STREAMS]
+        loop, events = asyncio.get_running_loop(), state.events.watch()
+        said_s, following = loop.time(), asyncio.ensure_future(anext(events))
+        try:
+            while mine in streams and state.admits(request, *VIEWERS):
+                await asyncio.wait({following}, timeout=LOOK_S)
+                if following.done():
+                    event = following.result()
+                    said_s, following = loop.time(), asyncio.ensure_future(anext(events))
+                    yield f"event: {event.kind}\ndata: {json.dumps({'number': event.number})}\n\n"
+                elif loop.time() - said_s >= BEAT_S:
+                    said_s = loop.time()
+                    yield ": nothing new\n\n"
+        finally:
+            if mine in streams:
+                streams.remove(mine)
+            following.cancel()
+
+    @router.get("/events", **file_of(EVENTS, refused=()))
+    async def get_events(request: Request) -> StreamingResponse:
+        """``live``: there is a new live run; ``finalized``: a result was written. A comment comes at least every 5 s.
+
+        The stream ends when the service stops, or when the token is no longer valid.
+        """
+        return StreamingResponse(lines(request), media_type=EVENTS)
 
     return router
 

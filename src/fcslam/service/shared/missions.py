@@ -17,8 +17,7 @@ from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, check_words, locked, sweep
 from fcslam.service.shared.agents import RobotLimit, SharedAgents
-from fcslam.service.shared.detectors import SharedDetectors
-from fcslam.service.shared.files import JOINT, LIVE, RESULT, fetch_folder, fetched
+from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
 from fcslam.service.shared.instance import Hooks, Instance
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import KnownMission, Registry
