@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fcslam.cloud.fleet import Fleet
 from fcslam.maps import certificate
 from fcslam.maps.certificate import certify
 from fcslam.mission.mission import MissionConfig, run_mission
@@ -178,7 +179,7 @@ def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
 
 def counted(cloud, monkeypatch):
     """The packets that fleets apply from now on."""
-    fleet, applied = type(cloud.worker._host.fleet), []
+    fleet, applied = Fleet, []
     apply = fleet.apply
 
     def counting(self, packet):
@@ -303,7 +304,7 @@ def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_g
 def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkeypatch):
     packets = stream("a", POSES, start_s=0.0)
     cloud.put(packets)
-    fleet = type(cloud.worker._host.fleet)
+    fleet = Fleet
     apply = fleet.apply
 
     def fragile(self, packet):
@@ -356,7 +357,7 @@ def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch)
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(type(cloud.worker._host.fleet), "apply", hungry)
+        patched.setattr(Fleet, "apply", hungry)
         with pytest.raises(MemoryError):
             cloud.work()
     assert cloud.store.refusals("a") == []
@@ -372,7 +373,7 @@ def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_
     reference.store.refuse(packets[bad].robot, 0, packets[bad].sequence, "beforehand")
     expected = content(reference.finalize())
     reference.store.close()
-    fleet = type(cloud.worker._host.fleet)
+    fleet = Fleet
     apply = fleet.apply
 
     def hungry(self, packet):
@@ -396,7 +397,7 @@ def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_
 def test_workers_that_end_elsewhere_refuse_nothing(cloud, monkeypatch):
     """Killed at a packet, then at another one, and so on: no packet is to blame."""
     cloud.put(two_robots())
-    fleet, ends = type(cloud.worker._host.fleet), iter([20, 30, 20, 30, 40])
+    fleet, ends = Fleet, iter([20, 30, 20, 30, 40])
     apply, left = fleet.apply, [next(ends)]
 
     def fragile(self, packet):
