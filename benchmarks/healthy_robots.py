@@ -25,6 +25,7 @@ from pathlib import Path
 import common
 import floor_worlds
 import numpy as np
+from convert_logs import readable
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
@@ -245,7 +246,7 @@ def recorded(folder: Path) -> Iterator[tuple[str, str]]:
     for part, pattern in LOGS.items():
         for path in sorted((folder / part).glob(pattern)):
             try:
-                source = open_source(path)
+                source = open_source(readable(path))
                 lines = said_about(source, calibrated(source, LidarConfig()))
             except SourceError as error:
                 lines = [f"refused: {error}".replace(str(folder), "")]

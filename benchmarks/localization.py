@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import common
 import numpy as np
+from convert_logs import readable
 from relocalization import Drive, kidnap
 from strangers import CORRECTED, RAW
 from wean_hall import LOGS as WEAN_HALL
@@ -159,7 +160,7 @@ def part(folder: Path, log: str, work: Path) -> tuple:
 
 
 def wean_hall(folder: Path, work: Path) -> Iterable[tuple]:
-    recordings = [sources.open_source(folder / log) for log in WEAN_HALL]
+    recordings = [sources.open_source(readable(folder / log)) for log in WEAN_HALL]
     together = fcslam.map_recordings(recordings)
     for own in recordings:
         run, off = in_map_of_others(recordings, own, together, work)
@@ -188,14 +189,14 @@ def in_map_of_others(
 def strangers(folder: Path, logs: Sequence[str], mapped: str, work: Path) -> Iterable[tuple]:
     """Robots of other logs in the map of one."""
     try:
-        fcslam.map_recordings(folder / mapped, output=work / "other")
+        fcslam.map_recordings(readable(folder / mapped), output=work / "other")
         occupancy = read_map(work / "other")
     finally:
         shutil.rmtree(work / "other", ignore_errors=True)
     first = logs.index(mapped)
     for log in [logs[first - k] for k in range(1, STRANGERS + 1)]:
         try:
-            run, cpu_s = localized(Head(sources.open_source(folder / log), STRANGER_M), occupancy)
+            run, cpu_s = localized(Head(sources.open_source(readable(folder / log)), STRANGER_M), occupancy)
             yield log, mapped, run.metrics["scans"].value, run.metrics["fixes"].value, cpu_s
         except SourceError as error:
             print(error, flush=True)

@@ -29,6 +29,7 @@ from typing import Any
 import common
 import numpy as np
 import relocalization
+from convert_logs import readable
 from localization import BUILDINGS, SEEDS, WRONG_M, carry_away, in_map_of_others
 from numpy.typing import NDArray
 from wean_hall import LOGS as WEAN_HALL
@@ -100,7 +101,7 @@ def corrected(building: str, seed: int) -> Counts:
 def real_drives(work: Path) -> Iterator[tuple[str, Callable[[], Counts]]]:
     """Name of each real drive and what counts its poses."""
     folder = common.recordings(*common.slam_benchmark_files(), *WEAN_HALL)
-    groups = [[sources.open_source(folder / log) for log in WEAN_HALL]]
+    groups = [[sources.open_source(readable(folder / log)) for log in WEAN_HALL]]
     groups += [
         sources.split(sources.open_source(common.log_path(folder, log)), parts) for log, parts in common.SPLITS.items()
     ]

@@ -14,6 +14,7 @@ own map lies where the joint map has put it: walls of different colours lie on e
 import sys
 
 import common
+from convert_logs import readable
 from map_search import PAIR_COLUMNS, Together, map_together, pair_rows
 
 from fcslam.geometry import se2
@@ -26,7 +27,7 @@ def main() -> None:
     chosen = common.options(__doc__).parse_args()
     folder = common.recordings(*LOGS)
     report = common.Report(__file__, __doc__, chosen)
-    together = map_together([folder / log for log in LOGS])
+    together = map_together([readable(folder / log) for log in LOGS])
     pairs = pair_rows(together.runs, together.run)
     maps = len({trajectory.map_index for trajectory in together.run.trajectories.values()})
     report.say(f"{maps} map{'s' if maps > 1 else ''}, {together.cost.cpu_s:.1f} s of CPU.")

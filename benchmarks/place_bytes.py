@@ -18,6 +18,7 @@ from pathlib import Path
 
 import common
 import numpy as np
+from convert_logs import readable
 
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import PLACE_CHANNELS, Keyscan, Place
@@ -69,7 +70,7 @@ def recordings(folder: Path, fleets: Sequence[Path], place: Path) -> Iterator[tu
     """Names and robots; without ``fleets`` some are simulated into ``place``."""
     for name, robots in LOGS.items():
         yield name, split(open_source(common.log_path(folder, name)), robots)
-    yield "wean-hall", [open_source(folder / run) for run in WEAN_HALL]
+    yield "wean-hall", [open_source(readable(folder / run)) for run in WEAN_HALL]
     for seed in SEEDS if not fleets else ():
         common.run_fcslam("tools", "simulate", "--robots", 3, "--seed", seed, "--output", place / f"seed-{seed}")
     for fleet in fleets or sorted(place.iterdir()):

@@ -13,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 import common
+from convert_logs import readable
 
 from fcslam.runs import ClosureRow, Run, open_run
 
@@ -45,7 +46,7 @@ def main() -> None:
         for number, (group, logs) in enumerate(GROUPS.items()):
             for seed in chosen.seeds:
                 out = Path(place) / f"{number}-{seed}"
-                paths = [folder / log for log in logs]
+                paths = [readable(folder / log) for log in logs]
                 cost = common.run_fcslam("map", *paths, "--output", out, "--config", f"seed={seed}")
                 run = open_run(out)
                 rows.append((group, seed, *verdict(run, cost)))

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import common
 import numpy as np
+from convert_logs import readable
 from map_search import PAIR_COLUMNS, FloatArray, Placed, Plan, map_together, mean_at, pair_rows, search
 
 from fcslam.geometry import se2
@@ -114,7 +115,7 @@ def draw(plan: Plan, together: Run, reference: Plan, T_reference_map: FloatArray
 def main() -> None:
     chosen = common.options(__doc__).parse_args()
     folder = common.recordings(*LOGS, PICTURE)
-    logs = [folder / log for log in LOGS]
+    logs = [readable(folder / log) for log in LOGS]
     report = common.Report(__file__, __doc__, chosen)
     together, runs, plan, cost = map_together(logs)
     pairs = pair_rows(runs, together)

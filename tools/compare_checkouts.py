@@ -58,13 +58,13 @@ class Case:
     arguments: tuple[str, ...]
 
 
-def cases(data: Path, work: Path) -> Iterator[Case]:
-    """All cases; the fleet of the last two is recorded once, by BEFORE."""
+def cases(data: Path, work: Path, bags: Path) -> Iterator[Case]:
+    """All cases; ``bags`` are the runs of Wean Hall. The fleet with cameras is recorded once, by BEFORE."""
     logs = data / "lidar" / "slam-benchmark"
     for name in ("intel", "fr079", "mit-csail"):
         yield Case(name, ("map", f"{logs / name}.clf.xz", "--output", "{output}"))
     yield Case("intel-3", ("map", str(logs / "intel.clf.xz"), "--split", "3", "--output", "{output}"))
-    runs = [str(data / "lidar" / "wean-hall" / f"robotdata{number}.log.gz") for number in range(1, 6)]
+    runs = [str(bags / f"robotdata{number}.mcap") for number in range(1, 6)]
     yield Case("wean-hall", ("map", *runs, "--output", "{output}"))
     simulate = ("tools", "simulate", "--robots", "3", "--seed", "101", "--path-length", "40", "--output", "{output}")
     yield Case("simulate", simulate)
@@ -73,6 +73,15 @@ def cases(data: Path, work: Path) -> Iterator[Case]:
     robots = [str(data / "vision" / name) for name in ("kodak24", "sun_hays80")]
     federate = ("tools", "federate", "local", *robots, "--quick", "--config", "rounds=2", "--output", "{output}")
     yield Case("federated", federate)
+
+
+def converted(data: Path, checkout: Path, place: Path) -> Path:
+    """The runs of Wean Hall as bags, in ``place``."""
+    logs = sorted((data / "lidar" / "wean-hall").glob("*.log.gz"))
+    if not place.exists():
+        command = [sys.executable, checkout / "benchmarks" / "convert_logs.py", *logs, "-o", place]
+        subprocess.run(command, env={**os.environ, "PYTHONPATH": str(checkout / "src")}, check=True)
+    return place
 
 
 def run(case: Case, checkout: Path, place: Path) -> None:
@@ -127,8 +136,9 @@ def main() -> None:
         sys.exit("set FCSLAM_DATA to the folder of the recordings")
     work = chosen.work.resolve()
     shutil.rmtree(work / "after", ignore_errors=True)
-    different = 0
-    for case in cases(Path(os.environ["FCSLAM_DATA"]), work):
+    data, different = Path(os.environ["FCSLAM_DATA"]), 0
+    bags = converted(data, chosen.after.resolve(), work / "bags")
+    for case in cases(data, work, bags):
         if chosen.cases and case.name not in chosen.cases:
             continue
         run(case, chosen.before.resolve(), work / "before")

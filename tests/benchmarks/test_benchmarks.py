@@ -31,6 +31,7 @@ SHARED = (
     "subpixel_loss",
     "g2o_files",
     "floor_worlds",
+    "convert_logs",
 )
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 

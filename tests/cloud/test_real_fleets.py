@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.convert_logs import readable
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.sources import open_source
 
@@ -24,7 +25,7 @@ pytestmark = [
     ids=["mines", "wean hall"],
 )
 def test_runs_through_one_building_share_a_map(logs):
-    run = run_mission([open_source(DATA / log) for log in logs], MissionConfig())
+    run = run_mission([open_source(readable(DATA / log)) for log in logs], MissionConfig())
     assert {name: trajectory.map_index for name, trajectory in run.trajectories.items()} == dict.fromkeys(
         run.trajectories, 0
     )

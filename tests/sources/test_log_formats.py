@@ -1,7 +1,6 @@
 import bz2
 import gzip
 import lzma
-import math
 import tracemalloc
 
 import numpy as np
@@ -156,25 +155,6 @@ def test_the_parameter_says_where_the_laser_sits_if_the_poses_do_not(tmp_path):
     one_corrected = save(tmp_path / "corrected.log", [parameter, *corrected])
     for path in (same_pose_twice, one_corrected):
         assert open_source(path).survey().lasers[0].T_base_laser == (-0.04, 0.0, 0.0)
-
-
-def test_cmu_logs_are_read_in_metres(tmp_path):
-    lines = []
-    for step in range(4):
-        x, y, theta = 100.0 * step, 50.0, 0.5
-        laser = (x + 25 * math.cos(theta), y + 25 * math.sin(theta), theta)
-        lines.append(f"L {x} {y} {theta} {laser[0]:.6f} {laser[1]:.6f} {laser[2]} {' '.join(['250'] * 180)} {step}.5")
-        lines.append(f"O {x} {y} {theta} {step}.6")
-    source = open_source(save(tmp_path / "wean.txt", lines))
-    records = list(source.records())
-    laser = source.survey().lasers[0]
-    assert laser.T_base_laser == pytest.approx((0.25, 0.0, 0.0))
-    assert np.degrees(laser.angle_min_rad) == pytest.approx(-90)
-    np.testing.assert_allclose(records[2].T_odom_base, (1.0, 0.5, 0.5))
-    np.testing.assert_allclose(records[3].T_odom_base, (1.0, 0.5, 0.5))
-    np.testing.assert_allclose(records[2].ranges_m, 2.5)
-    assert [record.stamp for record in records[:2]] == [0.5, 0.6]
-    assert source.faults.counts.keys() <= {Fault.REPEATED_SCAN}, "the ranges are all alike"
 
 
 def test_scans_without_poses_take_that_of_the_odometry_before_them(tmp_path):

@@ -1,6 +1,5 @@
-"""Lines of text logs that other programs write: csm, raw scans, no times, decimal commas, unstated angles."""
+"""Lines of text logs that other programs write: raw scans, no times, decimal commas, unstated angles."""
 
-import json
 import math
 
 import numpy as np
@@ -14,74 +13,11 @@ from tests.sources.carmen_text import drive, flaser, odom, pose_at, save, scans_
 RANGES = tuple(round(1.0 + 0.1 * k, 3) for k in range(8))
 
 
-def csm(step, **fields):
-    content = {
-        "nrays": 8,
-        "min_theta": -1.4,
-        "max_theta": 1.4,
-        "readings": [*RANGES[:3], None, *RANGES[4:]],
-        "valid": [1, 1, 1, 0, 1, 1, 1, 1],
-        "odometry": pose_at(step),
-        "timestamp": [1000 + step, 250000],
-        "estimate": [None, None, None],
-        **fields,
-    }
-    return json.dumps({key: value for key, value in content.items() if value != "none"})
-
-
 def assert_like(scans, count, first=-1.4, last=1.4):
     assert len(scans) == count
     np.testing.assert_array_equal([scan.T_odom_base for scan in scans], [pose_at(k) for k in range(count)])
     angles = scans[0].laser.angles_rad()
     assert (angles[0], angles[-1]) == pytest.approx((first, last))
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {},
-        {"nrays": "none", "valid": "none"},
-        {"theta": [-1.4 + 0.4 * k for k in range(8)], "min_theta": "none", "max_theta": "none"},
-        {"readings": [*RANGES[:3], math.nan, *RANGES[4:]], "valid": [True] * 8},
-    ],
-)
-def test_logs_of_csm(tmp_path, fields):
-    source = open_source(save(tmp_path / "run.log", [csm(k, **fields) for k in range(12)]))
-    scans = scans_of(source)
-    assert_like(scans, 12)
-    np.testing.assert_allclose(scans[0].ranges_m, [*RANGES[:3], 0.0, *RANGES[4:]], rtol=1e-6)
-    assert [scan.stamp for scan in scans] == pytest.approx([1000.25 + k for k in range(12)])
-    assert not source.survey().faults
-
-
-def test_csm_angles_may_run_clockwise_and_times_may_lack(tmp_path):
-    turned = {"min_theta": 1.4, "max_theta": -1.4, "timestamp": "none", "valid": "none", "readings": list(RANGES)}
-    scans = scans_of(open_source(save(tmp_path / "run.json", [csm(k, **turned) for k in range(12)])))
-    assert_like(scans, 12)
-    np.testing.assert_allclose(scans[0].ranges_m, RANGES[::-1], rtol=1e-6)
-    assert [scan.stamp for scan in scans] == list(range(12))
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        (csm(0, readings=[1.0] * 7), "no laser scan in this csm log; broken lines skipped: 12"),
-        (csm(0, readings=["x"] * 8), "no laser scan in this csm log"),
-        ('{"readings": ' + "[" * 5000, "no laser scan in this csm log"),
-        (csm(0, min_theta=0.0, max_theta=0.0), "no laser scan in this csm log"),
-    ],
-)
-def test_csm_lines_that_are_no_scans(tmp_path, line, words):
-    with pytest.raises(SourceError) as caught:
-        open_source(save(tmp_path / "run.log", [line] * 12)).survey()
-    assert words in str(caught.value)
-
-
-@pytest.mark.parametrize("odometry", [None, [None] * 3])
-def test_csm_lines_without_odometry(tmp_path, odometry):
-    source = open_source(save(tmp_path / "run.log", [csm(k, odometry=odometry) for k in range(12)]))
-    assert "the odometry never changes in 12 poses" in source.survey().notes[0]
-    assert all(np.isnan(scan.T_odom_base).all() for scan in scans_of(source))
 
 
 def untimed(lines):
@@ -108,10 +44,6 @@ def test_decimal_commas(tmp_path):
         assert one.stamp == other.stamp
         np.testing.assert_array_equal(one.T_odom_base, other.T_odom_base)
         np.testing.assert_array_equal(one.ranges_m, other.ranges_m)
-    lines = [f"L {k},0 0,0 0,0 {k},0 0,0 0,0 100,5 200,5 {k},5" for k in range(3)]
-    assert scans_of(open_source(save(tmp_path / "cmu.log", lines)))[0].ranges_m == pytest.approx([1.005, 2.005])
-    lines = [line for k in range(3) for line in (f"Odometry {k},0 0,0 0,0", "Laser 3 1,5 2,5 3,5")]
-    assert scans_of(open_source(save(tmp_path / "duke.log", lines)))[0].ranges_m == pytest.approx([1.5, 2.5, 3.5])
 
 
 def raw(stamp, remissions=()):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.convert_logs import readable
 from fcslam.sources import Fault, open_source, split
 from tests.sources.carmen_text import scans_of
 
@@ -36,7 +37,7 @@ pytestmark = [
     ],
 )
 def test_logs_hold_what_their_description_says(log, shape, path_m, duration_s, laser_x_m):
-    source = open_source(DATA / log)
+    source = open_source(readable(DATA / log))
     survey = source.survey()
     assert (survey.scan_count, survey.lasers[0].beam_count) == shape
     assert survey.path_length_m == pytest.approx(path_m, rel=0.01)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.convert_logs import readable
 from fcslam.geometry import se2
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan
@@ -54,13 +55,13 @@ def points_in_odom(scan: LaserScan) -> np.ndarray:
 @pytest.mark.parametrize("log", LOGS + OLDER_LOGS)
 @pytest.mark.parametrize("turned", [mirrored, turned_about])
 def test_scans_lie_on_one_another_only_by_the_right_conventions(log: str, turned: Callable[[LaserScan], LaserScan]):
-    scans = scans_of(open_source(DATA / log))
+    scans = scans_of(open_source(readable(DATA / log)))
     assert blur(scans) < 0.85 * blur([turned(scan) for scan in scans])
 
 
 @pytest.mark.parametrize("log", LOGS[:2])
 def test_the_map_confirms_the_wheels(log):
-    source = open_source(DATA / log)
+    source = open_source(readable(DATA / log))
     (trajectory,) = run_mission([source], MissionConfig()).trajectories.values()
     repeated = RepeatedScans()
     odometry = np.array([scan.T_odom_base for scan in scans_of(source) if repeated.admits(scan)])

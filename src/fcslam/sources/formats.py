@@ -15,11 +15,7 @@ from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag, as_fleet
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
 from fcslam.sources.logs.carmen import CARMEN, RAW_CARMEN
-from fcslam.sources.logs.cmu import CMU
-from fcslam.sources.logs.csm import CSM
 from fcslam.sources.logs.dialect import Dialect
-from fcslam.sources.logs.duke import DUKE
-from fcslam.sources.logs.mines import MINES
 from fcslam.sources.logs.textlog import TextLog
 from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
@@ -62,7 +58,7 @@ def _text_format(dialect: Dialect) -> Format:
 
 
 FORMATS: tuple[Format, ...] = (
-    *map(_text_format, (RAW_CARMEN, CARMEN, CMU, DUKE, MINES, CSM)),
+    *map(_text_format, (RAW_CARMEN, CARMEN)),
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format(_BAG, is_bag, RosBag),
 )

@@ -1,1 +1,1 @@
-"""Text logs: CARMEN, CMU, DP-SLAM, CoreSLAM, csm."""
+"""Text logs of CARMEN."""
