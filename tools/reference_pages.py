@@ -33,7 +33,7 @@ the option `--help` of each command prints the same.
 """
 
 ROWS = ["| argument or option | default or range | meaning |", "|---|---|---|"]
-LONG = 25
+LONG = 8
 """Words from which on a row that several commands share is written once."""
 
 REST = """\
@@ -107,16 +107,14 @@ def sections(group: click.Group, context: click.Context) -> Iterator[str]:
 
 
 def section(command: click.Command, context: click.Context) -> str:
-    """One command: what it does, its usage, options and examples."""
+    """One command: what it does, its options and examples."""
     depth = "##" if context.parent is not None and context.parent.parent is None else "###"
-    usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
-    head = [f"{depth} {context.command_path}", "", *paragraphs(command.help or "")]
-    lines = [*head, "```text", f"Usage: {usage}", "```", ""]
+    lines = [f"{depth} {context.command_path}", "", *paragraphs(command.help or "")]
     rows = [row(parameter, context) for parameter in command.params if not getattr(parameter, "hidden", False)]
     if rows and not isinstance(command, click.Group):
         lines += [*ROWS, *rows, ""]
     examples = [line for line in (command.epilog or "").split("\n") if line.startswith("fcslam ")]
-    if examples:
+    if examples and not isinstance(command, click.Group):
         lines += ["```sh", *examples, "```", ""]
     return "\n".join(lines)
 

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.maps.ros_map import parse_ros_map
+from fcslam.maps.ros_map import read_ros_map
 from fcslam.records import FloatArray, frozen
-from fcslam.untrusted import MOST_TEXT_BYTES, read_bytes, read_text
+from fcslam.untrusted import read_bytes
 
 DXF_CELL_M: Final = 0.02
 """Side of a cell in which a DXF drawing is drawn."""
@@ -74,14 +73,7 @@ def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
 def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
     if scale is not None:
         raise SourceError(f"{path}: a ROS map has its own resolution; leave --plan-scale out")
-    try:
-        description = read_text(path, most=MOST_TEXT_BYTES)
-        content = parse_yaml(description)
-    except ValueError:
-        content = None
-    if not isinstance(content, dict) or not isinstance(content.get("image"), str):
-        raise SourceError(f"{path}: not a map for ROS map_server; it names no image")
-    plan = parse_ros_map(str(path), read_bytes(path.parent / content["image"]), description)
+    plan = read_ros_map(path)
     cells = np.where(plan.cells == Occupancy.OCCUPIED, plan.cells, Occupancy.FREE).astype(np.uint8)
     return OccupancyMap(cells, plan.resolution_m, plan.origin_xy)
 

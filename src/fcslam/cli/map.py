@@ -257,9 +257,9 @@ def _report(
     for line in _session_lines(run, earlier):
         typer.echo(line)
     for trajectory in run.trajectories.values():
-        jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
+        jumps = find_jumps(trajectory.stamps, trajectory.T_map_base)
         if jumps is not None:
-            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
+            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there")
     maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:
         typer.echo(f"{maps} maps" if joined else f"{maps} maps: one for each robot")

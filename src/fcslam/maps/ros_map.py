@@ -12,23 +12,26 @@ yaw in ``origin``) is drawn again along the axes.
 
 import math
 import re
+from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.config import one_line
-from fcslam.errors import EvaluationError
+from fcslam.config import one_line, parse_yaml
+from fcslam.errors import EvaluationError, SourceError
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, number_in, read_description
 from fcslam.records import frozen
-from fcslam.untrusted import check_image
+from fcslam.untrusted import check_image, read_bytes
 
 _MODES: Final = ("trinary", "scale", "raw")
 _PGM: Final = re.compile(rb"P([25])(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+([1-9]\d{0,4})\s")
 _MOST_PIXELS: Final = 1 << 28
 """Largest number of cells of a map that is turned: cells of 2.5 cm over 400 m."""
 _PERCENT: Final = 100
+LARGEST_FILE: Final = 1 << 30
+"""Larger map files are refused, bytes."""
 _ROUNDING: Final = 1e-6
 """Share of a cell by which a map that is turned by a right angle may seem wider."""
 
@@ -49,6 +52,36 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
         return _map(image, description)
     except (OSError, ValueError, cv2.error) as error:
         raise EvaluationError(f"{name}: not a map for ROS map_server: {one_line(str(error))}") from error
+
+
+def read_ros_map(path: Path) -> OccupancyMap:
+    """Read a map from its YAML file and the image that it names.
+
+    Raises:
+        SourceError: the files cannot be read as a map.
+    """
+    try:
+        text = read_bytes(path, most=LARGEST_FILE).decode("utf-8")
+        image = parse_yaml(text)["image"]
+        if not isinstance(image, str):
+            raise TypeError(image)
+        return parse_ros_map(str(path), read_bytes(_image_of(path, image), most=LARGEST_FILE), text)
+    except OSError as error:
+        raise SourceError(
+            f"{one_line(str(error.filename))}: cannot be read as a map ({error.strerror}); give a run folder or "
+            "a map.yaml"
+        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"{path}: names no image; give a run folder or the YAML file of a map") from error
+    except EvaluationError as error:
+        raise SourceError(str(error)) from error
+
+
+def _image_of(description: Path, image: str) -> Path:
+    """Where the image of a map lies; map_saver writes the whole path, which is wrong after the map was moved."""
+    named = description.parent / Path(image)
+    beside = description.parent / named.name
+    return beside if beside.is_file() and not named.is_file() else named
 
 
 def _map(image: bytes, description: str) -> OccupancyMap:

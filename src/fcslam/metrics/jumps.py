@@ -3,23 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
+LARGEST_SPEED_M_S = 3.0
+LARGEST_TURN_RAD_S = 4.0
+"""A faster step is a jump."""
 SLACK_M = 0.2
 """Length allowed to any step, metres: the optimized map corrects by small steps."""
 SLACK_RAD = 0.3
 """Turn allowed to any step, radians."""
-
-
-class JumpLimits(Settings):
-    """The fastest motion that a trajectory may have; a faster step is a jump."""
-
-    speed_m_s: float = Field(default=3.0, gt=0, description="largest speed [m/s]")
-    turn_rad_s: float = Field(default=4.0, gt=0, description="largest speed of a turn [rad/s]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +37,8 @@ class Jumps:
         return f"{jumps} of {size} within {self.within_s:.2f} s at {self.stamp:.3f} s"
 
 
-def find_jumps(stamps: FloatArray, poses: FloatArray, limits: JumpLimits) -> Jumps | None:
-    """The steps of a trajectory that exceed the limits of motion; None without any.
+def find_jumps(stamps: FloatArray, poses: FloatArray) -> Jumps | None:
+    """The steps of a trajectory that are faster than a robot; None without any.
 
     ``stamps`` (N,) in seconds are of a clock that may step back; ``poses`` (N, 3), metres and radians.
     """
@@ -54,8 +48,8 @@ def find_jumps(stamps: FloatArray, poses: FloatArray, limits: JumpLimits) -> Jum
     steps = se2.relative(poses)
     length_m, turn_rad = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
     excess = np.maximum(
-        length_m / (SLACK_M + limits.speed_m_s * within_s + 1e-9),
-        turn_rad / (SLACK_RAD + limits.turn_rad_s * within_s + 1e-9),
+        length_m / (SLACK_M + LARGEST_SPEED_M_S * within_s + 1e-9),
+        turn_rad / (SLACK_RAD + LARGEST_TURN_RAD_S * within_s + 1e-9),
     )
     count = int(np.count_nonzero(excess > 1.0))
     if not count:

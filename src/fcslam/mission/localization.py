@@ -13,24 +13,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fcslam.config import dump, one_line, parse_yaml
-from fcslam.errors import EvaluationError, InputError, SourceError
+from fcslam.config import dump, one_line
+from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.occupancy import Casting, draw_over
 from fcslam.maps.drawing import map_png
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, parse_map, server_files
-from fcslam.maps.ros_map import parse_ros_map
+from fcslam.maps.ros_map import read_ros_map
 from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import read_mission
 from fcslam.records import FloatArray, LaserScan, checked_pose, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
-from fcslam.runs import LocalizedPoses, Metric, Run
+from fcslam.runs import LocalizedPoses, Metric, RobotTrajectory, Run
 from fcslam.runs.folder import MISSION, ROBOTS
 from fcslam.runs.tables import read_robots
 from fcslam.sources import Source
-from fcslam.untrusted import read_bytes
 
 MAP_YAML: Final = "map.yaml"
 """The first map of a run folder."""
@@ -38,8 +37,6 @@ REPORTED_SCANS: Final = 50
 """Scans between two reports of progress."""
 UPDATE_STEP_M: Final = 0.1
 """Least distance between two scans that are drawn into a finished map."""
-LARGEST_FILE: Final = 1 << 30
-"""Larger map files are refused, bytes."""
 _ROW: Final = 8
 """Numbers of one scan: stamp, pose, standard deviations, quality."""
 
@@ -66,10 +63,10 @@ def read_map(path: Path, floor: str = "") -> OccupancyMap:
         return _mission_map(path, floor)
     if (path / ROBOTS).is_file():
         number, floor = _map_on(floor, _floors(path), path)
-        return replace(_read_map_file(path / f"{map_stem(number)}.yaml"), floor=floor)
+        return replace(read_ros_map(path / f"{map_stem(number)}.yaml"), floor=floor)
     if floor:
         raise SourceError(f"{path}: only run folders and mission files know floors; leave the floor out")
-    return _read_map_file(path / MAP_YAML if path.is_dir() else path)
+    return read_ros_map(path / MAP_YAML if path.is_dir() else path)
 
 
 def pose_in_map(name: str, given: ArrayLike, occupancy: OccupancyMap) -> FloatArray:
@@ -103,31 +100,6 @@ def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str
         raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {listed}")
     number = min((k for k, its in floors.items() if its == floor or not floor), default=0)
     return number, floors.get(number, "")
-
-
-def _read_map_file(description: Path) -> OccupancyMap:
-    try:
-        text = _content(description).decode("utf-8")
-        image = parse_yaml(text)["image"]
-        if not isinstance(image, str):
-            raise TypeError(image)
-        return parse_ros_map(str(description), _content(_image_of(description, image)), text)
-    except OSError as error:
-        raise SourceError(
-            f"{one_line(str(error.filename))}: cannot be read as a map ({error.strerror}); give a run folder or "
-            "a map.yaml"
-        ) from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise SourceError(f"{description}: names no image; give a run folder or the YAML file of a map") from error
-    except EvaluationError as error:
-        raise SourceError(str(error)) from error
-
-
-def _image_of(description: Path, image: str) -> Path:
-    """Where the image of a map lies; map_saver writes the whole path, which is wrong after the map was moved."""
-    named = description.parent / Path(image)
-    beside = description.parent / named.name
-    return beside if beside.is_file() and not named.is_file() else named
 
 
 def run_localization(
@@ -185,12 +157,12 @@ def _updated(
             continue
         seen.append(Casting(scans[stamp].ranges_m, scans[stamp].laser, pose, scans[stamp].sweep))
     updated = draw_over(occupancy, seen, config.map)
-    files = {
-        **server_files("map", updated),
-        **server_files("map_before", occupancy),
-        "map.png": map_png(updated, {poses.robot: poses.believed().T_map_base}, ()),
-    }
-    return replace(run, map_files=files)
+    files = _map_files(updated, poses.believed())
+    return replace(run, map_files=files | server_files("map_before", occupancy))
+
+
+def _map_files(occupancy: OccupancyMap, path: RobotTrajectory) -> dict[str, bytes]:
+    return {**server_files("map", occupancy), "map.png": map_png(occupancy, {path.robot: path.T_map_base}, ())}
 
 
 class LocalizedDrive:
@@ -254,10 +226,7 @@ class LocalizedDrive:
             trajectories={robot: replace(believed, floor=occupancy.floor)},
             metrics={metric.name: metric for metric in metrics},
             config_yaml=dump(config),
-            map_files={
-                **server_files("map", occupancy),
-                "map.png": map_png(occupancy, {robot: believed.T_map_base}, ()),
-            },
+            map_files=_map_files(occupancy, believed),
             localized={robot: poses},
         )
 
@@ -278,7 +247,3 @@ def _mission_map(path: Path, floor: str) -> OccupancyMap:
     if f"{stem}.yaml" not in files:
         raise SourceError(f"{path}: the mission has no map; no robot has sent a keyscan")
     return replace(parse_map(str(path), files[f"{stem}.pgm"], files[f"{stem}.yaml"].decode()), floor=floor)
-
-
-def _content(path: Path) -> bytes:
-    return read_bytes(path, most=LARGEST_FILE)

@@ -25,7 +25,6 @@ from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.metrics.jumps import JumpLimits
 from fcslam.mission.driving import Drive, Leg, continued, one_by_one
 from fcslam.mission.floors import on_floors
 from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
@@ -56,7 +55,6 @@ class MissionConfig(Settings):
     robot: RobotConfig = Field(default=RobotConfig(), description="settings of the robots")
     fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the cloud")
     map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
-    jumps: JumpLimits = Field(default=JumpLimits(), description="limits of motion beyond which `fcslam map` warns")
 
     @model_validator(mode="after")
     def _words_do_not_show_geometry(self) -> Self:
