@@ -401,7 +401,7 @@ def test_ctrl_c_leaves_no_folder_and_the_old_run_alone(tmp_path, capsys, monkeyp
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mapping, "_details", interrupt)  # what the progress display asks for after some scans
+    monkeypatch.setattr("fcslam.cli.progress.ProgressDisplay.show", interrupt)
     capsys.readouterr()
     assert run_map(log, "--output", run, *force) == 130
     assert capsys.readouterr().err.strip().splitlines()[-1] == "fcslam: interrupted"
