@@ -45,6 +45,8 @@ class Script:
     """Set: words alone say that it is the same place."""
     passes: bool = True
     """Whether the verification passes."""
+    predictable: bool = True
+    """Whether the two places are compared although they share a map."""
 
 
 class ScriptedMatcher:
@@ -73,8 +75,11 @@ class ScriptedMatcher:
 
     def match(self, place, predicted, is_unaligned) -> list[PlaceMatch]:
         self.predictions[place.id] = dict(predicted)
-        found = [line for line in self.script if line.j == place.id]
+        found = [line for line in self.script if line.j == place.id and (line.predictable or is_unaligned(line.i))]
         return [matched(line, predicted=not is_unaligned(line.i)) for line in found]
+
+    def match_again(self, place, others) -> list[PlaceMatch]:
+        return [matched(line, predicted=False) for line in self.script if line.j == place and line.i in others]
 
 
 def matched(line: Script, predicted: bool) -> PlaceMatch:

@@ -154,6 +154,17 @@ def test_a_join_on_aliases_is_taken_back_while_the_robots_drive(scripted):
     assert maps[at[60]] == 0
 
 
+def test_maps_that_are_separated_are_compared_where_the_false_join_hid_the_truth(scripted):
+    """Three surprises end a join on aliases. The other true pairs lay far apart in the false joint map."""
+    hidden = [replace(line, predictable=False) for line in closures(A, B, [(k, k) for k in range(12, 48, 4)])]
+    found = closures(A, B, [(48, 48), (52, 52), (56, 56)])
+    alias = closures(A, B, [(0, 0), (4, 4), (8, 8)], shift=ALIAS)
+    result = feed(scripted(alias, hidden, found, solve_every=1), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert joint_error(result) < 1e-3
+    assert len(between(result, ClosureStatus.ACCEPTED)) == len(hidden) + len(found)
+
+
 def test_a_veto_parts_what_only_liars_joined(scripted):
     """Six aliases and no witness of the truth: only somebody who knows can tell. He may say so at any time."""
     alias = closures(A, B, TRUE, shift=ALIAS)

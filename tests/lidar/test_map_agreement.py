@@ -54,6 +54,18 @@ def test_only_long_walls_in_free_space_contradict(length_m, expected_m):
     assert found.contradicting_m == pytest.approx(expected_m, abs=1.0)
 
 
+def test_the_edge_of_what_a_robot_saw_contradicts_nothing():
+    """A robot at the corner of a crossing clears the floor along a wall that it cannot see."""
+    crossing = np.vstack(
+        (
+            path((-12, 1), (-12, -1), (1.6, -1), (1.6, -6.5), (4.1, -6.5), (4.1, -1), (12, -1)),
+            path((12, -1), (12, 1), (4.1, 1), (4.1, 14), (1.6, 14), (1.6, 1), (-12, 1)),
+        )
+    )
+    along, across = seen(crossing, [(-8, 0.3), (1.7, 0.3)], 0), seen(crossing, [(2.8, -5), (2.8, 12)], 1)
+    assert compared(along, across, HERE).contradicting_m == 0.0
+
+
 def test_the_order_of_the_maps_does_not_matter():
     one, other = seen(flat(), ROUND, 0), seen(flat(), BACK, 1)
     T = np.array([0.03, -0.02, 0.01])

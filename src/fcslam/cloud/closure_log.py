@@ -89,6 +89,11 @@ class ClosureLog:
         found = (entry.closure for entry in self._at.get(match.j.robot, {}).get(match.j.number, ()))
         return any({closure.i, closure.j} == places and closure.channel is match.channel for closure in found)
 
+    def has(self, i: KeyscanId, j: KeyscanId) -> bool:
+        """Whether the places of these two keyscans were compared, with a motion between them, before."""
+        entries = self._at.get(j.robot, {}).get(j.number, ())
+        return any({entry.closure.i, entry.closure.j} == {i, j} for entry in entries)
+
     def add(self, match: PlaceMatch) -> ClosureEntry:
         """Add a match, as verified or, if its verification failed, as a candidate."""
         closure = LoopClosure(*(getattr(match, each.name) for each in fields(LoopClosure)))

@@ -6,6 +6,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, replace
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 
@@ -68,6 +69,8 @@ class ClosureDecisions:
         """Sessions by map; maps, and the sessions in them, in the order in which they started."""
         self.joins: dict[frozenset[str], ClusterEvidence] = {}
         """On what evidence two sessions share a map."""
+        self.separated: list[tuple[list[str], list[str]]] = []
+        """Groups of sessions that shared a map until a re-evaluation, and whose places are to be compared again."""
         self.version = 0
         """How often the joint graph was solved."""
         self._changes: tuple[Change, ...] = ()
@@ -156,6 +159,7 @@ class ClosureDecisions:
             partial(self._comparison.fit, growth=1.0) if final else self._comparison.fit,
             self._comparison.overlap,
         )
+        self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
         self._apart = dict(fusion.apart)
         self._short.clear()
@@ -356,6 +360,15 @@ class ClosureDecisions:
         members = [entries[k].closure for k in decision.members]
         off = np.array([self._graph.innovation(closure.i, closure.j, closure.T_i_j) for closure in members])
         return bool(2 * np.count_nonzero(np.hypot(off[:, 0], off[:, 1]) > SURPRISE_M) > len(off))
+
+
+def _separated(before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]) -> list[tuple[list[str], list[str]]]:
+    """Groups of sessions that were in one map before and are in two after."""
+    pairs = []
+    for sessions in before:
+        parts = [part for map_ in after if (part := [session for session in map_ if session in sessions])]
+        pairs += list(combinations(parts, 2))
+    return pairs
 
 
 def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:

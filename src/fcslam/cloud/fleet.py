@@ -204,6 +204,7 @@ class Fleet:
         made = bool(self._sessions.robots) and any(isinstance(change, ManualClosure) for change in changes)
         self._needs_replay |= self._decisions.edit(changes) or bool(removed) or made
         self._recognition.forget(removed)
+        self._compare_separated()
         self._replayed = None
 
     def read_ahead(self, most: int) -> bool:
@@ -342,7 +343,7 @@ class Fleet:
                 self._decisions.add_local(constraint, match.tag)
         if self._config.join_maps:
             self._decisions.add_matches((match for match in matches if match.i.robot != session), session)
-        self._decisions.optimize_if_due()
+        self._optimize_if_due()
 
     def _check_submap(self, place: Place) -> None:
         robot = place.id.robot
@@ -357,5 +358,15 @@ class Fleet:
             matches = self._recognition.match(place, decisions.map_of(session))
             decisions.add_matches(matches, session)
             self._recognition.thin(place, decisions.map_of(session))
-        decisions.optimize_if_due()
+        self._optimize_if_due()
         self._quality.update(place, matches, decisions.map_of(session))
+
+    def _optimize_if_due(self) -> None:
+        """Solve, and compare the places of maps that this separated: a false joint map predicts wrong pairs."""
+        self._decisions.optimize_if_due()
+        self._compare_separated()
+
+    def _compare_separated(self) -> None:
+        while self._decisions.separated:
+            for session, matches in self._recognition.match_again(*self._decisions.separated.pop()):
+                self._decisions.add_matches(matches, session)

@@ -81,6 +81,19 @@ class PlaceRecognition:
         at_start = {match.i: match for match in by_start if match.i not in verified}
         return [*(match for match in matches if match.i not in at_start), *at_start.values()]
 
+    def match_again(self, a: Collection[str], b: Collection[str]) -> Iterator[tuple[str, list[PlaceMatch]]]:
+        """Compare the places of two groups of sessions, which shared a map until now, wherever they were not compared.
+
+        In a false joint map, the true pairs of places lie far apart, so they were not compared. Yields a session of b
+        with the matches of each of its places.
+        """
+        for key, matcher in self._matchers.items():
+            stored = {s: self._places.get((key, s), _NO_PLACES)[:, 0].tolist() for s in (*a, *b)}
+            others = [KeyscanId(session, number) for session in a for number in stored[session]]
+            for place in [KeyscanId(session, number) for session in b for number in stored[session]]:
+                new = [i for i in others if not self._closures.has(i, place)]
+                yield place.robot, matcher.match_again(place, new)
+
     def thin(self, place: Place, mates: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
         key, robot, settings = self._key(place), robot_of(place.id.robot), self._config.matcher

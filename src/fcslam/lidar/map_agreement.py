@@ -49,6 +49,9 @@ WALL_M: Final = 0.8
 FEWEST_STRETCHES: Final = 20
 """Of fewer stretches, the noise is taken to be ``NOISE_M``, that of a common laser."""
 NOISE_M, WIDEST_NOISE_M = 0.01, 0.1
+THROUGH_M: Final = 0.25
+"""A wall contradicts where the other map is free at this distance on both of its sides: beams passed through it. At the
+edge of what a robot saw, its free space touches walls that it did not see."""
 PARALLEL: Final = 0.7
 """Least product of the normals of two points on one wall."""
 
@@ -233,19 +236,27 @@ def _offsets(points, normals, T, field, free, free_corner):  # type: ignore[no-u
         x = T[0] + cos * points[i, 0] - sin * points[i, 1]
         y = T[1] + sin * points[i, 0] + cos * points[i, 1]
         label, distance = label_at(x, y, field), 10.0
+        mx = cos * normals[i, 0] - sin * normals[i, 1]
+        my = sin * normals[i, 0] + cos * normals[i, 1]
         if label != EMPTY:
             s = field.surfels[label]
             dx, dy = x - s[0], y - s[1]
             distance = np.hypot(dx, dy)
-            mx = cos * normals[i, 0] - sin * normals[i, 1]
-            my = sin * normals[i, 0] + cos * normals[i, 1]
             if distance < VIOLATION_M and s[2] * mx + s[3] * my > PARALLEL:
                 offsets[i] = dx * s[2] + dy * s[3]
                 states[i] = _ON_WALL
                 continue
-        column = int(np.floor((x - free_corner[0]) / FREE_CELL_M))
-        row = int(np.floor((y - free_corner[1]) / FREE_CELL_M))
-        inside = column >= 0 and row >= 0 and column < free.shape[1] and row < free.shape[0] and free[row, column]
-        if inside and distance > VIOLATION_M:
-            states[i] = _IN_FREE if label != EMPTY else _DEEP_IN_FREE
+        if distance > VIOLATION_M and _is_free(x, y, free, free_corner):
+            if label != EMPTY:
+                states[i] = _IN_FREE
+            elif _is_free(x - THROUGH_M * mx, y - THROUGH_M * my, free, free_corner) and _is_free(
+                x + THROUGH_M * mx, y + THROUGH_M * my, free, free_corner
+            ):
+                states[i] = _DEEP_IN_FREE
     return offsets, states
+
+
+@njit
+def _is_free(x, y, free, corner):  # type: ignore[no-untyped-def]
+    column, row = int(np.floor((x - corner[0]) / FREE_CELL_M)), int(np.floor((y - corner[1]) / FREE_CELL_M))
+    return 0 <= column < free.shape[1] and 0 <= row < free.shape[0] and free[row, column]

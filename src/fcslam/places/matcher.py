@@ -5,7 +5,7 @@ robots in one map, candidates are the places that the map predicts to be near. E
 the overlap of the two submaps under this motion decides. To the letter of the paper, the similarity alone decides.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
@@ -250,6 +250,15 @@ class PlaceMatcher:
             for (i, _), check in zip(kept, checks, strict=True)
         ]
         return [replace(match, predicted=False) for match in matches if match.M]
+
+    def match_again(self, place: KeyscanId, others: Collection[KeyscanId]) -> list[PlaceMatch]:
+        """Compare a stored place with other stored places, without a prediction; forgotten ones are ignored."""
+        if place not in self._places or self._config.decision is MatchDecision.SIMILARITY:
+            return []
+        stored, kept = self._stored(place), [i for i in others if i in self._places]
+        result = self._query(stored)
+        chosen = self._candidates(result, frozenset(kept).__contains__)
+        return self._verified([self._far(i, stored) for i in chosen], stored, result)
 
     def _similar(
         self, place: Place, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]
