@@ -536,7 +536,7 @@ _REASON_TEXT = {
     ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
     ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: strain {value}, {limit} allowed",
     ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
-    ReasonCode.FALSE_BRIDGE: "one robot alone joins maps that contradict each other at {value} separate places",
+    ReasonCode.FALSE_BRIDGE: "one robot alone joins maps of which {value} pairs contradict each other",
     ReasonCode.VETOED: "vetoed by hand",
     ReasonCode.PINNED: "pinned by hand",
     ReasonCode.MADE_BY_HAND: "made by hand",

@@ -2,9 +2,12 @@
 
 import pytest
 
-from fcslam.graph.bridges import Overlap, contradicted_bridges
+from fcslam.graph.bridges import contradicted_bridges
+from fcslam.graph.evidence import MapFit
 
-AGREES, CONTRADICTS, NOTHING = Overlap(2, 0), Overlap(0, 3), Overlap(0, 2)
+AGREES = MapFit(support=90.0, expected=80.0, compared_m=50.0)
+CONTRADICTS = MapFit(support=-40.0, expected=80.0, compared_m=50.0)
+NOTHING = MapFit(compared_m=2.0)
 
 
 def against(*pairs, other=NOTHING):
@@ -13,7 +16,7 @@ def against(*pairs, other=NOTHING):
 
 
 def found(ties, compare, senders=range(5)):
-    return set(contradicted_bridges(ties, list(senders), compare, 3.0))
+    return set(contradicted_bridges(ties, list(senders), compare))
 
 
 # Robots 0 and 1, robots 3 and 4, and robot 2 between them.

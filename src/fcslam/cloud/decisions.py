@@ -61,7 +61,7 @@ class ClosureDecisions:
         self._config = config
         self._sessions = sessions
         self._graph = graph
-        self._comparison = MapComparison(sessions, config.matcher.verification, config.consistency.separation_m)
+        self._comparison = MapComparison(sessions)
         self._short: dict[frozenset[str], int] = {}
         """Closures of two sessions when their evidence fell short last."""
         self.closures = ClosureLog()
@@ -157,7 +157,7 @@ class ClosureDecisions:
             self._config.consistency,
             self._config.contradiction,
             partial(self._comparison.fit, growth=1.0) if final else self._comparison.fit,
-            self._comparison.overlap,
+            self._comparison.at,
         )
         self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)

@@ -8,15 +8,13 @@ from numpy.typing import NDArray
 
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
-from fcslam.graph.bridges import Overlap
 from fcslam.graph.cluster import relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
 from fcslam.lidar.scan import PointScan, keyscan_points
-from fcslam.lidar.submap import RADIUS_M, Submap, build_submap
-from fcslam.lidar.verification import PARTIAL, VerificationConfig
+from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import FloatArray, Keyscan, KeyscanId, frozen
 from fcslam.storage.state_file import State
 
@@ -47,15 +45,6 @@ DRIFT_M, DRIFT_RAD = 0.5, 0.1
 RIVALS = 2
 """Transforms elsewhere at which local maps are compared: those with the best scores."""
 
-NEAR_M = 3.0
-"""Paths of two robots this close together show the same surfaces, unless a wall is between them."""
-OVERLAP_REACH_M = 6.0
-"""Keyscans up to this far from a place make a map of it."""
-MOST_PLACES = 8
-"""Most places at which the maps of two sessions are compared; of more, evenly spaced ones."""
-LEAST_KNOWN_M = 10.0
-"""Surface of one map in known area of the other that a comparison needs."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Near:
@@ -66,11 +55,10 @@ class _Near:
     anchor: KeyscanId
     is_complete: bool
     """Whether no keyscan around the point was released."""
-    radius_m: float
 
     def submap(self) -> Submap:
         """Their map, in the frame of the anchor."""
-        return build_submap(self.scans, self.radius_m)
+        return build_submap(self.scans, REACH_M)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,10 +84,8 @@ class _Compared:
 class MapComparison:
     """Compares maps that it builds from the keyscans of sessions."""
 
-    def __init__(self, sessions: SessionStore, verification: VerificationConfig, separation_m: float) -> None:
+    def __init__(self, sessions: SessionStore) -> None:
         self._sessions = sessions
-        self._verification = verification
-        self._separation_m = separation_m
         self._compared: dict[frozenset[str], list[_Compared]] = {}
         """The last comparisons of each pair of sessions, one for each transform: later, places may be forgotten."""
 
@@ -181,34 +167,10 @@ class MapComparison:
                     fit = replace(fit, rival_support=found.support)
         return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit)
 
-    def overlap(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> Overlap:
-        """Compare the maps of two sessions at separate places where their paths are close together.
-
-        The maps agree at a place if they have no more surface in free space than a predicted closure may have. They
-        contradict each other if they have more than even a partially supported closure may have. Poses (N, 3) of their
-        keyscans in the frame of one map, in metres and radians.
-        """
-        from scipy.spatial import cKDTree
-
-        from fcslam.lidar.uniqueness import align_map
-
-        found_m, found_rows = cKDTree(poses_b[:, :2]).query(poses_a[:, :2], distance_upper_bound=NEAR_M)
-        distance_m, nearest = np.asarray(found_m), np.asarray(found_rows)
-        rows = np.flatnonzero(np.isfinite(distance_m))
-        chosen = _at_most(_separate(poses_a, rows, self._separation_m), MOST_PLACES)
-        agreeing = contradicting = 0
-        for row in chosen:
-            near_a = self._map_around(sessions[0], poses_a, poses_a[row, :2], OVERLAP_REACH_M)
-            near_b = self._map_around(sessions[1], poses_b, poses_b[nearest[row], :2], OVERLAP_REACH_M)
-            if near_a is None or near_b is None:
-                continue
-            T_i_j = se2.between(poses_a[near_a.anchor.number], poses_b[near_b.anchor.number])
-            found = align_map(near_a.submap(), near_b.submap(), T_i_j)
-            if found.known_m < LEAST_KNOWN_M:
-                continue
-            agreeing += found.violation <= self._verification.loose.violation
-            contradicting += found.violation > PARTIAL.violation
-        return Overlap(agreeing, contradicting)
+    def at(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
+        """Compare the maps of two sessions at poses (N, 3) of their keyscans in the frame of one map."""
+        local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (poses_a, poses_b))
+        return _fit(local_maps.agreement(np.zeros_like(poses_b)))
 
     def state(self) -> State:
         """The state that ``restore`` needs."""
@@ -225,17 +187,15 @@ class MapComparison:
             compared = _Compared(KeyscanId(*i), KeyscanId(*j), frozen(T_i_j), keyscans, closures, size, MapFit(*fit))
             self._compared.setdefault(frozenset((compared.i.robot, compared.j.robot)), []).append(compared)
 
-    def _map_around(
-        self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float = REACH_M
-    ) -> _Near | None:
+    def _map_around(self, session: str, poses: FloatArray, middle: FloatArray) -> _Near | None:
         """The session's map around a point (2,) in the frame of the poses (N, 3)."""
-        keyscans = self._keyscans_around(session, poses, middle, reach_m, MOST_KEYSCANS)
+        keyscans = self._keyscans_around(session, poses, middle, REACH_M, MOST_KEYSCANS)
         if not keyscans:
             return None
         distance_m = np.hypot(*(poses[:, :2] - middle).T)
-        is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= reach_m)))
+        is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= REACH_M)))
         anchor = min((keyscan.id for keyscan in keyscans), key=lambda id_: float(distance_m[id_.number]))
-        return _Near(self._scans(session, keyscans, poses, anchor), anchor, is_complete, max(reach_m, RADIUS_M))
+        return _Near(self._scans(session, keyscans, poses, anchor), anchor, is_complete)
 
     def _keyscans_around(
         self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float, most: int

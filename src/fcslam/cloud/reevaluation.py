@@ -10,7 +10,6 @@ from fcslam.cloud.joining import CONSISTENCY, ExamineSessions
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.sessions import robot_of
-from fcslam.graph.bridges import Overlap
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.graph.evidence import MapFit
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
@@ -18,8 +17,8 @@ from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 
-CompareSessions = Callable[[tuple[str, str], FloatArray, FloatArray], Overlap]
-"""As ``MapComparison.overlap``."""
+CompareSessions = Callable[[tuple[str, str], FloatArray, FloatArray], MapFit]
+"""As ``MapComparison.at``."""
 
 CONTRADICTS = Reason(ReasonCode.CONTRADICTS_JOINT_GRAPH)
 
@@ -44,7 +43,7 @@ def reevaluate(
     def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> MapFit | None:
         return examine((robots[a], robots[b]), path_a, path_b, members)
 
-    def compare_pair(a: int, b: int, poses_a: FloatArray, poses_b: FloatArray) -> Overlap:
+    def compare_pair(a: int, b: int, poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
         return compare((robots[a], robots[b]), poses_a, poses_b)
 
     solution = solve_jointly(

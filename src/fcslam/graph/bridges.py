@@ -7,7 +7,8 @@ each other, walls of one side stand in free space of the other.
 
 from collections.abc import Callable, Collection, Sequence
 from itertools import combinations, product
-from typing import NamedTuple
+
+from fcslam.graph.evidence import MapFit, refutation
 
 Pair = tuple[int, int]
 """Two robots a < b."""
@@ -16,42 +17,32 @@ _SEVERAL = 2
 """Senders of one side that contradict the other side: one alone may be the one that is wrong."""
 
 
-class Overlap(NamedTuple):
-    """Separate places where the joint poses lay the maps of two robots over each other."""
-
-    agreeing: int
-    contradicting: int
-
-
-CompareMaps = Callable[[int, int], Overlap]
+CompareMaps = Callable[[int, int], MapFit]
 """Compares the maps of two robots at the joint poses."""
 
 
-def contradicted_bridges(
-    ties: Collection[Pair], senders: Sequence[int], compare: CompareMaps, least_places: float
-) -> dict[Pair, int]:
+def contradicted_bridges(ties: Collection[Pair], senders: Sequence[int], compare: CompareMaps) -> dict[Pair, int]:
     """The ties of robots that alone join two sides of a map, although the maps of both sides contradict each other.
 
-    Two robots contradict each other if their maps do so at enough separate places. If robots of several senders on each
-    side contradict the other side, and the maps agree at no place, the robot between them is wrong and loses its ties
-    to both. Otherwise a single sender on a side may be the one that is wrong, or has drifted, and everything stays.
+    Two robots contradict each other if their maps do not show the same place (``refutation``). If robots of several
+    senders on each side contradict the other side, and no two maps agree, the robot between them is wrong and loses its
+    ties to both. Otherwise a single sender on a side may be wrong, or has drifted, and everything stays.
 
     Args:
         ties: pairs of robots between which closures count.
         senders: who sent each robot's packets; robots of one sender, its sessions, count as one.
         compare: called for robots that only one sender connects.
-        least_places: separate places at which two maps contradict each other, at least.
 
     Returns:
-        The ties that are false, and at how many separate places the maps contradict each other.
+        The ties that are false, and how many pairs of robots contradict each other.
     """
     found: dict[Pair, int] = {}
     for bridge in sorted(set(senders)):
         sides = [side for side in _sides(ties, senders, bridge) if _are_several(side, senders)]
         for side, other in combinations(sides, 2):
-            against, places = _contradicting(side, other, compare, least_places)
+            against = _contradicting(side, other, compare)
             if all(_are_several([pair[end] for pair in against], senders) for end in (0, 1)):
-                found |= {pair: places for pair in ties if _connects(pair, bridge, (*side, *other), senders)}
+                found |= {pair: len(against) for pair in ties if _connects(pair, bridge, (*side, *other), senders)}
     return found
 
 
@@ -70,19 +61,16 @@ def _are_several(robots: Sequence[int], senders: Sequence[int]) -> bool:
     return len({senders[robot] for robot in robots}) >= _SEVERAL
 
 
-def _contradicting(
-    side: Sequence[int], other: Sequence[int], compare: CompareMaps, least_places: float
-) -> tuple[list[Pair], int]:
-    """Robots of both sides whose maps contradict each other, and the places; none if any maps agree."""
-    pairs, places = [], 0
+def _contradicting(side: Sequence[int], other: Sequence[int], compare: CompareMaps) -> list[Pair]:
+    """Robots of both sides whose maps contradict each other; none if any maps agree."""
+    against = []
     for pair in product(side, other):
-        overlap = compare(*pair)
-        if overlap.agreeing:
-            return [], 0
-        if overlap.contradicting >= least_places:
-            pairs.append(pair)
-            places += overlap.contradicting
-    return pairs, places
+        fit = compare(*pair)
+        if fit.is_compared:
+            if refutation(fit) is None:
+                return []
+            against.append(pair)
+    return against
 
 
 def _connects(pair: Pair, bridge: int, side: Collection[int], senders: Sequence[int]) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.bridges import Overlap, contradicted_bridges
+from fcslam.graph.bridges import contradicted_bridges
 from fcslam.graph.chains import find_chains
 from fcslam.graph.cluster import (
     ClusterDecision,
@@ -38,7 +38,7 @@ ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], MapFit | No
 """Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
 the numbers of the robots, their own trajectories, and the closures."""
 
-CompareJointMaps = Callable[[int, int, FloatArray, FloatArray], Overlap]
+CompareJointMaps = Callable[[int, int, FloatArray, FloatArray], MapFit]
 """Compares the maps of two robots at joint poses. It takes the numbers of the robots and the poses of their variables,
 shape (N, 3) each."""
 
@@ -116,9 +116,9 @@ def not_examined(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members
     """Leave the maps unaligned: only separate places count."""
 
 
-def not_compared(*_: object) -> Overlap:
+def not_compared(*_: object) -> MapFit:
     """Leave the joint maps uncompared: nothing contradicts."""
-    return Overlap(0, 0)
+    return MapFit()
 
 
 def solve_jointly(
@@ -185,7 +185,7 @@ def solve_jointly(
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         # 8. Robots that alone join maps that contradict each other leave them.
         if len(confirmed) == len(joining):
-            bridges = _false_bridges(evidence, solution, senders, consistency, compare)
+            bridges = _false_bridges(evidence, solution, senders, compare)
             apart |= {(a, b): reason for (a, b), reason in bridges.items() if bound[a] != bound[b]}
             confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
@@ -425,7 +425,6 @@ def _false_bridges(
     evidence: JointEvidence,
     solution: Solution,
     senders: Sequence[int],
-    consistency: ConsistencySettings,
     compare: CompareJointMaps,
 ) -> dict[tuple[int, int], Reason]:
     """Pairs of robots that must not share a map, because they alone join maps that contradict each other."""
@@ -434,11 +433,11 @@ def _false_bridges(
     ends = np.sort(np.stack((owner[edges.i[counting]], owner[edges.j[counting]])), axis=0)
     ties = [(int(a), int(b)) for a, b in np.unique(ends, axis=1).T]
 
-    def compare_pair(a: int, b: int) -> Overlap:
+    def compare_pair(a: int, b: int) -> MapFit:
         return compare(a, b, solution.poses[evidence.robots[a]], solution.poses[evidence.robots[b]])
 
-    found = contradicted_bridges(ties, senders, compare_pair, consistency.minimum_evidence)
-    return {pair: Reason(ReasonCode.FALSE_BRIDGE, places) for pair, places in found.items()}
+    found = contradicted_bridges(ties, senders, compare_pair)
+    return {pair: Reason(ReasonCode.FALSE_BRIDGE, contradicting) for pair, contradicting in found.items()}
 
 
 def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
