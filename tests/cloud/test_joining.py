@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.cloud import decisions
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
-from fcslam.cloud.joining import decide_join, first_estimate
+from fcslam.cloud.joining import decide_join
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
@@ -59,29 +59,6 @@ def entries(pairs, shift=None, turned=()):
         told = (line.j, line.i, se2.inverse(line.T_i_j)) if n in turned else (line.i, line.j, line.T_i_j)
         found.append(entry(*told))
     return found
-
-
-@pytest.mark.parametrize("turned", [(), (0,), (1, 3), (0, 1, 2, 3)])
-def test_the_first_estimate_is_where_the_other_map_lies(turned):
-    graph = graph_of(a=POSES, b=POSES)
-    members = entries([(0, 10), (10, 20), (20, 30), (30, 0)], turned=turned)
-    assert np.allclose(se2.between(first_estimate(members, ("a", "b"), graph), T_A_B), 0.0, atol=1e-6)
-    assert np.allclose(first_estimate(members, ("b", "a"), graph), se2.inverse(T_A_B), atol=1e-6)
-
-
-def test_the_first_estimate_rests_on_the_longest_lever():
-    """Each closure is turned a little, but its place is right: two far places tell the direction better."""
-    graph = graph_of(a=POSES, b=POSES)
-    turned = [
-        entry(e.closure.i, e.closure.j, e.closure.T_i_j + np.array([0.0, 0.0, 0.05]))
-        for e in entries([(0, 0), (1, 1), (30, 30)])
-    ]
-    assert np.allclose(first_estimate(turned, ("a", "b"), graph), T_A_B, atol=1e-9)
-
-
-def test_a_single_closure_gives_the_first_estimate_alone():
-    graph = graph_of(a=POSES, b=POSES)
-    assert np.allclose(first_estimate(entries([(7, 11)]), ("a", "b"), graph), T_A_B, atol=1e-9)
 
 
 @pytest.mark.parametrize("turned", [(), (1, 2)])

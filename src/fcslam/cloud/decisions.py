@@ -12,7 +12,7 @@ import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit, stamps_of
-from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
+from fcslam.cloud.joining import CONSISTENCY, decide_join
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.cloud.manual_closures import Scans, measured
 from fcslam.cloud.map_comparison import MapComparison
@@ -62,8 +62,8 @@ class ClosureDecisions:
         self._sessions = sessions
         self._graph = graph
         self._comparison = MapComparison(sessions)
-        self._short: dict[frozenset[str], int] = {}
-        """Closures of two sessions when their evidence fell short last."""
+        self._due: dict[frozenset[str], int] = {}
+        """Number of closures between two sessions from which on they are decided again."""
         self.closures = ClosureLog()
         self.maps: list[list[str]] = []
         """Sessions by map; maps, and the sessions in them, in the order in which they started."""
@@ -76,8 +76,6 @@ class ClosureDecisions:
         self._changes: tuple[Change, ...] = ()
         self._contested = False
         """Whether evidence has turned against a join."""
-        self._apart: dict[frozenset[str], Reason] = {}
-        """Pairs of sessions that the last re-evaluation keeps apart, because paths contradict each other."""
         self._postponed_until = 0
         """Number of closures below which a contested join is not re-evaluated."""
 
@@ -161,8 +159,7 @@ class ClosureDecisions:
         )
         self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
-        self._apart = dict(fusion.apart)
-        self._short.clear()
+        self._due.clear()
         self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
         self.version += 1
         return fusion
@@ -171,21 +168,20 @@ class ClosureDecisions:
         """The state that ``restore`` needs."""
         return {
             "closures": self.closures.state(),
-            "short": [(sorted(pair), size) for pair, size in self._short.items()],
+            "due": [(sorted(pair), size) for pair, size in self._due.items()],
             "comparison": self._comparison.state(),
             "maps": self.maps,
             "joins": [(sorted(pair), astuple(evidence)) for pair, evidence in self.joins.items()],
             "version": self.version,
             "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
             "contested": self._contested,
-            "apart": [(sorted(pair), astuple(reason)) for pair, reason in self._apart.items()],
             "postponed_until": self._postponed_until,
         }
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         self.closures.restore(state["closures"])
-        self._short = {frozenset(pair): size for pair, size in state["short"]}
+        self._due = {frozenset(pair): size for pair, size in state["due"]}
         self._comparison.restore(state["comparison"])
         self.maps, self.version = state["maps"], state["version"]
         for pair, (*counts, fit) in state["joins"]:
@@ -193,7 +189,6 @@ class ClosureDecisions:
         changes = (read_edit(*change) for change in state["changes"])
         self._changes = tuple(change for change in changes if not isinstance(change, Undo))
         self._contested, self._postponed_until = state["contested"], state["postponed_until"]
-        self._apart = {frozenset(pair): Reason(ReasonCode(code), *details) for pair, (code, *details) in state["apart"]}
 
     def _mark(self, entry: ClosureEntry) -> bool:
         """Note whether users exclude or pin the closure; returns whether that is new."""
@@ -285,49 +280,20 @@ class ClosureDecisions:
         return False
 
     def _decide_pair(self, a: str, b: str) -> None:
-        """Join the maps of two sessions, or accept more closures between them, if one cluster dominates."""
+        """Decide all closures again if those between two sessions could join their maps, or bend or separate a map."""
         entries, pair = self.closures.evidence(a, b), frozenset((a, b))
-        if DECIDED_EACH_TIME < len(entries) < DECIDED_GROWTH * self._short.get(pair, 0):
+        if len(entries) < self._due.get(pair, 0):
             return
         decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
-        joined = b in self.map_of(a)
-        self._contested |= joined and self._is_contested(decision, entries)
+        if b in self.map_of(a):
+            self._contested |= self._is_contested(decision, entries)
         if decision.shortfall is not None:
-            self._short[pair] = len(entries)
+            growth = DECIDED_GROWTH if len(entries) > DECIDED_EACH_TIME else 1.0
+            self._due[pair] = int(growth * len(entries)) + 1
             _explain(entries, decision.shortfall.under(CONSISTENCY))
-            return
-        apart = None if joined else self._kept_apart(a, b)
-        if apart is not None:
-            self._contested = True
-            _explain(entries, apart)
-            return
-        self.joins[pair] = decision.evidence
-        members = [entries[k] for k in decision.members]
-        if not joined:
-            self._join(members, a, b)
-        reason = Reason(ReasonCode.IN_CLUSTER, len(members))
-        fresh = [entry for entry in members if entry.closure.status is not ClosureStatus.ACCEPTED]
-        for entry in fresh:
-            self._accept(entry, reason)
-        _explain(entries, Reason(ReasonCode.OUTSIDE_CLUSTER))
-        if fresh:
-            self._optimize()
-
-    def _kept_apart(self, a: str, b: str) -> Reason | None:
-        """Why the maps of two sessions must not be joined, if paths contradict each other."""
-        pairs = (frozenset((x, y)) for x in self.map_of(a) for y in self.map_of(b))
-        return next((self._apart[pair] for pair in pairs if pair in self._apart), None)
-
-    def _join(self, members: list[ClosureEntry], a: str, b: str) -> None:
-        """Move the younger map into the older one's frame."""
-        older, younger = self.map_of(a), self.map_of(b)
-        T_a_b = first_estimate(members, (a, b), self._graph)
-        if self.maps.index(older) > self.maps.index(younger):
-            older, younger, T_a_b = younger, older, se2.inverse(T_a_b)
-        self._graph.move(younger, T_a_b)
-        self.maps.remove(younger)
-        older.extend(younger)
-        older.sort(key=self._sessions.robots.index)
+        elif any(entries[k].closure.status is not ClosureStatus.ACCEPTED for k in decision.members):
+            self.reevaluate()
+            self._due[pair] = int(CONTESTED_GROWTH * len(entries)) + 1
 
     def _accept(self, entry: ClosureEntry, reason: Reason) -> None:
         closure = entry.closure

@@ -11,7 +11,6 @@ from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.graph.evidence import MapFit
 from fcslam.graph.trajectory import Trajectory
-from fcslam.records import FloatArray
 
 ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures], MapFit | None]
 """As ``MapComparison.fit``."""
@@ -33,12 +32,6 @@ def decide_join(
     return cluster.decide_cluster(
         a, b, closures, informative, settings, lambda members: examine(robots, a, b, closures.select(members))
     )
-
-
-def first_estimate(members: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph) -> FloatArray:
-    """T_a_b (3,) of the two robots' maps, from the two matched places that are farthest apart, eqs. (5)-(6)."""
-    a, b = (graph.path(robot) for robot in robots)
-    return cluster.relative_frame(a, b, _closures(members, robots[0]))
 
 
 def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:

@@ -1,6 +1,6 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -113,12 +113,6 @@ class JointGraph:
     def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> FloatArray:
         """Difference of a measurement T_i_j (3,) and the estimate: (x, y, theta), in metres and radians."""
         return se2.between(se2.between(self.pose(i), self.pose(j)), T_i_j)
-
-    def move(self, robots: Sequence[str], T_new_old: FloatArray) -> None:
-        """Move the robots of one map into another map's coordinate frame."""
-        for robot in robots:
-            variables, poses = self._variables[robot].values, self._poses.values
-            poses[variables] = se2.compose(T_new_old, poses[variables])
 
     def is_due(self, closures: int) -> bool:
         """Whether that many closures came in since the last solve, and the graph has grown noticeably.

@@ -55,20 +55,23 @@ def reevaluate(
     )
     graph.take(solution.poses)
     reasons = _reasons(solution, robots)
+    clusters = {edge: len(link.members) for link in solution.joining for edge in link.members.tolist()}
     maps = dict(zip(robots, solution.maps, strict=True))
     for entry in entries:
         assert entry.edge is not None
         pair = frozenset((entry.closure.i.robot, entry.closure.j.robot))
         divided = len({maps[robot] for robot in pair}) > 1
         refuted = reasons.get(pair, CONTRADICTS) if divided else CONTRADICTS
-        _decide(entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), refuted)
+        fits = Reason(ReasonCode.FITS_JOINT_GRAPH)
+        if entry.edge in clusters:
+            fits = Reason(ReasonCode.IN_CLUSTER, clusters[entry.edge])
+        _decide(entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), fits, refuted)
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
     T_local_base = dict(zip(robots, solution.own, strict=True))
     joins = {frozenset((robots[link.a], robots[link.b])): link.decision.evidence for link in solution.joining}
-    apart = _named(solution.apart, robots)
-    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures), joins, apart)
+    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures), joins)
 
 
 def _enter(graph: JointGraph, entries: Iterable[ClosureEntry]) -> None:
@@ -106,8 +109,8 @@ def _with_certain(graph: PoseGraph, certain: list[int]) -> PoseGraph:
     return PoseGraph.restored(graph.poses(), replace(edges, robust=robust))
 
 
-def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
-    """Set the entry's status; ``contradiction`` is the reason if it does not hold."""
+def _decide(entry: ClosureEntry, holds: bool, fits: Reason, contradiction: Reason) -> None:
+    """Set the entry's status, for the first reason if it holds and for the second one if it does not."""
     accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
     if entry.vetoed:
         entry.set(ClosureStatus.REVOKED, Reason(ReasonCode.VETOED))
@@ -115,8 +118,7 @@ def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
         code = ReasonCode.PINNED if entry.made_by_hand is None else ReasonCode.MADE_BY_HAND
         entry.set(ClosureStatus.ACCEPTED, Reason(code))
     elif holds:
-        fits = entry.closure.reason if accepted_before else Reason(ReasonCode.FITS_JOINT_GRAPH)
-        entry.set(ClosureStatus.ACCEPTED, fits)
+        entry.set(ClosureStatus.ACCEPTED, entry.closure.reason if accepted_before else fits)
     elif accepted_before or entry.closure.status is ClosureStatus.REVOKED:
         entry.set(ClosureStatus.REVOKED, contradiction)
     else:

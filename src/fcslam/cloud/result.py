@@ -25,7 +25,6 @@ from fcslam.records import (
     KeyscanId,
     LaserModel,
     LoopClosure,
-    Reason,
     TagSighting,
     frozen,
 )
@@ -100,8 +99,6 @@ class Fusion:
     """In the order in which they were found, decided."""
     joins: Mapping[frozenset[str], ClusterEvidence] = field(default_factory=dict)
     """As in ``FleetResult``."""
-    apart: Mapping[frozenset[str], Reason] = field(default_factory=dict)
-    """Pairs of robots that must not share a map, because paths contradict each other."""
 
     def pose(self, keyscan: KeyscanId) -> FloatArray:
         """Pose of a keyscan in its map, shape (3,)."""
