@@ -5,7 +5,7 @@ the maps have the last word. At the transform, the walls of one place lie on eac
 in free space of the other, and the maps fit nowhere else as well.
 
 Where closures come from few places, twice the ratio of the support of the maps there to that elsewhere, less one,
-counts as further places. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing.
+counts as further places, up to twice the likeness of the maps. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing.
 A tag that both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and
 then the maps contradict each other.
 
@@ -22,9 +22,9 @@ from fcslam.records import Reason, ReasonCode
 
 LEAST_COMPARED_M = 5.0
 """Least ``MapFit.compared_m`` that refutes a transform."""
-LARGEST_CONTRADICTION = 0.02
-"""Largest share of walls in the other map's free space. One floor in three years had up to 0.010, robots of one day up
-to 0.006, and refurnished or partly equal floors from 0.037 on."""
+LARGEST_CONTRADICTION = 0.01
+"""Largest share of walls in the other map's free space. Pairs on one published floor had less than 0.0005, also after
+years; most refurnished copies had 0.015 to 0.06."""
 LEAST_LIKENESS = 0.5
 """Least ``MapFit.likeness``. In one place it was 0.55 to 2, in places that look alike mostly less."""
 CLEAR_LIKENESS = 0.8
@@ -36,7 +36,7 @@ LEAST_RATIO = 1.2
 FIXES_RATIO = 2.0
 """Least ``MapFit.ratio`` of maps that fix the pose where no closure does."""
 RATIO_PLACES = 2.0
-"""Further places that maps replace which fit twice as well as elsewhere."""
+"""Further places that maps replace which fit twice as well as elsewhere, and as well as those of one place do."""
 TAG_PLACES = 2.0
 """Further places that a tag replaces, which both robots saw, if their maps do not contradict each other."""
 
@@ -165,6 +165,7 @@ def _amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> 
         return None
     if fit is None:
         return Reason(ReasonCode.FEW_PLACES, places, least, "minimum_evidence")
-    if places + RATIO_PLACES * max(0.0, fit.ratio - 1.0) + (TAG_PLACES if evidence.tags else 0.0) >= least:
+    by_walls = RATIO_PLACES * min(max(0.0, fit.ratio - 1.0), fit.likeness)
+    if places + by_walls + (TAG_PLACES if evidence.tags else 0.0) >= least:
         return None
     return Reason(ReasonCode.NOT_UNIQUE, fit.ratio, 1.0 + (least - places) / RATIO_PLACES, "minimum_evidence")
