@@ -5,9 +5,9 @@ the maps have the last word. At the transform, the walls of one place lie on eac
 in free space of the other, and the maps fit nowhere else as well.
 
 Where closures come from few places, twice the ratio of the support of the maps there to that elsewhere, less one,
-counts as further places, up to twice the likeness of the maps. A corridor with equal doors fits nearly as well one door farther, so it adds next to nothing.
-A tag that both robots saw counts as further places, too: its number is unmistakable, but it may be there twice, and
-then the maps contradict each other.
+counts as further places, up to twice the likeness of the maps. A corridor with equal doors fits nearly as well one door
+farther, so it adds next to nothing. A tag that both robots saw counts as further places, too: its number is
+unmistakable, but it may be there twice, and then the maps contradict each other.
 
 In a lane that winds, no closure fixes the pose in every direction, but the maps may.
 """
