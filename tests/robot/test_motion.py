@@ -143,14 +143,14 @@ def test_the_duration_of_a_scan_can_be_a_setting():
 
 def test_odometry_that_never_changes_is_not_used():
     frontend, _ = mapped(spinning.drive(odometry=lambda _: np.zeros(3)))
-    assert frontend.motion.prediction is not None
+    assert not frontend.motion.model.is_measured
     assert len(frontend.tracks) == 2
     assert spinning.error_m(frontend.tracks[1]) < 0.005
 
 
 def test_odometry_whose_heading_is_never_set_is_not_used():
     frontend, _ = mapped(spinning.drive(odometry=lambda stamp: spinning.pose_at(stamp) * (1.0, 1.0, 0.0)))
-    assert frontend.motion.prediction is not None
+    assert not frontend.motion.model.is_measured
     assert spinning.error_m(frontend.tracks[-1]) < 0.005
 
 
@@ -229,5 +229,5 @@ def test_the_first_scan_without_odometry_has_a_pose_before_the_second_comes():
 def test_a_robot_at_rest_keeps_its_odometry():
     scan = next(iter(spinning.drive(odometry=spinning.pose_at)))
     frontend, _ = mapped([scan] * 40)
-    assert frontend.motion.prediction is None
+    assert frontend.motion.model.is_measured
     assert len(frontend.tracks) == 1

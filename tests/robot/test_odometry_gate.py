@@ -111,7 +111,7 @@ def test_a_robot_maps_on_through_spikes(far_m):
         return frontend, frontend.scan_poses.T_odom_base()
 
     frontend, poses = mapped(read)
-    assert frontend.motion.odometry.jumps == 6
+    assert frontend.odometry.jumps == 6
     error = se2.between(mapped(scans)[1], poses)
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.03
     assert np.abs(error[:, 2]).max() < 0.01

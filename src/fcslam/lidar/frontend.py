@@ -154,6 +154,10 @@ class LidarFrontend:
         self._recent: deque[MappedKeyscan] = deque()
         """The keyscans of the last ``SUBMAP_REACH_M`` of travel."""
 
+    def fresh(self) -> "LidarFrontend":
+        """A front end of the same robot that has seen nothing."""
+        return LidarFrontend(self.robot, self.config, self.odometry)
+
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; nothing changes before ``process``."""
         return self._tracker.localize(scan)

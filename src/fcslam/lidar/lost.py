@@ -124,7 +124,7 @@ def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
         scans: consecutive scans that the front end has not processed.
         frontend: the robot's front end; it does not change.
     """
-    fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
+    fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):
         return False
     worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh)
@@ -139,7 +139,7 @@ def rode(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float) -
         frontend: the robot's front end; it does not change.
         closed_s: stamp at which the door closed, seconds.
     """
-    fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
+    fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):
         return False
     worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh, closed_s)
@@ -164,7 +164,7 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
     """
     from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load, and few robots need them
 
-    fresh = LidarFrontend(frontend.robot, frontend.config, frontend.odometry)
+    fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):
         return None
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()

@@ -143,7 +143,7 @@ class LiveTracker(ABC):
     @property
     def odometry_jumps(self) -> int:
         """Number of jumps of the odometry so far."""
-        return self._frontend.motion.odometry.jumps
+        return self._frontend.odometry.jumps
 
     def close(self) -> None:
         """End the worker and the connection at once. Packets that the server does not have wait in the state folder.
@@ -182,9 +182,9 @@ class LiveTracker(ABC):
         T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
         T_odom_base = None if np.isnan(scan.T_odom_base).any() else scan.T_odom_base
         pose = self._pose = self._pose_of(newest, T_smooth_base, T_odom_base)
-        if self._frontend.motion.prediction is not None:
+        if self._frontend.motion is not self._frontend.odometry:
             self._tell_undetermined(pose)
-        if (fault := self._frontend.motion.wheels.fault) is not None:
+        if (fault := self._frontend.odometry.fault) is not None:
             self._tell_failure(f"the odometry {fault}; scan matching alone gives the motion")
         if watched := self._facing[scan.laser.T_base_laser].add(scan):
             with suppress(RuntimeError):  # a worker that has ended is told by what needs it

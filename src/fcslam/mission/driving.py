@@ -122,7 +122,7 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     packets += map(measure, robot.finish())
     if robot.packets.failure is not None:
         raise FcslamError(f"{robot.robot}: the process of its back end failed: {robot.packets.failure}")
-    faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.motion.odometry.jumps)
+    faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)
 

@@ -12,7 +12,6 @@ a new one begins with them, as after a restart. So no unmeasured motion enters a
 import math
 from collections.abc import Callable
 from concurrent.futures import Future
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,8 +27,7 @@ from fcslam.robot.backend import BackendInput, NewDetector, PlaceKeyframes, Robo
 from fcslam.robot.backend_runner import BackendRunner, InlineBackend
 from fcslam.robot.deferred_scans import DeferredScans, Outcome
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.motion import RobotMotion
-from fcslam.robot.motion_prediction import MotionPrediction
+from fcslam.robot.motion import Motion, PredictedMotion, WheelOdometry
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.session import Session, WaitingFixes
 from fcslam.robot.track import ScanTrack
@@ -79,7 +77,9 @@ class RobotFrontend:
         self.robot = robot
         self.tracks: list[ScanTrack] = []
         """Poses of the scans, by session."""
-        self.motion = RobotMotion(config.lidar.scan_duration_s)
+        self.odometry = WheelOdometry(config.lidar.scan_duration_s)
+        self._motion: Motion = self.odometry
+        """Of the sessions from the next one on."""
         self.packets = PacketQueue(
             robot, InlineBackend(RobotBackend(robot, config)) if backend is None else backend, config.sends
         )
@@ -89,7 +89,7 @@ class RobotFrontend:
         self._repeated = RepeatedScans()
         self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self._fixes = WaitingFixes()
-        self._deferred = DeferredScans(robot, config.lidar, config.lost, self.motion)
+        self._deferred = DeferredScans(config.lost)
         self._before: LaserScan | None = None
         """The newest scan, mapped or not; None if the next one is of another place."""
         self._before_s = (float("-inf"), float("-inf"))
@@ -99,7 +99,12 @@ class RobotFrontend:
     @property
     def scan_poses(self) -> ScanTrack:
         """Poses of the scans of the present session."""
-        return self._session.track
+        return self._session.poses
+
+    @property
+    def motion(self) -> Motion:
+        """The motion of the present session: the odometry, or a prediction in its place."""
+        return self._session.motion
 
     @property
     def travel_m(self) -> float:
@@ -116,7 +121,7 @@ class RobotFrontend:
                     scan = self._mark(self._mapped.of(scan))
                     self._process_scan(scan)
             case CameraImage() if self._config.uses_images:
-                self._process_image(self.motion.image(record))
+                self._process_image(self.motion.place_image(record))
             case GnssFix():
                 self._fixes.add(record)
         return self.ready()  # scans carry their odometry; images never leave the robot
@@ -168,46 +173,47 @@ class RobotFrontend:
         if scan.new_floor:
             self.change_floor(scan.new_floor)
         if is_clock_step(self._before_s, scan.stamp):
+            if self._motion is not self.odometry:
+                self._motion = PredictedMotion(self._config.lidar.scan_duration_s)
             self.begin_session()
-            self.motion.forget()
         self._before_s = self._before_s[1], scan.stamp
 
     def _predict(self, scan: LaserScan) -> LaserScan:
         """Give the scan its predicted pose and the velocity of its sweep."""
-        if self.motion.becomes_predicted(scan):
+        if self._motion is self.odometry and self.odometry.says_nothing(scan):
             self._begin_without_odometry()
-        return self.motion.predict(scan, self._before)
+        return self._session.place(scan, self._before)
 
     def _begin_without_odometry(self) -> None:
         """Begin a session whose motion is predicted, with the scans at which the odometry was frozen."""
-        wheels, held = self.motion.wheels, []
-        if wheels.may_be_frozen:
-            self.scan_poses.cut(wheels.certain_s)
+        self._motion, held = PredictedMotion(self._config.lidar.scan_duration_s), []
+        if self.odometry.may_be_frozen:
+            self.scan_poses.cut(self.odometry.certain_s)
             held = self._deferred.take()
         self.begin_session()
         for record in held:
             if isinstance(record, LaserScan):
-                self._process_scan(self.motion.predict(record, None))
+                self._process_scan(self._session.place(record, None))
             else:
-                self._describe(self.motion.image(record))
+                self._describe(self.motion.place_image(record))
 
     def _process_scan(self, scan: LaserScan) -> None:
         """Track a scan; then map it, or defer it while it is doubtful."""
-        prediction = self.motion.prediction
-        if prediction is not None and prediction.is_new and scan.sweep is not None:
+        if self._session.awaits_second(scan):
             if not self._deferred:
                 self._await_second(scan)
                 return
-            scan = self._begin_motion(prediction, scan)
+            scan = self._deferred.begin_motion(scan, self._session)
+            self._map_deferred()
         scan = self._bridge_gap(scan)
         self._deferred.watch_cabin(scan, self._session)
-        deskewed, tracking = self.motion.track(scan, self._session.lidar, partial(self._session.in_odom, scan.stamp))
+        deskewed, tracking = self._session.track(scan)
         if self._deferred.is_doubtful(tracking, self._session):
             self._defer(scan, tracking)
         else:
             self._map_admitted(deskewed, tracking)
         if self.newest is not None and not self._deferred:
-            self.motion.observe(scan.stamp, self.scan_poses.in_odom(self.newest.pose), self.newest.tracked)
+            self._session.observe(scan.stamp, self.newest.pose, self.newest.tracked)
 
     def _await_second(self, scan: LaserScan) -> None:
         """Defer the first scan of a robot without odometry: the second one shows the motion during it."""
@@ -215,13 +221,6 @@ class RobotFrontend:
         self.newest = NewestScan(ScanPose(scan.stamp, 0, se2.IDENTITY), tracked, math.nan, is_deferred=True)
         self._before = scan
         self._deferred.add(scan)
-
-    def _begin_motion(self, prediction: MotionPrediction, second: LaserScan) -> LaserScan:
-        """Map the first scan of a robot without odometry; returns the second one, predicted from it."""
-        first = self._deferred.place_first(second)
-        self._map_deferred()
-        prediction.begin(first, se2.IDENTITY)
-        return prediction.predict(second)
 
     def _bridge_gap(self, scan: LaserScan) -> LaserScan:
         """The scan; where nothing shows the motion to it, it begins a session, or is predicted and doubtful."""
@@ -233,7 +232,7 @@ class RobotFrontend:
             self._end_session()
         elif self._deferred.follows_gap(before, scan, self._session):
             self._end_deferral()
-            scan = self.motion.predict(scan, before)  # the frame of the predictions may have moved
+            scan = self._session.place(scan, before)  # the frame of the predictions may have moved
             self._deferred.begin_gap(scan.stamp - before.stamp)
         return scan
 
@@ -242,7 +241,7 @@ class RobotFrontend:
         self._deferred.add_doubtful(scan, tracking, self._session)
         pose = self._session.lidar.scan_pose(scan.stamp, tracking.tracked)
         self.newest = NewestScan(pose, tracking.tracked, tracking.quality, is_deferred=True)
-        if self._deferred.can_decide:
+        if self._deferred.can_decide(self._session):
             self._decide()
 
     def _decide(self) -> None:
@@ -281,7 +280,7 @@ class RobotFrontend:
 
     def _map(self, scan: LaserScan, tracking: TrackingResult) -> None:
         self.packets.advance(scan.stamp)
-        for input in self._session.map(scan, tracking, self._fixes.until(scan.stamp), self.motion.odometry.jumps):
+        for input in self._session.map(scan, tracking, self._fixes.until(scan.stamp)):
             self._submit(input)
         self.newest = NewestScan(self.scan_poses[-1], tracking.tracked, tracking.quality, is_deferred=False)
 
@@ -302,7 +301,7 @@ class RobotFrontend:
         self._begin(ScanTrack(self.scan_poses.floor))
 
     def _begin(self, track: ScanTrack) -> None:
-        self._session = Session(self.robot, len(self.tracks), self._config.lidar, self.motion.model, track)
+        self._session = Session(self.robot, len(self.tracks), self._config.lidar, self._motion, track)
         self._deferred.leave_cabin()
         self.tracks.append(track)
 

@@ -1,16 +1,19 @@
 """One session of a robot: everything that is tied together by measured motion."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, ScanPose
-from fcslam.lidar.odometry import OdometryModel
+from fcslam.lidar.lost import drove_on
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, GnssFix, KeyscanFix, KeyscanId, LaserScan
 from fcslam.robot.backend import BackendInput, NewImage, NewKeyscan
+from fcslam.robot.motion import Deferred, Motion, PredictedMotion
 from fcslam.robot.track import ScanTrack
 
 LATE_S = 0.5
@@ -38,55 +41,105 @@ class WaitingFixes:
 
 
 class Session:
-    """Maps the scans of one session and keeps the newest of them."""
+    """Tracks and maps the scans of one session, and keeps the newest of them."""
 
-    def __init__(self, robot: str, epoch: int, config: LidarConfig, odometry: OdometryModel, track: ScanTrack) -> None:
-        """Begin session number ``epoch`` of a robot; ``track`` gets the poses of its scans."""
-        self.epoch, self.track = epoch, track
-        self.lidar = LidarFrontend(robot, config, odometry)
+    def __init__(self, robot: str, epoch: int, config: LidarConfig, motion: Motion, poses: ScanTrack) -> None:
+        """Begin session number ``epoch`` of a robot; ``poses`` gets those of its scans."""
+        self.epoch, self.motion, self.poses = epoch, motion, poses
+        self.lidar = LidarFrontend(robot, config, motion.model)
         self.newest: tuple[LaserScan, ScanPose] | None = None
         """The newest scan that was mapped."""
-        self.explained: dict[tuple[float, float, float], LaserScan] = {}
+        self._explained: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser that the map explained, by its mounting."""
-        self.jumps = 0
+        self._jumps = 0
         """Jumps of the odometry up to the newest scan that was mapped."""
         self._scans: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser, by its mounting."""
         self._fixed = -1
         """The newest keyscan with a fix."""
 
-    def in_odom(self, stamp: float, tracked: TrackedScan) -> FloatArray:
-        """``T_odom_base`` of a localized scan, shape (3,), metres and radians."""
-        return self.track.in_odom(self.lidar.scan_pose(stamp, tracked))
+    def place(self, scan: LaserScan, before: LaserScan | None) -> LaserScan:
+        """The next scan with its pose and velocity by odometry or prediction; ``before`` is the one before it."""
+        if isinstance(self.motion, PredictedMotion):
+            return self.motion.place(scan)
+        return self.motion.place(scan, before)
 
-    def map(
-        self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix], jumps: int
-    ) -> list[BackendInput]:
+    def track(self, scan: LaserScan) -> tuple[LaserScan, TrackingResult]:
+        """Localize a scan; returns it as it was deskewed, too."""
+        if isinstance(self.motion, PredictedMotion):
+            return self.motion.track(scan, self.lidar, partial(self._in_odom, scan.stamp))
+        return scan, self.lidar.localize(scan)
+
+    def observe(self, stamp: float, pose: ScanPose, tracked: TrackedScan) -> None:
+        """Continue the motion from where the scan at ``stamp`` was found."""
+        if isinstance(self.motion, PredictedMotion):
+            self.motion.observe(stamp, self.poses.in_odom(pose), tracked)
+
+    def awaits_second(self, scan: LaserScan) -> bool:
+        """Whether only a second scan shows the motion during this one."""
+        return isinstance(self.motion, PredictedMotion) and self.motion.awaits_second(scan)
+
+    def begin_motion(self, deferred: Deferred, second: LaserScan) -> LaserScan:
+        """Give the first deferred scan the motion that the second one shows; returns this one, predicted from it."""
+        return self.motion.begin(deferred, second) if isinstance(self.motion, PredictedMotion) else second
+
+    def is_unseen(self, before: LaserScan, scan: LaserScan) -> bool:
+        """Whether nothing shows the motion between two scans although there is a map."""
+        is_predicted = isinstance(self.motion, PredictedMotion) and self.newest is not None
+        return is_predicted and scan.stamp - before.stamp > LONGEST_GAP_S
+
+    def follow(self, deferred: Deferred, scan: LaserScan, tracking: TrackingResult) -> LaserScan:
+        """The next doubtful scan with its motion since those before it."""
+        if not isinstance(self.motion, PredictedMotion):
+            return scan
+        return self.motion.follow(deferred, scan, tracking.tracked, self.lidar, partial(self._in_odom, scan.stamp))
+
+    @property
+    def may_be_frozen(self) -> bool:
+        """Whether the odometry stands still although the newest scans have changed."""
+        return not isinstance(self.motion, PredictedMotion) and self.motion.may_be_frozen
+
+    def drove_on(self, scans: Sequence[LaserScan]) -> bool:
+        """Whether odometry without a jump and the scans agree that the robot drove to where doubtful scans are."""
+        if isinstance(self.motion, PredictedMotion) or self.motion.jumps != self._jumps:
+            return False
+        return drove_on(self._explained, scans, self.lidar)
+
+    def relocate(self, deferred: Deferred, gap_s: float) -> bool:
+        """Whether doubtful scans that do not contradict the map show the place before them; see ``PredictedMotion``."""
+        return not isinstance(self.motion, PredictedMotion) or self.motion.relocate(deferred, self.lidar, gap_s)
+
+    def map(self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]) -> list[BackendInput]:
         """Continue from a localized scan; returns the keyscan that it becomes, and the fixes of keyscans.
 
         Args:
             scan: the scan.
             tracking: where it was localized.
             fixes: those up to the scan.
-            jumps: jumps of the odometry up to the scan.
         """
         step = self.lidar.process(scan, tracking)
         inputs: list[BackendInput] = []
         if step.keyscan is not None:
             if step.keyscan.odometry is not None:
-                self.track.extend(step.keyscan.odometry.T_i_j)
+                self.poses.extend(step.keyscan.odometry.T_i_j)
             inputs.append(NewKeyscan(step.keyscan, self.lidar.lasers))
-        self.track.add(step.pose)
+        self.poses.add(step.pose)
         inputs.extend(self._keyscan_fixes(step.pose, fixes))
-        self.newest, self.jumps = (scan, step.pose), jumps
+        self.newest = scan, step.pose
         self._scans[scan.laser.T_base_laser] = scan
         if tracking.explained >= DOUBTFUL * tracking.known:  # false if it was not matched
-            self.explained[scan.laser.T_base_laser] = scan
+            self._explained[scan.laser.T_base_laser] = scan
+        if not isinstance(self.motion, PredictedMotion):
+            self._jumps = self.motion.jumps
         return inputs
 
     def view(self, image: CameraImage) -> NewImage | None:
         """An image with the newest scans; None before the first scan."""
         return None if self.newest is None else NewImage(image, *self.newest, tuple(self._scans.values()))
+
+    def _in_odom(self, stamp: float, tracked: TrackedScan) -> FloatArray:
+        """``T_odom_base`` of a localized scan, shape (3,), metres and radians."""
+        return self.poses.in_odom(self.lidar.scan_pose(stamp, tracked))
 
     def _keyscan_fixes(self, pose: ScanPose, fixes: Iterable[GnssFix]) -> Iterator[KeyscanFix]:
         """Each fix with the keyscan of the scan next to it, at most one for each keyscan."""
