@@ -3,8 +3,7 @@
     python benchmarks/continued.py [--log intel] [--parts 3] [--repetitions 2]
 
 A recording of the SLAM benchmark is cut into robots as by `--split`. One command maps all of them. Two others map all
-but the last, and then the last one onto that run: once with the state that the first left (`mission.state`), and once
-without. CPU is that of the whole command, the least of the repetitions.
+but the last, and then the last one onto that run. CPU is that of the whole command, the least of the repetitions.
 """
 
 import tempfile
@@ -35,21 +34,17 @@ def measured(log: Path, parts: int, repetitions: int, place: Path) -> list[tuple
     logs = [place / f"{number}.clf" for number in range(parts)]
     for path, part in zip(logs, sources.split(sources.open_source(log), parts), strict=True):
         sources.write_carmen(path, part.records())
-    whole, begun, bare = place / "whole", place / "begun", place / "bare"
+    whole, begun = place / "whole", place / "begun"
     commands = {
         "all at once": (*logs, "-o", whole),
         "all but the last": (*logs[:-1], "-o", begun),
-        "the last, with the state": (logs[-1], "--onto", begun, "-o", place / "with"),
-        "the last, without": (logs[-1], "--onto", bare / "mission.fcslam", "-o", place / "without"),
+        "the last": (logs[-1], "--onto", begun, "-o", place / "last"),
     }
     cpu_s: dict[str, float] = {}
     for _ in range(repetitions):
         for name, arguments in commands.items():
             cost = common.run_fcslam("map", *arguments, "--force")
             cpu_s[name] = min(cpu_s.get(name, cost.cpu_s), cost.cpu_s)
-            if name == "all but the last" and not bare.exists():
-                bare.mkdir()
-                (bare / "mission.fcslam").write_bytes((begun / "mission.fcslam").read_bytes())
     unlike = {name: differing(whole, arguments[-1]) for name, arguments in commands.items()}
     return [(name, spent_s, spent_s / cpu_s["all at once"], unlike[name]) for name, spent_s in cpu_s.items()]
 

@@ -58,14 +58,6 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def state_home(tmp_path_factory):
-    """A folder for the user's state, so that no test writes to the real one."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
 def no_wait_for_the_disk():
     """No test cuts the power, so none waits until the disk has what was written."""
 

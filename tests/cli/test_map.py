@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 RUN_FILES = {
     "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "mission.fcslam",
-    "joins.csv", "quality.json", "quality.png", "mission.state", "pose_graph.g2o", "robots.csv", "trajectories",
+    "joins.csv", "quality.json", "quality.png", "pose_graph.g2o", "robots.csv", "trajectories",
 }  # fmt: skip
 
 

@@ -1,7 +1,6 @@
 """A robot that comes back again and again: what is forgotten, what never is, and that the map does not suffer."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,15 +12,13 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.lab.simulation.recording import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.submap_bytes import submap_bytes
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import Occupancy
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
 from fcslam.places.matcher import MatcherConfig
-from fcslam.records import Channel, KeyscanId, Place, Veto
+from fcslam.records import Channel, Place, Veto
 from fcslam.runs import open_run
-from fcslam.storage.state_file import parse_state, state_bytes
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
 from tests import small_fleet
@@ -113,7 +110,6 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
 
 def test_submaps_that_are_dropped_and_built_again_change_nothing(forgetful, packets):
     cloud = feed(Cloud(ONE_A_SQUARE.model_copy(update={"submaps_kept": 2}), 0), packets)
-    assert len(cloud.fleet.submaps()["keys"]) <= 2
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 
 
@@ -123,39 +119,8 @@ def test_submaps_that_are_packed_change_nothing_and_are_not_built_again(forgetfu
     monkeypatch.setattr(submaps, "build_submap", lambda scans: built.append(len(scans)) or build_submap(scans))
     cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
     places = sum(isinstance(packet.body, Place) for packet in packets)
-    assert len(cloud.fleet.submaps()["keys"]) == 1 < len(built) <= places
+    assert 1 < len(built) <= places
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
-
-
-def test_a_cloud_that_goes_on_from_a_state_builds_no_submap_again(packets, monkeypatch):
-    first, later = packets[: len(packets) // 2], packets[len(packets) // 2 :]
-    cloud = feed(Cloud(ONE_A_SQUARE, 0), first)
-    known = {(number.session, number.sequence): packet for number, packet in cloud._packets.items()}
-    state = parse_state(Path("state"), state_bytes("this", cloud.state()), "this")
-    restored = Cloud.restored(ONE_A_SQUARE, 0, state, {number: p.time for number, p in known.items()}, known.get)
-    before, after = (each.fleet.submaps() for each in (cloud, restored))
-    assert before["keys"]
-    assert all(np.array_equal(before[name], after[name]) for name in before)
-    monkeypatch.setattr(submaps, "build_submap", lambda _: pytest.fail("it is in the state"))
-    (matcher,) = restored.fleet._recognition._matchers.values()
-    for robot, number, channel in before["keys"]:
-        identifier = KeyscanId(robot, number)
-        again = restored.fleet._recognition.submaps.of(matcher._places[identifier])
-        expected = cloud.fleet._recognition.submaps.of(matcher._places[identifier])
-        assert submap_bytes(again) == submap_bytes(expected), channel
-    monkeypatch.undo()
-    assert fingerprint(feed(restored, later).finalize()) == fingerprint(feed(cloud, later).finalize())
-
-
-def test_a_cloud_that_goes_on_from_a_state_has_the_state_of_one_that_never_stopped(packets, monkeypatch):
-    """Also where the cache holds more submaps than the state."""
-    monkeypatch.setattr(submaps, "UNPACKED", 3)
-    first, later = packets[: len(packets) // 2], packets[len(packets) // 2 :]
-    cloud = feed(Cloud(ONE_A_SQUARE, 0), first)
-    known = {(number.session, number.sequence): packet for number, packet in cloud._packets.items()}
-    state = parse_state(Path("state"), state_bytes("this", cloud.state()), "this")
-    restored = Cloud.restored(ONE_A_SQUARE, 0, state, {number: p.time for number, p in known.items()}, known.get)
-    assert state_bytes("this", feed(restored, later).state()) == state_bytes("this", feed(cloud, later).state())
 
 
 def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):

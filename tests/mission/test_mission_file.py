@@ -6,7 +6,6 @@ import shutil
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,11 +15,9 @@ from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import EditError, SourceError
 from fcslam.mission.localization import read_map
-from fcslam.mission.mission import MissionCloud, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import edit_mission, mission_bytes, read_mission
 from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
 from fcslam.runs import open_run
-from fcslam.sources import write_carmen
 
 pytestmark = pytest.mark.slow
 
@@ -46,95 +43,18 @@ def begun(logs, tmp_path_factory):
     return folder / "run"
 
 
-@pytest.fixture
-def resumed(monkeypatch):
-    """Whether each mission went on from the state of the earlier one."""
-    answers = []
-
-    def resume(cloud, first, original=MissionCloud.resume):
-        answers.append(original(cloud, first))
-        return answers[-1]
-
-    monkeypatch.setattr(MissionCloud, "resume", resume)
-    return answers
-
-
-@pytest.fixture
-def resumes(resumed, monkeypatch):
-    """Whether a mission that is mapped again would go on from its state; it ends there."""
-
-    class KnownError(Exception):
-        """The answer is known."""
-
-    def resume(cloud, first, original=MissionCloud.resume):
-        original(cloud, first)
-        raise KnownError
-
-    monkeypatch.setattr(MissionCloud, "resume", resume)
-
-    def answer(onto, **options):
-        with pytest.raises(KnownError):
-            fcslam.map_recordings([], onto=onto, **options)
-        return resumed[-1]
-
-    return answer
-
-
-def test_a_mission_goes_on_more_than_once_without_its_recordings(logs, whole, begun, resumed, tmp_path):
-    """The three robots drive at the same time, so some packets come before the state."""
+def test_a_mission_goes_on_more_than_once_without_its_recordings(logs, whole, begun, tmp_path):
     fcslam.map_recordings(logs[2:], output=tmp_path / "run", onto=begun)
     assert contents(tmp_path / "run") == contents(whole)
-    assert resumed == [False]
 
 
 def copied(run, folder):
     return Path(shutil.copytree(run, folder))
 
 
-def test_a_state_saves_work_and_changes_nothing(drawn, begun, resumed, tmp_path):
-    hour_later = tmp_path / "later.clf"
-    write_carmen(hour_later, (replace(scan, stamp=scan.stamp + 3600.0) for scan in drawn.robots[2].scans()))
-    fcslam.map_recordings(hour_later, output=tmp_path / "from state", onto=begun)
-    bare = copied(begun, tmp_path / "bare")
-    (bare / "mission.state").unlink()
-    fcslam.map_recordings(hour_later, output=tmp_path / "from packets", onto=bare)
-    assert resumed == [True, False]
-    assert contents(tmp_path / "from state") == contents(tmp_path / "from packets")
-
-
-def test_a_mission_that_is_mapped_again_goes_on_from_its_state(begun, resumed, tmp_path):
+def test_a_mission_that_is_mapped_again_is_the_same(begun, tmp_path):
     fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
-    assert resumed == [True]
     assert contents(tmp_path / "again") == contents(begun)
-
-
-def test_a_state_that_somebody_changed_is_not_read(begun, resumed, tmp_path):
-    run = copied(begun, tmp_path / "run")
-    state = run / "mission.state"
-    state.write_bytes(state.read_bytes()[:-1] + b"!")
-    fcslam.map_recordings([], output=tmp_path / "again", onto=run)
-    assert resumed == [False]
-    assert contents(tmp_path / "again") == contents(begun)
-
-
-def test_a_pipe_in_place_of_a_state_is_not_waited_for(begun, resumes, tmp_path):
-    run = copied(begun, tmp_path / "run")
-    assert resumes(run)
-    (run / "mission.state").unlink()
-    os.mkfifo(run / "mission.state")
-    assert not resumes(run)
-
-
-def test_the_state_of_another_user_is_not_read(begun, resumes, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-    assert not resumes(begun)
-
-
-def test_who_has_no_folder_for_a_key_maps_without_states(begun, resumed, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
-    fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
-    assert resumed == [False]
-    assert not (tmp_path / "again" / "mission.state").exists()
 
 
 @pytest.mark.attack
@@ -166,14 +86,6 @@ def test_names_of_folders_that_are_no_utf8_are_names(begun, tmp_path):
 
 
 @pytest.mark.attack
-def test_a_state_of_another_size_is_not_read(begun, resumes, tmp_path):
-    """A file with a hole, of 3 GB."""
-    run = copied(begun, tmp_path / "run")
-    os.truncate(run / "mission.state", 3 << 30)
-    assert not resumes(run)
-
-
-@pytest.mark.attack
 def test_a_mission_beyond_the_limit_is_refused_by_its_size(begun, tmp_path):
     """Files with a hole, of 3 GB: nothing of them is read."""
     run = copied(begun, tmp_path / "run")
@@ -181,23 +93,6 @@ def test_a_mission_beyond_the_limit_is_refused_by_its_size(begun, tmp_path):
     for read in (read_mission, lambda path: edit_mission(path, [], "me", 0.0)):
         with pytest.raises(SourceError, match=r"mission\.fcslam has 3221\.2 MB; the limit is 2147\.5 MB$"):
             read(run)
-
-
-def test_a_state_counts_only_if_nothing_but_the_packets_changed(logs, begun, resumes, tmp_path):
-    first, second = (path.stem for path in logs[:2])
-    assert resumes(begun)
-    assert not resumes(begun, vetoes=[Veto(first, second)])
-    assert not resumes(begun, config=fcslam.MissionConfig(seed=1))
-    edited = copied(begun, tmp_path / "edited")
-    edit_mission(edited, [Veto(first, second)], "anna", 1.0)
-    assert not resumes(edited)
-
-
-def test_a_state_that_makes_no_sense_is_left_out(begun, caplog):
-    saved = replace(read_mission(begun), state={"cloud": {"fleet": {}, "log": {}}, "traffic": []})
-    run = run_mission([], continued_config(saved), inputs=MissionInputs(saved))
-    assert "all packets take effect again" in caplog.text
-    assert run.pose_graph_g2o == open_run(begun).pose_graph_g2o
 
 
 def test_a_robot_that_comes_back_begins_a_new_session(logs, begun, tmp_path):

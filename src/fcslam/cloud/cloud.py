@@ -1,9 +1,6 @@
 """The cloud within one process: packets in, replies out, one map in the end."""
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from fcslam.cloud.host import FleetHost
 from fcslam.cloud.packet_log import PacketNumber
@@ -14,8 +11,7 @@ from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import PacketError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.records import Correction, Edit, Place, WordPlace, frozen
-from fcslam.storage.state_file import State
+from fcslam.records import Place, WordPlace
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode, encode
 
@@ -36,48 +32,10 @@ class Cloud(FleetHost):
         self._times: dict[PacketNumber, float] = {}
         """Time of each packet."""
         self._packets: dict[PacketNumber, Packet] = {}
-        """Those that this cloud applied itself."""
-        self._earlier: Callable[[PacketNumber], Packet] | None = None
-        """Gives the others; None if this cloud applied all itself."""
         self._corrections: dict[str, SessionCorrection] = {}
         """The newest that was sent, by session."""
         self._sent = 0
         """How many corrections were sent: the version of the next one."""
-
-    def state(self) -> State:
-        """As in ``FleetHost``; with it no submap has to be built again, and no correction is sent again."""
-        return {
-            **super().state(),
-            "submaps": self.fleet.submaps(),
-            "sent": self._sent,
-            "corrections": {
-                session: {
-                    "sender": [sent.robot, sent.epoch, sent.time],
-                    "correction": [c.version, c.map_index, c.quality],
-                    "T_map_odom": np.array(c.T_map_odom),
-                }
-                for session, sent in self._corrections.items()
-                for c in (sent.correction,)
-            },
-        }
-
-    def take_over(
-        self,
-        state: State,
-        edits: Sequence[Edit],
-        times: Mapping[PacketNumber, float],
-        read: Callable[[PacketNumber], Packet],
-    ) -> None:
-        """Take over the state of another cloud and its edits; ``times`` are of its packets, which ``read`` gives."""
-        self._times, self._earlier = dict(times), read
-        self.restore(state, edits)
-        self.fleet.restore_submaps(state["submaps"])
-        self._sent = state["sent"]
-        for session, kept in state["corrections"].items():
-            robot, epoch, time = kept["sender"]
-            version, map_index, quality = kept["correction"]
-            correction = Correction(robot, version, map_index, frozen(kept["T_map_odom"]), quality)
-            self._corrections[session] = SessionCorrection(robot, epoch, time, correction)
 
     def receive(self, data: bytes) -> list[bytes]:
         """As ``apply``, with encoded packets.
@@ -118,10 +76,7 @@ class Cloud(FleetHost):
         return self.conclude((time, number) for number, time in self._times.items())
 
     def _packet(self, number: PacketNumber) -> Packet:
-        if number in self._packets:
-            return self._packets[number]
-        assert self._earlier is not None, "only a restored cloud lacks packets"
-        return self._earlier(number)
+        return self._packets[number]
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch

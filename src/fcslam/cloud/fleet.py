@@ -180,14 +180,6 @@ class Fleet:
         fleet._needs_replay = state["needs_replay"]
         return fleet
 
-    def submaps(self) -> State:
-        """The submaps that were compared. ``state`` does without, as the fleet can build them again from keyscans."""
-        return self._recognition.submaps.state()
-
-    def restore_submaps(self, state: State) -> None:
-        """After ``restored``: take over the submaps of ``submaps``, which saves the time to build them again."""
-        self._recognition.submaps.restore(state)
-
     def edit(self, changes: Sequence[Change]) -> None:
         """Replace the changes by hand that are in force; maps that only excluded closures joined are separated.
 

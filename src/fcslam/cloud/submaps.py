@@ -3,16 +3,12 @@
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import PackedSubmap, Submap, build_submap, self_violation
-from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
-from fcslam.storage.state_file import State
 
 UNPACKED: Final = 250
 """Submaps that are kept ready to compare, 0.2 MB each. To unpack one takes a tenth of the time to build it."""
@@ -58,27 +54,6 @@ class SubmapCache:
         if entry.noise is None:
             entry.noise = self_violation(self._scans(place))
         return entry.noise
-
-    def state(self) -> State:
-        """The submaps that were compared last, so that they need not be built again; for ``restore``.
-
-        Their noise is left out: whether it was needed depends on what was forgotten since.
-        """
-        built = [key for key, entry in self._entries.items() if entry.packed is not None or key in self._unpacked]
-        content = [packed_bytes(self._packed(key)) for key in built[-UNPACKED:]]
-        return {
-            "keys": [(*identifier, channel) for identifier, channel in built[-UNPACKED:]],
-            "sizes": [len(data) for data in content],
-            "content": np.frombuffer(b"".join(content), np.uint8),
-        }
-
-    def restore(self, state: State) -> None:
-        """Take over a ``state``."""
-        content, begin = state["content"].tobytes(), 0
-        for (robot, number, channel), size in zip(state["keys"], state["sizes"], strict=True):
-            packed = read_packed(content[begin : begin + size])
-            self._entries[KeyscanId(robot, number), Channel(channel)] = _Entry(packed)
-            begin += size
 
     def drop(self, place: Place) -> None:
         """Drop the submap around a place from the cache."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fcslam.lidar.field import FieldArrays, SurfelField
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FreeSpace, PackedSubmap, Submap
+from fcslam.lidar.submap import FreeSpace, Submap
 
 _HEADER = 4
 """Bytes of the length of the header, big-endian."""
@@ -35,22 +35,6 @@ def read_submap(data: bytes) -> Submap:
     *field, points, normals, solitary, origin, cells, corner = _unpack(data)
     surface = PointScan(points, normals, solitary, origin)
     return Submap(SurfelField.of(FieldArrays(*field)), surface, FreeSpace(cells, corner))
-
-
-def packed_bytes(packed: PackedSubmap) -> bytes:
-    """The same bytes for the same packed submap, on every machine with this byte order."""
-    labels, free = (np.frombuffer(data, np.uint8) for data in (packed.labels, packed.free))
-    about = np.array(packed.free_shape)
-    return _pack((*packed.field, labels, packed.rows, packed.solitary, packed.origin, free, about, packed.corner))
-
-
-def read_packed(data: bytes) -> PackedSubmap:
-    """The packed submap of ``packed_bytes``."""
-    *field, labels, rows, solitary, origin, free, about, corner = _unpack(data)
-    height, width = about.tolist()
-    return PackedSubmap(
-        FieldArrays(*field), labels.tobytes(), rows, solitary, origin, free.tobytes(), (height, width), corner
-    )
 
 
 def _pack(arrays: Sequence[NDArray[Any]]) -> bytes:

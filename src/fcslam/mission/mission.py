@@ -16,10 +16,9 @@ from pydantic import Field, model_validator
 from fcslam.anchoring.anchors import Anchored, Anchors, anchored
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
-from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
-from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
+from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
@@ -27,20 +26,19 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.driving import Drive, Leg, continued, one_by_one
 from fcslam.mission.floors import on_floors
-from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
+from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes
 from fcslam.mission.mission_store import StoredPacket
 from fcslam.places.matcher import MatchDecision
 from fcslam.processes import trim_memory
-from fcslam.records import Channel, Edit, Placement, Veto
+from fcslam.records import Edit, Placement, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
-from fcslam.storage.state_file import State
-from fcslam.wire.ledger import Counter, Ledger, Traffic
-from fcslam.wire.messages import Packet, PacketKind
-from fcslam.wire.packets import Label, SizedPacket, decode, measure
+from fcslam.wire.ledger import Counter
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import SizedPacket, measure
 
 _log = logging.getLogger(__name__)
 
@@ -146,11 +144,7 @@ def run_mission(
     with drive(sources, config.robot) as robots:
         new = [continued(legs, onto.session_count(name)) for legs, name in zip(robots, recordings, strict=True)]
         streams = [_packets(legs, meter) for legs in new]
-        first, streams = _first(streams)
-        if cloud.resume(first):
-            meter.take_over(onto)
-        else:
-            streams += [_packets(legs, meter) for legs in onto.legs()]
+        streams += [_packets(legs, meter) for legs in onto.legs()]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
             cloud.apply(sent)
             live(cloud)
@@ -164,7 +158,7 @@ class MissionCloud:
     def __init__(self, config: MissionConfig, inputs: MissionInputs = MissionInputs()) -> None:
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
         self.config, self._inputs, onto = config, inputs, inputs.onto
-        self.host = self._new_host()
+        self.host = Cloud(config.fleet, config.seed, inputs.verify_pairs, config.map)
         """The fleet."""
         self._traffic = Counter()
         self._packets: list[StoredPacket] = []
@@ -173,37 +167,6 @@ class MissionCloud:
         self.host.follow([*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in inputs.vetoes)])
         for packet in onto.refused:
             self.host.refuse(packet.robot, packet.epoch, packet.sequence)
-
-    def _new_host(self) -> Cloud:
-        return Cloud(self.config.fleet, self.config.seed, self._inputs.verify_pairs, self.config.map)
-
-    def resume(self, first: SizedPacket | None) -> bool:
-        """Take over the state after all packets of the earlier mission, so that they need not be applied again.
-
-        Args:
-            first: the first packet of the new ones; None if no packets were added.
-
-        Returns:
-            Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
-        """
-        onto = self._inputs.onto
-        packets = sorted(onto.stored, key=lambda packet: packet.order)
-        is_later = not packets or first is None or first.packet.order > packets[-1].order
-        if onto.state is None or not is_later or self.host.edits != onto.edits or self.config.cloud != onto.config:
-            return False
-        try:
-            numbered = {PacketNumber(session_name(p.robot, p.epoch), p.sequence): p for p in packets}
-            times, host = {number: packet.time for number, packet in numbered.items()}, self._new_host()
-            host.take_over(onto.state["cloud"], onto.edits, times, lambda number: decode(numbered[number].data))
-            traffic = {
-                Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
-                for robot, kind, channel, count, size in onto.state["traffic"]
-            }
-        except Exception as error:  # a mission must never depend on the state of an earlier one
-            _log.warning("all packets take effect again, as the state of the mission cannot be used: %s", error)
-            return False
-        self.host, self._packets, self._traffic = host, packets, Counter(Ledger(traffic, Traffic()))
-        return True
 
     def apply(self, sent: SizedPacket) -> list[Packet]:
         """Apply the next packet of a robot; returns the replies to it."""
@@ -245,7 +208,7 @@ class MissionCloud:
         placing = self._placed(result)
         run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
         run = replace(run, map_files={**run.map_files, **placing.files})
-        return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
+        return replace(run, mission=mission)
 
     def _placed(self, result: FleetResult) -> Anchored:
         anchors, is_fixed = self._inputs.anchors, any(robot.fixes for robot in result.robots)
@@ -255,25 +218,12 @@ class MissionCloud:
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
         return anchored(result, anchors, placed, lambda members: fuse_members(members, self.config.map))
 
-    def _state(self) -> State:
-        ledger = self._traffic.ledger()
-        traffic = [[*label, total.count, total.bytes] for label, total in ledger.accepted.items()]
-        return {"cloud": self.host.state(), "traffic": traffic}
-
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
     """The packets that one robot sends over its recording."""
     for leg in legs:
         meter.count(leg)
         yield from leg.packets
-
-
-def _first(streams: Sequence[Iterator[SizedPacket]]) -> tuple[SizedPacket | None, list[Iterator[SizedPacket]]]:
-    """The first packet of all streams, each of which is in order, and the same streams again."""
-    heads = [next(stream, None) for stream in streams]
-    there = [(head, stream) for head, stream in zip(heads, streams, strict=True) if head is not None]
-    first = min((head for head, _ in there), key=lambda head: head.packet.order, default=None)
-    return first, [itertools.chain((head,), stream) for head, stream in there]
 
 
 class _Meter:
@@ -311,12 +261,6 @@ class _Meter:
         else:
             self._tracks[leg.robot] |= leg.tracks
             self._faults[leg.robot] = leg.faults
-
-    def take_over(self, onto: SavedMission) -> None:
-        """Count an earlier mission whose packets need not be applied again."""
-        for leg in onto.driven():
-            self.count(leg)
-        self.keyscans += sum(packet.kind is PacketKind.KEYSCAN for packet in onto.stored)
 
     def report(self, fusing: bool = False) -> None:
         """Report the progress now."""

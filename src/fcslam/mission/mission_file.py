@@ -9,9 +9,8 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,17 +20,15 @@ from fcslam.cloud.edits import check_edit
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import InputError, PacketError, SourceError, StoreError
+from fcslam.errors import PacketError, SourceError, StoreError
 from fcslam.mission.driving import Leg
 from fcslam.mission.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
 from fcslam.records import Change, Edit, Undo
-from fcslam.runs.folder import MISSION, STATE
+from fcslam.runs.folder import MISSION
 from fcslam.sources.faults import Faults
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing
-from fcslam.storage.own_files import read_own
-from fcslam.storage.state_file import State, code_version, parse_state, state_bytes
-from fcslam.untrusted import MOST_BYTES, LimitError, check_unpacked, open_file, read_bytes
+from fcslam.untrusted import MOST_BYTES, LimitError, check_unpacked, open_file
 from fcslam.wire.packets import SizedPacket, decode, unpacked_size
 
 _log = logging.getLogger(__name__)
@@ -54,8 +51,6 @@ class SavedMission:
     """Packets without effect; their numbers are used up."""
     tracks: Mapping[str, Track]
     """The scans of each session whose scans are known, by its name."""
-    state: State | None = None
-    """The state of the cloud after all packets, if this user's program left one beside the file."""
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -81,16 +76,12 @@ class SavedMission:
 
     def legs(self) -> list[Iterator[Leg]]:
         """Yield the legs of each robot, as ``driving`` gives them for recordings."""
-        return [iter((replace(leg, packets=self.packets[leg.robot]),)) for leg in self.driven()]
-
-    def driven(self) -> list[Leg]:
-        """The way of each robot, without its packets."""
-        return [self._way(robot) for robot in self.robots]
+        return [iter((self._way(robot),)) for robot in self.robots]
 
     def _way(self, robot: str) -> Leg:
         tracks = {name: track for name, track in self.tracks.items() if robot_and_epoch(name)[0] == robot}
         stamps = tuple(stamp for track in tracks.values() for stamp in track.stamps.tolist())
-        return Leg(robot, (), stamps, tracks, Faults({}))
+        return Leg(robot, self.packets[robot], stamps, tracks, Faults({}))
 
 
 EMPTY: Final = SavedMission(CloudConfig(), (), (), (), {})
@@ -102,10 +93,9 @@ def read_mission(path: Path) -> SavedMission:
     path = mission_path(path)
     try:
         with opened_copy(path) as store:
-            mission = replace(stored_mission(store), state=_state_beside(path))
-        if mission.state is None:
-            check_packets(mission)
-            _ = mission.packets  # beside a state that fits the file, this program has decoded them all before
+            mission = stored_mission(store)
+        check_packets(mission)
+        _ = mission.packets
         return mission
     except (PacketError, LimitError) as error:
         raise SourceError(f"{path}: {error}") from error
@@ -135,31 +125,6 @@ def opened_copy(path: Path | None) -> Iterator[MissionStore]:
                 raise StoreError(str(error).replace(str(copy), str(path))) from error
         with closing(MissionStore(copy, is_checked=path is not None)) as store:
             yield store
-
-
-def mission_state_bytes(mission: bytes, state: State) -> bytes:
-    """The state of the cloud that made a mission file, for ``Run.state``."""
-    return state_bytes(_fits(mission), state)
-
-
-def _state_beside(path: Path) -> State | None:
-    """The state that fits this program and the mission file at ``path``; None if no such state is stored."""
-    place = path.with_name(STATE)
-    if path.name != MISSION or not place.exists():
-        return None
-    data = read_own(place)
-    if data is None:
-        _log.info("%s: is not of this user, or was changed; all packets take effect again", place)
-        return None
-    try:
-        return parse_state(place, data, _fits(read_bytes(path)))
-    except InputError as error:
-        _log.info("%s; all packets take effect again", error)
-        return None
-
-
-def _fits(mission: bytes) -> str:
-    return f"{code_version()} {blake2b(mission, digest_size=16).hexdigest()}"
 
 
 def mission_bytes(
@@ -243,7 +208,7 @@ def as_stored(sized: SizedPacket) -> StoredPacket:
 
 
 def stored_mission(store: MissionStore) -> SavedMission:
-    """What a store holds, without a state."""
+    """What a store holds."""
     packets: list[StoredPacket] = []
     last = 0
     while arrived := store.arrivals(last, _AT_ONCE):

@@ -9,7 +9,6 @@
     config.yaml                the complete configuration of the run
     quality.json, .png         the certificate: expected error of each square metre, open stretches, what to drive again
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
-    mission.state              what this program made of them, so that its user's next run need not apply them again
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
     localization/<robot>.csv   instead of local: of a robot that was localized in a finished map, pose, standard
                                deviations and quality at every laser scan
@@ -46,11 +45,10 @@ from fcslam.runs.tables import (
     write_tum,
 )
 from fcslam.storage.files import bring_back, replacing_folder
-from fcslam.storage.own_files import write_own
 from fcslam.untrusted import read_bytes, read_text
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES, JOINS = "trajectories", "local", "robots.csv", "closures.csv", "joins.csv"
-LOCALIZATION, MISSION, STATE = "localization", "mission.fcslam", "mission.state"
+LOCALIZATION, MISSION = "localization", "mission.fcslam"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 QUALITY = "quality"
 """Beginning of the names of the certificate's files: ``quality.json``, and a picture of each map."""
@@ -90,8 +88,6 @@ class Run:
     service have none."""
     mission: bytes = b""
     """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
-    state: bytes = b""
-    """The state of the cloud that made it, beside ``mission``; a run that was read has none."""
     localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
     """By robot: poses in a finished map; ``fcslam.localize`` makes them."""
 
@@ -234,8 +230,6 @@ def _write(run: Run, folder: Path) -> None:
         write_localized(folder / LOCALIZATION / f"{poses.robot}.csv", poses)
     if run.mission:
         (folder / MISSION).write_bytes(run.mission)
-    if run.state:
-        write_own(folder / STATE, run.state)
     write_robots(folder / ROBOTS, run.trajectories.values())
     write_closures(folder / CLOSURES, run.closures)
     write_joins(folder / JOINS, run.joins)
