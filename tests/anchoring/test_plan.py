@@ -10,6 +10,7 @@ import pytest
 from fcslam.anchoring.anchors import Anchors, anchored, read_anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
+from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -21,8 +22,8 @@ from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
 pytestmark = pytest.mark.slow
 
 
-def placed(result, plan=None, to_walls=False, by_hand=()):
-    anchors = Anchors(None if plan is None else BuildingPlan(plan), to_walls)
+def placed(result, plan=None, by_hand=()):
+    anchors = Anchors(None if plan is None else BuildingPlan(plan))
     return anchored(result, anchors, by_hand, lambda members: fuse_members(members, OccupancyConfig()))
 
 
@@ -93,10 +94,11 @@ def test_walls_of_the_plan_that_stand_are_no_deviations():
     assert report_of(placed(mapped()[0], plan_of()))["deviations"] == []
 
 
-def test_a_map_without_a_plan_can_be_turned_to_its_walls():
+def test_the_walls_of_a_map_show_how_it_is_turned():
     result, _ = mapped((3.0, -2.0, 0.3))
-    (robot,) = placed(result, to_walls=True).result.robots
-    turned = robot.T_map_base[0, 2] - 0.0  # the robot begins along the walls
+    (robot,) = result.robots
+    walls_rad = wall_direction(fuse_members([robot], OccupancyConfig()))
+    turned = robot.T_map_base[0, 2] - walls_rad  # the robot begins along the walls
     assert (turned + np.pi / 4) % (np.pi / 2) - np.pi / 4 == pytest.approx(0.0, abs=0.005)
 
 

@@ -16,7 +16,6 @@ import pytest
 
 from fcslam.cli import main, show
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from fcslam.mission.mission_file import mission_path
 from fcslam.runs import RobotTrajectory, Run
 
 API = "/api/v1"
@@ -135,15 +134,6 @@ def test_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(run, end):
             assert events.status_code == 200
             command.process.send_signal(end)
             assert command.process.wait(120.0) == 0
-
-
-@pytest.mark.slow
-def test_a_mission_file_is_mapped_and_shown(logs, tmp_path):
-    assert main(["map", str(logs[0]), "-o", str(tmp_path / "run"), "-q"]) == 0
-    mission = mission_path(tmp_path / "run").rename(tmp_path / "alone.fcslam")
-    report = tmp_path / "report.html"
-    assert main(["show", str(mission), "--html", str(report)]) == 0
-    assert "maps/0/tiles/" in report.read_text()
 
 
 @pytest.mark.slow

@@ -15,10 +15,8 @@ from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
 from fcslam.anchoring.surveyed_tags import MapTags, Survey, placed_by_tags, read_survey, tag_lines
-from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import InputError, SourceError
-from fcslam.geometry import se2
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
@@ -42,21 +40,16 @@ class Anchors:
     """What is known about the building."""
 
     plan: BuildingPlan | None = None
-    to_walls: bool = False
-    """Turn maps that nothing else places, so that their walls run along x and y."""
     survey: Survey | None = None
     """Positions of tags."""
 
 
-def read_anchors(
-    plan: StrPath | None = None, plan_scale: float | None = None, to_walls: bool = False, tags: StrPath | None = None
-) -> Anchors:
+def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, tags: StrPath | None = None) -> Anchors:
     """Read what is known about the building, for ``map_recordings``.
 
     Args:
         plan: floor plan: a PNG drawing, a DXF drawing, or the YAML file of a ROS map.
         plan_scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
-        to_walls: turn maps that nothing else places, so that their walls run along x and y.
         tags: YAML file with the positions of surveyed tags.
 
     Raises:
@@ -69,7 +62,7 @@ def read_anchors(
     building = None if plan is None else BuildingPlan(read_plan(Path(plan), plan_scale))
     if building is not None and building.submap.field.is_full:
         raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
-    return Anchors(building, to_walls, None if tags is None else read_survey(Path(tags)))
+    return Anchors(building, None if tags is None else read_survey(Path(tags)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +75,7 @@ class Anchored:
 
 
 def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers) -> Anchored:
-    """Place each map by the floor plan, else by surveyed tags, else by fixes, else by its walls.
+    """Place each map by the floor plan, else by surveyed tags, else by fixes.
 
     Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
@@ -123,9 +116,6 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
         if found is not None:
             part = found.part
             files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))
-        if anchors.to_walls and not in_plan and not is_placed and not by_tags and (found is None or found.refusal):
-            turn = np.array((0.0, 0.0, -wall_direction(fuse(part.robots))))
-            part = part.at(se2.compose(turn, part.graph.poses()))
         result = with_part(result, k, part)
         seen = MapTags(part.robots, result.sightings)
         tags += seen.report(k)

@@ -11,10 +11,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.anchoring.part import MapPart
+from fcslam.anchoring.part import MapPart, position_prior
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.graph.anchored import PosePrior, optimize_anchored
+from fcslam.graph.anchored import optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray
 
@@ -33,8 +33,6 @@ LEAST_SIGMA_M: Final = 0.02
 HYPOTHESES: Final = 400
 """Pairs of fixes from which the pose of the map is guessed."""
 ROUNDS: Final = 6
-_HEADING_INFORMATION: Final = 1e-6
-"""A fix says nothing about the heading; the solver needs a number above 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,11 +43,11 @@ class Georeference:
     fixes: int
     """Fixes at a scan of the map."""
     ignored: int
-    """Those of them that contradict the others."""
+    """Fixes that contradict the others."""
     refusal: str = ""
     """Why the map is not placed; empty if it is."""
     latitude_deg: float = 0.0
-    """Of the map's origin, as the others."""
+    """Latitude of the map's origin; the longitude and altitude are also those of the origin."""
     longitude_deg: float = 0.0
     altitude_m: float = 0.0
     heading_rad: float = 0.0
@@ -168,10 +166,11 @@ def _solve(
     for _ in range(ROUNDS):
         arms = measured.antennas(poses) - poses[measured.variables, :2]
         priors = [
-            PosePrior(
+            position_prior(
                 variable,
-                np.append(measured.east_north[row] - arms[row], poses[variable, 2]),
-                np.diag((*2 * ((measured.spread * measured.sigma_m[row]) ** -2.0,), _HEADING_INFORMATION)),
+                measured.east_north[row] - arms[row],
+                poses[variable, 2],
+                (measured.spread * measured.sigma_m[row]) ** -2.0,
             )
             for row, variable in enumerate(measured.variables.tolist())
             if agreeing[row]

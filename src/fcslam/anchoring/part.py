@@ -2,13 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
+from fcslam.graph.anchored import PosePrior
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, frozen
+
+_HEADING_INFORMATION: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +70,11 @@ def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
     )
     robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
     return replace(result, robots=robots, corrections=corrections, graph=graph, regions=regions)
+
+
+def position_prior(variable: int, xy: FloatArray, heading_rad: float, information: float) -> PosePrior:
+    """A measured position (2,) of a variable; the solver needs some information about its heading."""
+    return PosePrior(variable, np.append(xy, heading_rad), np.diag((information, information, _HEADING_INFORMATION)))
 
 
 def _variables(robots: Sequence[MappedRobot]) -> FloatArray:

@@ -196,6 +196,6 @@ def _dxf_lines(drawing: Any, flatness: float) -> list[FloatArray]:
                 corners = np.array([(point.x, point.y) for point in path.flattening(flatness)])
                 if len(corners) > 1 and np.isfinite(corners).all():
                     lines.append(corners)
-        except TypeError:  # an entity that is no line
+        except TypeError:  # an entity that is not a line
             continue
     return lines

@@ -13,13 +13,13 @@ from typing import Any, Final
 import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError
 
-from fcslam.anchoring.part import MapPart
+from fcslam.anchoring.part import MapPart, position_prior
 from fcslam.cloud.result import MappedRobot
 from fcslam.config import StrictModel, one_line, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.graph.anchored import PosePrior, optimize_anchored
+from fcslam.graph.anchored import optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, Tag, TagFamily, TagSighting
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text
@@ -43,7 +43,6 @@ BASELINE_M: Final = 1.0
 """Least distance of two surveyed tags that place a map without their headings."""
 MOST_PAIRS: Final = 2000
 """Pairs of surveyed tags that propose a motion of the map; the longest baselines count."""
-_HEADING_INFORMATION: Final = 1e-6
 _ROUNDS: Final = 3
 
 Survey = Mapping[Tag, tuple[float, float, float | None]]
@@ -98,7 +97,7 @@ class MapTags:
             if one.id.robot in self._robots:
                 by_tag.setdefault(one.tag, []).append(one)
         self.places = {tag: self._places(seen) for tag, seen in sorted(by_tag.items())}
-        """Of each tag, the place with most sightings first."""
+        """Places by tag, the one with most sightings first."""
 
     def variable(self, sighting: TagSighting) -> int:
         """Number of the variable of its keyscan."""
@@ -306,8 +305,7 @@ def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Ta
             arm = se2.compose(np.array((0.0, 0.0, poses[variable, 2])), one.T_base_tag)[:2]
             variance = np.linalg.inv(one.information)[:2, :2].trace() / 2.0 + SURVEY_SIGMA_M**2
             weight = 1.0 / (variance * counts[one.tag])
-            pose = np.append(np.array(survey[one.tag][:2]) - arm, poses[variable, 2])
-            priors.append(PosePrior(variable, pose, np.diag((weight, weight, _HEADING_INFORMATION))))
+            priors.append(position_prior(variable, survey[one.tag][:2] - arm, poses[variable, 2], weight))
         poses = optimize_anchored(graph, poses, priors)
     return poses
 

@@ -51,7 +51,7 @@ COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 
 
 class _Commands(TyperGroup):
-    """The commands. Who asks for one of ``fcslam tools`` without it is told where it is."""
+    """The commands; the error about one of ``fcslam tools`` names its place."""
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         group = self.commands.get("tools")
@@ -106,7 +106,7 @@ fcslam info robot1.bag
 fcslam info robot1.mcap --json
 fcslam show runs/building
 fcslam show runs/building --html report.html
-fcslam show runs/building/mission.fcslam --port 8350 --no-open
+fcslam show runs/building --port 8350 --no-open
 fcslam robot ros2:/robot1 -o runs/robot1
 fcslam robot ros2:/robot1 --server https://hub --state s --credentials c
 fcslam robot anna=ros2:/robot1 --sensors scan-topic=/front/scan

@@ -155,13 +155,13 @@ def _watch(
     notify: Callable[[str], None], follow: "Callable[[RobotPose], None]"
 ) -> "Callable[[int, RobotPose | None], None]":
     """Follow the poses of the scans, and print a line of progress for many scans."""
-    told = 0
+    reported = 0
 
     def watch(scans: int, pose: "RobotPose | None") -> None:
-        nonlocal told
-        if pose is None or scans == told:
+        nonlocal reported
+        if pose is None or scans == reported:
             return
-        told = scans
+        reported = scans
         follow(pose)
         if scans % _SCANS_PER_LINE == 0:
             notify(f"{scans} scans")

@@ -6,7 +6,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,12 +44,6 @@ MOST_JOINS = 6
 """Most joins that are printed; all are in joins.csv."""
 
 
-class AlignTo(StrEnum):
-    """What maps can be aligned with."""
-
-    WALLS = "walls"
-
-
 def map_recordings(
     logs: Annotated[
         list[str] | None,
@@ -76,7 +69,7 @@ def map_recordings(
         list[str] | None,
         typer.Option(
             metavar="[NAME[@TIME]=]FLOOR",
-            help="Floor of all LOGs, or of the robot NAME; with @TIME, from so many seconds after its first scan on, "
+            help="Floor of all LOGs, or of the robot NAME; with @TIME, from TIME seconds after its first scan on, "
             "in a new session. Places of different floors are never compared. Can be repeated.",
         ),
     ] = None,
@@ -94,10 +87,6 @@ def map_recordings(
     tags: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="YAML file of surveyed tags. The map is given in their coordinates."),
-    ] = None,
-    align: Annotated[
-        AlignTo | None,
-        typer.Option(help="Turn each map that nothing else places, so that its walls run along x and y."),
     ] = None,
     config: ConfigFiles = None,
     start: Annotated[
@@ -129,7 +118,7 @@ def map_recordings(
         prepare_output(output, force)
         earlier = EMPTY if onto is None else read_mission(onto)
         settings = with_starts(mission_config(config, continued_config(earlier)), start)
-        anchors = read_anchors(plan, plan_scale, align is AlignTo.WALLS, tags)
+        anchors = read_anchors(plan, plan_scale, tags)
         options = bag_options(sensors)
         if not logs and onto is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")

@@ -8,20 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from socket import socket
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fcslam.cli.listening import listen
 from fcslam.cli.options import Force
-from fcslam.cli.output import notices
-from fcslam.cli.warm_up import compiled
 from fcslam.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from fcslam.page.live_map import LiveMap
 
 LARGEST_BYTES = 2 * 2**30
@@ -30,9 +25,7 @@ HOST = "127.0.0.1"
 
 
 def show(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Run folder, or mission file, which is mapped again first.")
-    ],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
     *,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the page as one file, and serve nothing.")
@@ -55,8 +48,8 @@ def show(
 
     if html is not None and html.exists() and not (force and html.is_file()):
         raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
-    console = notices()
-    with _run_folder(run, console) as folder, ShownRun(folder, folder.resolve().name) as shown:
+    _check(run)
+    with ShownRun(run, run.resolve().name) as shown:
         if html is not None:
             content = report_html(shown).encode()
             try:
@@ -73,29 +66,17 @@ def show(
             run_viewer(viewer_app(ReadOnly(shown)), listening)
 
 
-@contextmanager
-def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
-    """The run folder to show; that of a mission file is made, and removed in the end."""
-    from fcslam import api
-    from fcslam.cli.progress import ProgressDisplay
+def _check(run: Path) -> None:
+    """Refuse what is not a run, a damaged run, and one that is too large."""
     from fcslam.runs import open_run
     from fcslam.runs.folder import is_run_folder
 
-    if run.is_file():
-        with TemporaryDirectory() as place:
-            folder = Path(place) / run.stem
-            with compiled(console), ProgressDisplay(console) as display:
-                display.start("mapping")
-                api.map_recordings([], onto=run).save(folder)
-            yield folder
-        return
     size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file()) if is_run_folder(run) else 0
     if size > LARGEST_BYTES:
         raise InputError(
             f"{run}: the files have {size / 2**30:.1f} GiB; fcslam show reads at most {LARGEST_BYTES / 2**30:.0f} GiB"
         )
-    _ = open_run(run).maps  # refuses a damaged run, and what is none
-    yield run
+    _ = open_run(run).maps
 
 
 @contextmanager

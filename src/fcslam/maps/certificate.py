@@ -3,7 +3,7 @@
 Two errors count for a cell: that of its position in the frame of the map's first robot, and that of its position
 relative to its surroundings. The covariances of the graph are larger than the errors, because no measurement counts as
 more precise than scan matching at its worst. ``SCALE`` is calibrated on simulated buildings
-(``benchmarks/certificate.py``). Where measurements contradict each other more than those of a good scanner do, the
+(``benchmarks/certificate.py``). Where measurements contradict each other more than with a good scanner, the
 errors are larger: ``CONTRADICTED``.
 """
 
@@ -51,7 +51,7 @@ AGAIN_M: Final = 0.01
 AGAIN_PER_M: Final = 0.001
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 UNKNOWN_INFORMATION: Final = 1e-4
-"""Of where keyscans begin that no edge connects with the first one."""
+"""Information about the pose of keyscans that no edge connects with the first one."""
 _SYMMETRIC: Final[dict[str, Any]] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 
@@ -76,7 +76,7 @@ class Places(NamedTuple):
     poses: FloatArray
     """Shape (P, 3)."""
     covariance: FloatArray
-    """Of their errors (x, y, theta) along the axes of ``map``, shape (3 P, 3 P), calibrated, without the floor."""
+    """Covariance of the errors (x, y, theta) along the axes of ``map``, (3 P, 3 P), calibrated, without the floor."""
     scale: float
     """Ratio of errors to the standard deviations of the graph."""
 

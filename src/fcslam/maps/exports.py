@@ -30,7 +30,7 @@ class EarthFrame(BaseModel):
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-180, le=180)
-    """Of the origin of the frame."""
+    """Longitude of the origin of the frame."""
     x_axis_from_east_deg: float
     """Direction of the x axis, counterclockwise."""
 
@@ -48,7 +48,7 @@ def earth_frame(folder: Path, number: int) -> EarthFrame | None:
 def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
     """A map of a run folder as ``svg`` or ``tif``, or its ``pgm`` and ``yaml`` as ``zip``.
 
-    None if there is no such map, or if it is to be on the earth and its place there is not known.
+    None if there is no such map, or if a GeoTIFF is asked for and the map's place on the earth is unknown.
 
     Raises:
         EvaluationError: the files of the map are broken.

@@ -95,7 +95,7 @@ class Explorer:
     """Sends the robots of one map to its frontiers: one frontier a robot, at the least total cost.
 
     A frontier costs the path, less what the unknown area there is worth. A robot keeps its frontier unless another one
-    saves much. A frontier at which a robot was, and which did not vanish, is no goal again: nothing more is seen there.
+    saves much. A frontier that remains after a robot was there is not assigned again: nothing more is seen.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class Explorer:
     def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
         """The frontier of each robot that can reach one.
 
-        The frontiers are those of the map as it is now, with a distance for each of the robots, in their order;
+        The frontiers of the present map have a distance for each of the robots, in their order;
         positions in metres, in the frame of the map.
         """
         for robot, at in robots.items():

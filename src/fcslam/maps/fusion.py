@@ -89,7 +89,7 @@ def fuse_periods(
 def _without_teammates(
     keyscans: Sequence[Keyscan], scans: list[Casting], senders: Mapping[str, str], config: OccupancyConfig
 ) -> list[Casting]:
-    """The scans without the points that lie on robots of other senders; the paths are those of the keyscans."""
+    """The scans without the points that lie on robots of other senders, by the paths of the keyscans."""
     stamps = np.array([keyscan.stamp for keyscan in keyscans])
     sessions = np.array([keyscan.id.robot for keyscan in keyscans])
     poses = np.array([scan.T_map_base for scan in scans]).reshape(-1, 3)

@@ -40,7 +40,7 @@ class TileBatch(NamedTuple):
     """Identifies the history of tiles, which has one coordinate frame and resolution. In another frame, earlier tiles
     count no longer."""
     version: int
-    """Of the newest change that the robot has with these tiles."""
+    """Version of the newest change that the robot has with these tiles."""
     resolution_m: float
     is_complete: bool
     """Whether there is nothing more to fetch."""

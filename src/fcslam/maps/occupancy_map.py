@@ -126,7 +126,7 @@ class MapArea(NamedTuple):
 
 
 def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
-    """As ``parse_map``, without a copy of the image, which may be large."""
+    """Like ``parse_map``, without a copy of the image, which may be large."""
     try:
         width, height, begin = _size(pgm)
         if len(pgm) - begin != width * height:

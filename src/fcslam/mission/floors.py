@@ -14,7 +14,7 @@ from fcslam.wire.checks import check_floor
 
 
 class OnFloors:
-    """A recording that tells its floors."""
+    """A recording whose scans name their floors."""
 
     def __init__(self, source: Source, floors: Mapping[float, str]) -> None:
         """``floors``: by the time at which the robot came there, in seconds since the first scan."""
@@ -27,15 +27,15 @@ class OnFloors:
 
     @property
     def faults(self) -> Faults:
-        """As in Source."""
+        """See ``Source``."""
         return self._source.faults
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source."""
+        """See ``Source``."""
         return self._source.survey(scans)
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source; the first scan on each floor names it."""
+        """See ``Source``; the first scan on each floor names it."""
         first_s, coming = math.nan, sorted(self._floors.items(), reverse=True)
         for record in self._source.records(scans):
             floor = ""

@@ -1,6 +1,6 @@
 """Changes in a mission's building: from a run folder to grids, a picture and a table of changed regions.
 
-The poses are those of the run; the ranges are those of its mission file.
+Poses come from the run, ranges from its mission file.
 """
 
 import csv
@@ -55,7 +55,7 @@ def find_changes(folder: Path, since: str | None = None, until: str | None = Non
 def changes_of(
     run: Run, mission: SavedMission, since: str | None, until: str | None, map_index: int, name: str
 ) -> Changes:
-    """As ``find_changes``, of a run and its mission; ``name`` tells in messages which run it is.
+    """Like ``find_changes``, from a run and its mission; messages call the run ``name``.
 
     Keyscans that are newer than the run are left out.
     """

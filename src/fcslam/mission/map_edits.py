@@ -62,11 +62,11 @@ def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatA
 
 
 def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tuple[float, float]]) -> FloatArray:
-    """The motion that moves points of a map nearest to where they shall be, in the least-squares sense.
+    """The motion that brings points of a map nearest to their targets, in the least-squares sense.
 
     Args:
         points: two or more points (x, y) in ``map``, metres.
-        targets: where each shall be, metres.
+        targets: target of each point, metres.
 
     Returns:
         The present frame in the new one, shape (3,), metres and radians.

@@ -59,7 +59,7 @@ class SavedMission:
 
     @cached_property
     def packets(self) -> Mapping[str, tuple[SizedPacket, ...]]:
-        """The packets of each robot in the order of their times, decoded when somebody asks for them."""
+        """The packets of each robot in the order of their times, decoded at the first use."""
         sent: dict[str, list[SizedPacket]] = {robot: [] for robot in self.robots}
         for stored in self.stored:
             sent[stored.robot].append(SizedPacket(decode(stored.data), stored.data))

@@ -39,7 +39,7 @@ VERSION = 8
 MOST_PACKETS = 2**53
 """No mission has as many."""
 NEARBY_S = 1.0
-"""So far outside of a session an edit may name a moment: stamps are rounded when they are printed."""
+"""An edit may name a moment this far outside of a session: stamps are rounded when they are printed."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
 _ASKED_AT_ONCE = 1024
@@ -154,7 +154,7 @@ class MissionStore:
             Database(place, SCHEMA, VERSION, is_checked=is_checked) if isinstance(place, Path) else place
         )
         self._edits: list[Edit] = []
-        """Those read so far, numbered from 1; each request of a robot asks for them."""
+        """The edits read so far, numbered from 1; each request of a robot asks for them."""
 
     def close(self) -> None:
         """Close the file."""
@@ -288,7 +288,7 @@ class MissionStore:
         return Edit(number, author, time_s, content)
 
     def check_named(self, content: Change | Undo) -> None:
-        """Check that the sessions and moments that an edit names are in the mission, those of a closure on one floor.
+        """Check that the sessions and moments that an edit names are in the mission, both of a closure on one floor.
 
         Raises:
             EditError: they are not.
