@@ -162,7 +162,7 @@ def training_page() -> str:
         for key, field in type(mine).model_fields.items()
         if getattr(mine, key) != getattr(other, key) and not isinstance(getattr(mine, key), Settings)
     ]
-    head = "| key | default | unit | allowed | effect |\n|---|---|---|---|---|"
+    head = "| key | default | allowed | effect |\n|---|---|---|---|"
     live_tables = [LEARNING, *live, "\n".join([head, *changed, ""])]
     robot = [LEARNING_ROBOT, *tables(RobotLearningSettings())]
     return "\n".join([TRAINING, *tables(TrainingSettings()), FEDERATED, *federated, *live_tables, *robot])
@@ -189,7 +189,7 @@ def tables(
             nested.append((key, field, value))
     if rows:
         yield f"In the code: {place_of(type(settings))}.\n"
-        yield "\n".join(["| key | default | unit | allowed | effect |", "|---|---|---|---|---|", *rows, ""])
+        yield "\n".join(["| key | default | allowed | effect |", "|---|---|---|---|", *rows, ""])
     for key, field, value in nested:
         yield f"{heading} `{path}{key}`\n\n{sentence(field.description)}\n"
         yield from tables(value, f"{path}{key}.", documented, heading)
@@ -203,7 +203,9 @@ def place_of(kind: type) -> str:
 def row(path: str, field: FieldInfo, value: Any) -> str:
     """One line of a table."""
     effect, stated = split_unit(sentence(field.description))
-    cells = [f"`{path}`", f"`{flow(value)}`", stated or unit(path), allowed(field), effect]
+    of_unit = stated or unit(path)
+    default = f"`{flow(value)}`" if of_unit == "-" else f"`{flow(value)}` {of_unit}"
+    cells = [f"`{path}`", default, allowed(field), effect]
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
