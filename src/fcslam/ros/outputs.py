@@ -55,7 +55,7 @@ LONGEST_PATH: Final = 5000
 LINE_WIDTH_M: Final = 0.05
 _OK, _WARN = 0, 1
 SPHERE_M: Final = 0.3
-_LINE_LIST, _SPHERE_LIST, _ADD = 5, 7, 0
+_LINE_LIST, _SPHERE_LIST = 5, 7
 
 
 class Grid(NamedTuple):
@@ -314,31 +314,17 @@ class Outputs:
     ) -> Any:
         """A marker of points (..., 2), metres in ``map``."""
         make, vector = self._codec.make, self._codec.vector
-        image = make(
-            "sensor_msgs/CompressedImage", header=self._codec.header(0, ""), format="", data=np.zeros(0, np.uint8)
-        )
         r, g, b = colour
+        width_m = 0.0 if kind == _LINE_LIST else scale_m
         return make(
             "visualization_msgs/Marker",
             header=self._codec.header(stamp_ns, self._map_frame),
             ns=name,
-            id=0,
             type=kind,
-            action=_ADD,
             pose=self._codec.pose(in_space(np.zeros(3))),
-            scale=vector("Vector3", scale_m, scale_m * (kind != _LINE_LIST), scale_m * (kind != _LINE_LIST)),
+            scale=vector("Vector3", scale_m, width_m, width_m),
             color=make("std_msgs/ColorRGBA", r=r, g=g, b=b, a=0.8),
-            lifetime=make("builtin_interfaces/Duration", sec=0, nanosec=0),
-            frame_locked=False,
             points=[vector("Point", x, y) for x, y in points.reshape(-1, 2).tolist()],
-            colors=[],
-            texture_resource="",
-            texture=image,
-            uv_coordinates=[],
-            text="",
-            mesh_resource="",
-            mesh_file=make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-            mesh_use_embedded_materials=False,
         )
 
     def _grid_message(self, stamp_ns: int, grid: Grid) -> Any:

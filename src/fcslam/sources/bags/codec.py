@@ -3,9 +3,12 @@
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from fcslam.records import Transform
 
 if TYPE_CHECKING:
+    from rosbags.interfaces import Nodetype
     from rosbags.typesys.store import Typestore
 
 SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
@@ -75,8 +78,23 @@ class MessageCodec:
         return bytes(serialize(message, full_name(kind)))
 
     def make(self, kind: str, **fields: Any) -> Any:
-        """A message of this kind."""
-        return self.store.types[full_name(kind)](**fields)
+        """A message of this kind; what ``fields`` do not give is zero or empty."""
+        name = full_name(kind)
+        _, defined = self.store.fielddefs[name]
+        zeros = {field: self._zero(*of) for field, of in defined if field not in fields}
+        return self.store.types[name](**zeros, **fields)
+
+    def _zero(self, node: "Nodetype", of: Any) -> Any:
+        """A zero of a type as rosbags describes it."""
+        from rosbags.interfaces import Nodetype
+
+        if node == Nodetype.NAME:
+            return self.make(of.replace("/msg/", "/"))
+        inner, count = of
+        if node == Nodetype.BASE:
+            return "" if inner == "string" else np.zeros((), inner).item()
+        is_number = inner[0] == Nodetype.BASE and inner[1][0] != "string"
+        return np.zeros(count, inner[1][0]) if is_number else [self._zero(*inner) for _ in range(count)]
 
     def time(self, stamp_ns: int) -> Any:
         """A time stamp."""
@@ -84,9 +102,8 @@ class MessageCodec:
         return self.make("builtin_interfaces/Time", sec=seconds, nanosec=nanoseconds)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
-        """A header; ROS 1 counts it, too."""
-        count = {"seq": 0} if self.ros1 else {}
-        return self.make("std_msgs/Header", stamp=self.time(stamp_ns), frame_id=frame, **count)
+        """A header."""
+        return self.make("std_msgs/Header", stamp=self.time(stamp_ns), frame_id=frame)
 
     def vector(self, kind: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
         """A message of geometry_msgs with three coordinates."""

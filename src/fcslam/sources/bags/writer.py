@@ -176,7 +176,7 @@ class _Bag:
         message = make(
             FIX,
             header=header,
-            status=make("sensor_msgs/NavSatStatus", status=0, service=1),
+            status=make("sensor_msgs/NavSatStatus", service=1),
             latitude=fix.latitude_deg,
             longitude=fix.longitude_deg,
             altitude=fix.altitude_m,
@@ -201,17 +201,9 @@ class _Bag:
         self._writer.write(self._connections[topic], self._bag_time_ns, self._codec.encode(message, kind))
 
     def _odometry(self, header: Any, T_parent_base: FloatArray) -> Any:
-        unknown = np.zeros(36)
-        make, vector = self._codec.make, self._codec.vector
-        pose = self._codec.pose(in_space(T_parent_base))
-        twist = make("geometry_msgs/Twist", linear=vector("Vector3"), angular=vector("Vector3"))
-        return make(
-            ODOMETRY,
-            header=header,
-            child_frame_id=_BASE,
-            pose=make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
-            twist=make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
-        )
+        make, pose = self._codec.make, self._codec.pose(in_space(T_parent_base))
+        posed = make("geometry_msgs/PoseWithCovariance", pose=pose)
+        return make(ODOMETRY, header=header, child_frame_id=_BASE, pose=posed)
 
     def _scan(self, header: Any, scan: LaserScan) -> Any:
         count, first_rad, increment_rad = scan.laser.beams
@@ -227,10 +219,8 @@ class _Bag:
             angle_increment=increment_rad,
             time_increment=beam_s,
             scan_time=count * beam_s,
-            range_min=0.0,
             range_max=scan.laser.max_range_m,
             ranges=np.ascontiguousarray(ranges_m),
-            intensities=np.zeros(0, dtype=np.float32),
         )
 
     def _camera_info(self, header: Any, camera: CameraModel) -> Any:
@@ -238,17 +228,12 @@ class _Bag:
         K = np.array([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0])
         P = np.insert(K, (3, 6, 9), 0.0)
         matrices = {"D": np.zeros(5), "K": K, "R": np.eye(3).ravel(), "P": P}
-        make = self._codec.make
-        region = make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        return make(
+        return self._codec.make(
             CAMERA_INFO,
             header=header,
             height=camera.height,
             width=camera.width,
             distortion_model="plumb_bob",
-            binning_x=0,
-            binning_y=0,
-            roi=region,
             **{name if self._codec.ros1 else name.lower(): matrix for name, matrix in matrices.items()},
         )
 
