@@ -12,13 +12,13 @@ WITHOUT_FOLDER = """
 import numpy as np
 from fcslam import compiled
 compiled._CachedCode._locator_classes = []  # as where nothing can be written
-from fcslam.cli.warm_up import tell_uncached
+from fcslam.cli.warm_up import report_uncached
 from fcslam.cli.output import notices
 from fcslam.features.codes import hamming
 from fcslam.warmup import is_cold
 assert hamming(*np.zeros((2, 4), np.uint64)) == 0
 assert is_cold()
-assert tell_uncached(notices(False))
+assert report_uncached(notices(False))
 """
 
 

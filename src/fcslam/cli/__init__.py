@@ -98,21 +98,17 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
 EXAMPLES = """\
 fcslam map robot1.clf.gz robot2.clf.gz
 fcslam map anna=run1.bag ben=run2.mcap -o runs/building
-fcslam map building.clf.gz --split 3 --quiet
 fcslam map robot1.bag robot2.bag --live
 fcslam map today.bag --onto runs/building -o runs/building-2
 fcslam map --onto runs/building -o runs/building-edited
-fcslam info robot1.bag
 fcslam info robot1.mcap --json
 fcslam show runs/building
-fcslam show runs/building --html report.html
 fcslam show runs/building --port 8350 --no-open
 fcslam robot ros2:/robot1 -o runs/robot1
 fcslam robot ros2:/robot1 --server https://hub --state s --credentials c
 fcslam robot anna=ros2:/robot1 --sensors scan-topic=/front/scan
 fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state
 fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c
-fcslam localize today.bag --map runs/building
 fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57
 fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy
 fcslam edit list runs/building
@@ -121,12 +117,10 @@ fcslam edit veto runs/building anna 1000.0 ben 1000.001
 fcslam edit veto runs/building anna ben
 fcslam edit pin runs/building anna 1000.0 ben 1000.001
 fcslam edit close runs/building anna 1000.0 ben 1000.001 --pose 0.5,0,3.1
-fcslam edit remove runs/building ben
 fcslam edit remove runs/building ben+1
 fcslam edit remove runs/building ben --from 1010 --to 1025
 fcslam edit floor runs/building anna+1 2
 fcslam edit erase runs/building "1,2 3,2 3,4 1,4"
-fcslam edit erase runs/building "0,0 2,0 1,2" --map 1
 fcslam edit free runs/building "1,2 3,4"
 fcslam edit keep-out runs/building "1,2 3,4"
 fcslam edit area runs/building "Room 12" "1,2 3,4"
@@ -137,28 +131,22 @@ fcslam record ros2:/robot1 -o day.mcap
 fcslam record ros2:/ -o day.mcap --duration 600
 fcslam record robot1.clf.gz -o robot1.bag
 fcslam record robot2.mcap -o robot2.clf.gz --sensors scan-topic=/front/scan
-fcslam serve --data cloud
 fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
-fcslam demo --live
 fcslam demo --robots 4 --no-camera -o demo4
 fcslam evaluate fleet fleet/run --truth fleet
 fcslam evaluate fleet demo/run --csv fleet.csv --figure fleet.png
 fcslam evaluate relations runs/intel intel.relations.gz
-fcslam evaluate relations runs/intel-3 intel.relations.gz --across-robots
 fcslam evaluate quality fleet/run
 fcslam tools simulate --building office --no-camera
 fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3
 fcslam tools simulate --robots 20 --building office -o office
-fcslam tools changes runs/building
 fcslam tools changes runs/building --since 2026-11-20 -o changes/week
 fcslam tools config > mission.yaml
 fcslam tools config paper > paper.yaml
 fcslam tools certificates --host cloud.local --robot robot1 --admin boss
 fcslam tools warm-up
 fcslam tools train photos -o detector
-fcslam tools train photos --quick
 fcslam tools federate local robot1 robot2 robot3 --public photos -o fleet
-fcslam tools federate local robot1 robot2 --quick
 fcslam tools federate serve lab:8000 --insecure --public photos -o fleet
 fcslam tools federate join http://server.lab:8000 images --name robot1 -o home
 fcslam tools extract photos -o features --keypoints 1000

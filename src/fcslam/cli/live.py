@@ -77,14 +77,14 @@ def drive_live(
     def notify(line: str) -> None:
         print_line(console, line)
 
-    def tell(event: "RobotEvent") -> None:
+    def print_event(event: "RobotEvent") -> None:
         if event.kind is not EventKind.CORRECTED:  # there are many
             notify(event.text)
 
     with (
         closing(open_network(live.address)) as network,
         compiled(console),
-        start(live.name, on_event=tell) as robot,
+        start(live.name, on_event=print_event) as robot,
     ):
         namespace = live.address.namespace
         topics = await_sensors(network, namespace, live.options, live.parameters.topic_timeout)

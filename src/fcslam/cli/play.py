@@ -120,11 +120,11 @@ def _learn(
     """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
     from fcslam.learning.federated.learning_process import LearningProcess
 
-    def tell(line: str) -> None:
+    def notify(line: str) -> None:
         print_line(console, line)
 
-    tell("the drive is over; the robot learns with its fleet until Ctrl-C")
-    learning = LearningProcess(plan, robot.name, tell)
+    notify("the drive is over; the robot learns with its fleet until Ctrl-C")
+    learning = LearningProcess(plan, robot.name, notify)
     began_s = time.monotonic()
     try:
         learning.set_idle(True)
@@ -134,7 +134,7 @@ def _learn(
             display.show("learning", round(passed_s), round(plan.settings.time_s))
             time.sleep(0.5)
     except KeyboardInterrupt:
-        tell("learning ends; the robot sends what is left")
+        notify("learning ends; the robot sends what is left")
     finally:
         learning.close()
 

@@ -9,7 +9,7 @@ import typer
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
 from fcslam.cli.options import ConfigFiles, Quiet, WorkersOption, mission_config
 from fcslam.cli.output import notices
-from fcslam.cli.warm_up import tell_uncached
+from fcslam.cli.warm_up import report_uncached
 
 
 def serve(
@@ -91,7 +91,7 @@ def serve(
         else:
             state = serving.shared_state(store, listening.getsockname()[1], data, authenticator, given, workers)
         serving.reload_on_hangup(state, tokens)
-        tell_uncached(notices(quiet))
+        report_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
         routers = [page_router(), report_router(state)]

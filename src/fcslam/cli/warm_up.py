@@ -24,7 +24,7 @@ def warm_up() -> None:
     from fcslam.warmup import WARM_UPS, compiling
 
     console = notices()
-    if tell_uncached(console):
+    if report_uncached(console):
         return
     print_line(console, f"compiling, about {EVERYTHING_S} s on one core")
     if cores() == 1:
@@ -42,7 +42,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def tell_uncached(console: "Console") -> bool:
+def report_uncached(console: "Console") -> bool:
     """Say so if compiled code cannot be kept; returns whether that is so."""
     from fcslam.compiled import uncached
 
@@ -60,7 +60,7 @@ def compiled(console: "Console") -> Iterator[None]:
     """Wait until the code for the first scans is compiled and say why; the rest is compiled meanwhile."""
     from fcslam.warmup import compiling, is_cold
 
-    if tell_uncached(console) or not is_cold():
+    if report_uncached(console) or not is_cold():
         yield
         return
     processes = cores()
