@@ -143,7 +143,7 @@ def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
     assert list(drain(outbox)) == [(0, 0), (0, 1)], "of the new one the cloud does not know yet"
     outbox.synchronize({0: 2, 1: 5})
     assert (outbox.epoch, outbox.is_synchronized) == (2, True), "another state folder had that one"
-    assert [outbox.part(epoch) for epoch in (0, 1, 2)] == [0, None, 1]
+    assert [outbox.session_of(epoch) for epoch in (0, 1, 2)] == [0, None, 1]
     assert list(drain(outbox)) == [(2, 0)]
     outbox.close()
     again = Outbox(path, "alice", LIMIT)
@@ -156,7 +156,7 @@ def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
     anew = Outbox(path, "alice", LIMIT)
     assert anew.begin("r", resume=False) == 0
     anew.put(of_part(0, 0))
-    assert [anew.part(epoch) for epoch in (0, 2, 3, 4)] == [None, None, None, 0]
+    assert [anew.session_of(epoch) for epoch in (0, 2, 3, 4)] == [None, None, None, 0]
     with pytest.raises(StateError, match="differs from that of the interrupted run"):
         anew.put([replace(said(0, KEYSCAN), epoch=0)])
     anew.close()

@@ -32,7 +32,7 @@ MOST_MET = 1000
 class _DrawnKeyscan(NamedTuple):
     """A keyscan that the cloud may not have drawn yet."""
 
-    part: int
+    session: int
     keyscan: Keyscan
     laser: LaserModel
     on_teammates: NDArray[np.bool_] | None
@@ -57,7 +57,7 @@ class JointMap:
         self._lasers: tuple[LaserModel, ...] = ()
         """As the robot announced them last."""
         self._newest: tuple[int, FloatArray] | None = None
-        """Part of the newest scan, and its pose by odometry without its jumps, or by the prediction in its place."""
+        """Session of the newest scan, and its pose by odometry without its jumps, or by the prediction in its place."""
         self._met: dict[_ScanKey, NDArray[np.bool_]] = {}
         """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
@@ -76,8 +76,8 @@ class JointMap:
                 with self._lock:
                     self._drawn.append(_DrawnKeyscan(packet.epoch, keyscan, laser, on_teammates))
 
-    def draw(self, part: int, track: ScanTrack, localizer: CorrectedOdometry) -> OccupancyMap | None:
-        """The joint map, with the keyscans of a part of the robot drawn into it that the cloud has not drawn yet.
+    def draw(self, session: int, track: ScanTrack, localizer: CorrectedOdometry) -> OccupancyMap | None:
+        """The joint map, with the keyscans of a session of the robot drawn into it that the cloud has not drawn yet.
 
         None: the server has not drawn the map that the robot's poses are in.
         """
@@ -87,7 +87,7 @@ class JointMap:
         with self._lock:
             while self._drawn and self._drawn[0].keyscan.stamp <= fleet.drawn_s:
                 self._drawn.popleft()
-            waiting = [one for one in self._drawn if one.part == part]
+            waiting = [one for one in self._drawn if one.session == session]
         lately = [
             Casting(ranges_m, laser, moved, keyscan.sweep)
             for _, keyscan, laser, on_teammates in waiting
@@ -97,15 +97,17 @@ class JointMap:
         ]
         return padded(draw_over(joint, lately, self._config))
 
-    def mark_teammates(self, scan: LaserScan, part: int, newest: RobotPose | None) -> LaserScan:
+    def mark_teammates(self, scan: LaserScan, session: int, newest: RobotPose | None) -> LaserScan:
         """The next scan with the beams marked that hit other robots.
 
-        ``newest`` is the pose of the scan before. ``odom`` is another frame in each part.
+        ``newest`` is the pose of the scan before. ``odom`` is another frame in each session.
         """
         fleet, radius_m = self._fleet, self._config.robot_radius_m
-        before, self._newest = self._newest, (part, scan.T_odom_base)
+        before, self._newest = self._newest, (session, scan.T_odom_base)
         joint, mates = fleet.joint_map, fleet.mates
-        if joint is None or mates is None or newest is None or before is None or before[0] != part or radius_m <= 0.0:
+        if joint is None or mates is None or newest is None or radius_m <= 0.0:
+            return scan
+        if before is None or before[0] != session:
             return scan
         if mates.map_index != newest.map_index:  # the joint map is that of the mates
             return scan

@@ -179,7 +179,7 @@ class LocalizedRobot(LiveTracker):
     def _estimate(self) -> MapEstimate | None:
         """Where the present session's ``odom`` lies in the map."""
         state = self._localizer.state
-        return state.estimate if state.session == self._part else None
+        return state.estimate if state.session == self._session else None
 
     def _take(self, packets: list[Packet]) -> None:
         """Nothing leaves a robot that makes no map."""

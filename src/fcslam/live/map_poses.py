@@ -11,7 +11,7 @@ from fcslam.robot.corrected_odometry import CorrectedOdometry
 
 
 class MapPoses:
-    """Corrections by part; a robot that was lost goes on in another part. Any thread may call."""
+    """Corrections by session; a robot that was lost goes on in another one. Any thread may call."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -21,29 +21,29 @@ class MapPoses:
         """Where the robot's own map lies in the map of the server, by its newest correction."""
         self._lock = threading.Lock()
 
-    def localizer(self, part: int) -> CorrectedOdometry:
-        """The localizer of a part: with the server's corrections as soon as there is one, else the robot's own."""
-        return self._by_server.get(part) or self._own.setdefault(part, CorrectedOdometry(self._clock))
+    def localizer(self, session: int) -> CorrectedOdometry:
+        """The localizer of a session: with the server's corrections as soon as there is one, else the robot's own."""
+        return self._by_server.get(session) or self._own.setdefault(session, CorrectedOdometry(self._clock))
 
-    def T_map_own(self, part: int) -> FloatArray:
+    def T_map_own(self, session: int) -> FloatArray:
         """Where the robot's own map lies in the map of its poses, shape (3,)."""
-        return self._T_map_own.get(part, np.zeros(3))
+        return self._T_map_own.get(session, np.zeros(3))
 
-    def correct(self, part: int, correction: Correction, is_server_away: bool) -> None:
+    def correct(self, session: int, correction: Correction, is_server_away: bool) -> None:
         """Take a correction of the robot's own map. While the server is away, it counts for the pose."""
         with self._lock:
-            own = self._own.setdefault(part, CorrectedOdometry(self._clock))
+            own = self._own.setdefault(session, CorrectedOdometry(self._clock))
             own.correct(correction)
-            if part in self._T_map_own and own.correction is not None and is_server_away:
-                T_map_odom = se2.compose(self._T_map_own[part], own.correction.T_map_odom)
-                self._by_server[part].move(T_map_odom)
+            if session in self._T_map_own and own.correction is not None and is_server_away:
+                T_map_odom = se2.compose(self._T_map_own[session], own.correction.T_map_odom)
+                self._by_server[session].move(T_map_odom)
 
-    def correct_by_server(self, part: int, correction: Correction) -> None:
+    def correct_by_server(self, session: int, correction: Correction) -> None:
         """Take a correction of the server."""
         with self._lock:
-            by_server = self._by_server.setdefault(part, CorrectedOdometry(self._clock))
+            by_server = self._by_server.setdefault(session, CorrectedOdometry(self._clock))
             by_server.correct(correction)
             if by_server.correction is correction:
-                own = self._own.get(part)
+                own = self._own.get(session)
                 T_own_odom = np.zeros(3) if own is None or own.correction is None else own.correction.T_map_odom
-                self._T_map_own[part] = se2.compose(correction.T_map_odom, se2.inverse(T_own_odom))
+                self._T_map_own[session] = se2.compose(correction.T_map_odom, se2.inverse(T_own_odom))

@@ -24,7 +24,7 @@ from fcslam.wire.packets import SizedPacket, decode, measure
 
 Answer = TypeVar("Answer")
 Correct = Callable[[int, Correction], None]
-"""Takes a correction and the part of its session; called in another thread."""
+"""Takes a correction and its session; called in another thread."""
 
 
 class OwnMap:
@@ -33,7 +33,7 @@ class OwnMap:
     def __init__(
         self, robot: str, config: MissionConfig, executor: Executor, correct: Correct, first_epoch: int
     ) -> None:
-        """Start a map in the only worker of ``executor``; part 0 of the robot is its session ``first_epoch``."""
+        """Start a map in the only worker of ``executor``; session 0 of this start is that of ``first_epoch``."""
         self._robot, self._executor, self._correct, self._first_epoch = robot, executor, correct, first_epoch
         self.failure: str | None = None
         """Why the map stopped growing; None if it grows."""
@@ -109,8 +109,8 @@ class OwnMap:
         if error is not None:
             self.failure = self.failure or f"{type(error).__name__}: {error}"
             return
-        for part, correction in done.result():
-            self._correct(part, correction)
+        for session, correction in done.result():
+            self._correct(session, correction)
 
     def _answer(self, function: Callable[..., Answer], *arguments: object) -> Answer:
         self.hand_over()
@@ -145,7 +145,7 @@ def _restore(cloud: MissionCloud, earlier: Sequence[bytes]) -> list[tuple[int, C
 
 
 def _apply(cloud: MissionCloud, packets: Sequence[Packet], first_epoch: int) -> list[tuple[int, Correction]]:
-    """Apply packets, whose epochs are parts; returns the corrections with their parts."""
+    """Apply packets, whose epochs count from this start; returns the corrections with their sessions."""
     numbered = (_in_epoch(packet, first_epoch + packet.epoch) for packet in packets)
     replies = [reply for packet in numbered for reply in cloud.apply(measure(packet))]
     return [(reply.epoch - first_epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]

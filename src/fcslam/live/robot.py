@@ -129,12 +129,12 @@ class Robot(LiveTracker):
         super().__init__(name, laser, settings_of(config), on_event)
         self._camera = checked_camera(camera)
         self._clock = wiring.clock
-        self._newest_part = 0
-        """The part that the newest pose is of."""
+        self._newest_session = 0
+        """The session that the newest pose is of."""
         self._applied: Correction | None = None
         """The correction that the newest pose was made with."""
         self._map_poses = MapPoses(wiring.clock)
-        self._keyscans = self._part_base = 0
+        self._keyscans = self._first_session = 0
         self._is_placed = False
         """Whether the poses of all keyframes are written."""
         self._is_online: bool | None = None
@@ -221,7 +221,7 @@ class Robot(LiveTracker):
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: its place in the map, its connection, and counts since its start."""
-        uplink, localizer, tracks = self._uplink, self._map_poses.localizer(self._part), self._frontend.tracks
+        uplink, localizer, tracks = self._uplink, self._map_poses.localizer(self._session), self._frontend.tracks
         failure = self._frontend.packets.failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
@@ -232,7 +232,7 @@ class Robot(LiveTracker):
             map_index=localizer.map_index,
             correction_age_s=localizer.age_s,
             quality=localizer.quality,
-            times_lost=self._part - max(part for part, track in enumerate(tracks) if track.is_new_floor),
+            times_lost=self._session - max(session for session, track in enumerate(tracks) if track.is_new_floor),
             notices=notices,
         )
         if uplink is None:
@@ -270,9 +270,9 @@ class Robot(LiveTracker):
         if self._joint is None:
             return None
         with self._lock:
-            part = self._part
-            track = self._frontend.tracks[part]
-        return self._joint.draw(part, track, self._map_poses.localizer(part))
+            session = self._session
+            track = self._frontend.tracks[session]
+        return self._joint.draw(session, track, self._map_poses.localizer(session))
 
     def own_map(self) -> OccupancyMap:
         """The map of all that this robot has seen so far, corrected by all loop closures.
@@ -290,8 +290,8 @@ class Robot(LiveTracker):
         own = self._require_own_map()
         self._catch_up()
         with self._lock:
-            part = self._part
-        return own.draw(self._session(part), self._map_poses.T_map_own(part))
+            session = self._session
+        return own.draw(self._session_name(session), self._map_poses.T_map_own(session))
 
     def closures(self) -> FloatArray:
         """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``.
@@ -302,8 +302,8 @@ class Robot(LiveTracker):
         """
         own = self._require_own_map()
         with self._lock:
-            part = self._part
-        return own.closures(self._session(part), self._map_poses.T_map_own(part))
+            session = self._session
+        return own.closures(self._session_name(session), self._map_poses.T_map_own(session))
 
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost or changed its floor; it waits for the worker.
@@ -316,23 +316,23 @@ class Robot(LiveTracker):
         """
         self._catch_up()
         with self._lock:
-            part = self._part
-            track = self._frontend.tracks[part]
+            session = self._session
+            track = self._frontend.tracks[session]
             stamps, keyscans, offsets = track.stamps, track.keyscans, track.T_keyscan_base
             T_odom_keyscan = track.T_odom_keyscan
-        known = np.empty((0, 3)) if self._own is None else self._own.poses(self._session(part))
+        known = np.empty((0, 3)) if self._own is None else self._own.poses(self._session_name(session))
         # The map may have got keyscans since the track was read.
-        known = se2.compose(self._map_poses.T_map_own(part), known[: len(T_odom_keyscan)])
+        known = se2.compose(self._map_poses.T_map_own(session), known[: len(T_odom_keyscan)])
         # Keyscans that the map does not have yet go on from the last one that it has.
-        moved = self._map_poses.localizer(part).T_map_base(np.zeros(3))
+        moved = self._map_poses.localizer(session).T_map_base(np.zeros(3))
         T_map_odom = np.zeros(3) if moved is None else moved
         if len(known):
             T_map_odom = se2.compose(known[-1], se2.inverse(T_odom_keyscan[len(known) - 1]))
         poses = np.concatenate((known, se2.compose(T_map_odom, T_odom_keyscan[len(known) :])))
-        index = self._map_poses.localizer(part).map_index
+        index = self._map_poses.localizer(session).map_index
         T_map_base = se2.compose(poses[keyscans], offsets)
         return RobotTrajectory(
-            self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base), track.floor
+            self._session_name(session), 0 if index is None else index, frozen(stamps), frozen(T_map_base), track.floor
         )
 
     def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
@@ -415,8 +415,8 @@ class Robot(LiveTracker):
         prepare_output(Path(folder), force)
         with self._lock:
             self._take(self._frontend.ready(wait=True))  # a run needs the keyscans of all its scans
-            parts = enumerate(self._frontend.tracks)
-            tracks = {self._session(part): track_of(track) for part, track in parts if len(track)}
+            sessions = enumerate(self._frontend.tracks)
+            tracks = {self._session_name(session): track_of(track) for session, track in sessions if len(track)}
         if not tracks:
             raise InputError(f"{self.name}: no scan was added, so there is no map to save")
         stamps = np.concatenate([track.stamps for track in tracks.values()])
@@ -424,16 +424,16 @@ class Robot(LiveTracker):
         run.save(folder, force)
         return run
 
-    def _session(self, part: int) -> str:
-        return session_name(self.name, self._part_base + part)
+    def _session_name(self, session: int) -> str:
+        return session_name(self.name, self._first_session + session)
 
     def _start(self, executor: Executor, outbox: Outbox | None, own_map: bool, keyframes: Path | None) -> None:
         """Start the back end, which keeps keyframes in a folder if there is one, and the robot's own map, which goes on
         from the earlier sessions in ``outbox``."""
         robot = self._config.robot
-        self._part_base = 0 if outbox is None else outbox.first_epoch
+        self._first_session = first = 0 if outbox is None else outbox.first_epoch
         try:
-            self._own = OwnMap(self.name, self._config, executor, self._correct, self._part_base) if own_map else None
+            self._own = OwnMap(self.name, self._config, executor, self._correct, first) if own_map else None
             backend = WorkerBackend(self.name, robot, executor, keyframes)
             self._frontend = RobotFrontend(self.name, robot, backend, self._mark_teammates)
         except BrokenExecutor as error:
@@ -484,7 +484,7 @@ class Robot(LiveTracker):
         return super()._processed(record)
 
     def _mark_teammates(self, scan: LaserScan) -> LaserScan:
-        return scan if self._joint is None else self._joint.mark_teammates(scan, self._part, self._pose)
+        return scan if self._joint is None else self._joint.mark_teammates(scan, self._session, self._pose)
 
     def _take(self, packets: list[Packet]) -> None:
         if not packets:
@@ -502,15 +502,15 @@ class Robot(LiveTracker):
         pose = self._pose
         return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
-    def _correct(self, part: int, correction: Correction) -> None:
+    def _correct(self, session: int, correction: Correction) -> None:
         """Take a correction of the robot's own map, in any thread."""
-        self._map_poses.correct(part, correction, self._is_server_away())
+        self._map_poses.correct(session, correction, self._is_server_away())
 
     def _is_server_away(self) -> bool:
         return self._uplink is None or self._uplink.trouble is not None
 
     def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
-        localizer = self._map_poses.localizer(self._part)
+        localizer = self._map_poses.localizer(self._session)
         corrected = localizer.T_map_base(T_smooth_base)
         is_found = self._frontend.scan_poses.is_new_floor or localizer.quality > 0.0
         return RobotPose(
@@ -527,9 +527,9 @@ class Robot(LiveTracker):
         )
 
     def _tell(self) -> None:
-        part, correction = self._part, self._map_poses.localizer(self._part).correction
-        if part > self._newest_part:
-            self._newest_part, self._applied = part, None
+        session, correction = self._session, self._map_poses.localizer(self._session).correction
+        if session > self._newest_session:
+            self._newest_session, self._applied = session, None
             track = self._frontend.scan_poses
             if track.is_new_floor:
                 where = f"floor {track.floor}" if track.floor else "a floor without a name: it rode in a lift; name it"

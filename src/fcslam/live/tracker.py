@@ -154,7 +154,8 @@ class LiveTracker(ABC):
         self._stack.close()
 
     @property
-    def _part(self) -> int:
+    def _session(self) -> int:
+        """Number of the present session, from 0."""
         return len(self._frontend.tracks) - 1
 
     def _processed(self, record: SensorRecord) -> list[Packet]:

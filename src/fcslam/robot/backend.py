@@ -172,7 +172,7 @@ class RobotBackend:
                 rest = self._session.finish()
                 self._place()
                 if self._folder is not None:
-                    self._folder.part += 1
+                    self._folder.session += 1
                 self._view_extractor.reset()
                 self._session = _Session(self._robot, self._session.epoch + 1, self._view_extractor, self._config)
                 return rest

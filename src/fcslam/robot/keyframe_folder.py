@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 class KeptKeyframe:
     """A keyframe as the process beside the robot reads it."""
 
-    part: int
+    session: int
     """Session of this start, from 0."""
     image: KeyframeImage
     features: ImageFeatures
@@ -46,7 +46,7 @@ class KeyframeFolder:
         """``folder``: created if it does not exist."""
         self._folder = folder
         self._is_failed = False
-        self.part = 0
+        self.session = 0
         """Session whose keyframes are written."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -77,10 +77,10 @@ class KeyframeFolder:
 
     def place(self, T_own_keyscan: FloatArray) -> None:
         """Write the poses of all keyscans of this session in the robot's own map, shape (N, 3)."""
-        self._write(self._folder / f"{self.part}-{_POSES}{_SUFFIX}", {"T_own_keyscan": T_own_keyscan})
+        self._write(self._folder / f"{self.session}-{_POSES}{_SUFFIX}", {"T_own_keyscan": T_own_keyscan})
 
     def _path(self, keyscan: int) -> Path:
-        return self._folder / f"{self.part}-{keyscan}{_SUFFIX}"
+        return self._folder / f"{self.session}-{keyscan}{_SUFFIX}"
 
     def _write(self, path: Path, state: State) -> None:
         """Mapping goes on without the keyframes of a full disk."""
@@ -104,17 +104,17 @@ def read_keyframes(folder: Path, most: int) -> list[KeptKeyframe]:
         tuple(map(int, path.stem.split("-"))) for path in folder.glob(f"*{_SUFFIX}") if not path.stem.endswith(_POSES)
     )
     poses: dict[int, FloatArray] = {}
-    for part in {part for part, _ in numbers}:
-        state = _read(folder / f"{part}-{_POSES}{_SUFFIX}")
-        poses[part] = np.empty((0, 3)) if state is None else state["T_own_keyscan"]
-    known = [(part, keyscan) for part, keyscan in numbers if keyscan < len(poses[part])]
-    found = ((part, poses[part][keyscan], keyscan) for part, keyscan in known[-most:])
-    frames = (_keyframe(folder, part, keyscan, pose) for part, pose, keyscan in found)
+    for session in {session for session, _ in numbers}:
+        state = _read(folder / f"{session}-{_POSES}{_SUFFIX}")
+        poses[session] = np.empty((0, 3)) if state is None else state["T_own_keyscan"]
+    known = [(session, keyscan) for session, keyscan in numbers if keyscan < len(poses[session])]
+    found = ((session, poses[session][keyscan], keyscan) for session, keyscan in known[-most:])
+    frames = (_keyframe(folder, session, keyscan, pose) for session, pose, keyscan in found)
     return [frame for frame in frames if frame is not None]
 
 
-def _keyframe(folder: Path, part: int, keyscan: int, T_own_keyscan: FloatArray) -> KeptKeyframe | None:
-    state = _read(folder / f"{part}-{keyscan}{_SUFFIX}")
+def _keyframe(folder: Path, session: int, keyscan: int, T_own_keyscan: FloatArray) -> KeptKeyframe | None:
+    state = _read(folder / f"{session}-{keyscan}{_SUFFIX}")
     if state is None:
         return None
     x, y, z, *rotation = state["camera"].pop("T_base_camera").tolist()
@@ -129,7 +129,7 @@ def _keyframe(folder: Path, part: int, keyscan: int, T_own_keyscan: FloatArray) 
         frozen(state["descriptors"], np.uint8),
     )
     return KeptKeyframe(
-        part, image, features, state["detector_version"], se2.compose(T_own_keyscan, image.T_keyscan_image)
+        session, image, features, state["detector_version"], se2.compose(T_own_keyscan, image.T_keyscan_image)
     )
 
 

@@ -1,9 +1,9 @@
 """Outbox of a robot: numbered packets on disk that the cloud has not confirmed yet.
 
-Each start of a robot is an epoch. Each time the robot is lost, another epoch begins, the next part of the same start.
-The front end numbers its parts and the packets of each part. The outbox assigns the epoch and the sequence number on
-the wire, in the order of sending. It forgets the data of a packet once the cloud has stored it, but keeps a digest. By
-the digests it checks that a recording that is read again produces the same packets.
+Each start of a robot begins a session, and so does each loss of its place. The front end numbers the sessions of its
+start, and the packets of each. The outbox assigns the numbers on the wire, in the order of sending: the epoch, which
+counts the sessions of all starts, and the sequence number. It forgets the data of a packet once the cloud has stored
+it, but keeps a digest. By the digests it checks that a recording that is read again produces the same packets.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ _VERSION = 3
 _SCHEMA = """
 CREATE TABLE robot (name TEXT NOT NULL, agent TEXT NOT NULL);
 CREATE TABLE sessions (
-    epoch INTEGER PRIMARY KEY, part INTEGER NOT NULL, recording TEXT NOT NULL, met INTEGER NOT NULL,
+    epoch INTEGER PRIMARY KEY, session INTEGER NOT NULL, recording TEXT NOT NULL, met INTEGER NOT NULL,
     stored INTEGER NOT NULL
 );
 CREATE TABLE packets (
@@ -44,7 +44,7 @@ CREATE TABLE releases (
 CREATE INDEX numbers ON packets (epoch, sequence);
 CREATE INDEX waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
-# - part: the front end's own epoch, 0 for the first part of a start
+# - session: the front end's own number, 0 for the first session of a start
 # - ordinal: the front end's own count
 # - sequence: the number on the wire, NULL for a packet that is never sent
 # - data: NULL once it need not be sent
@@ -80,7 +80,7 @@ class Outbox:
         self.epoch = -1
         """Epoch of the newest session."""
         self._first = -1
-        """Epoch of the first part of this start."""
+        """Epoch of the first session of this start."""
         with self._state_errors():
             self._database = Database(path, _SCHEMA, _VERSION, exclusive=True)
         try:
@@ -97,11 +97,11 @@ class Outbox:
     def _check_waiting(self) -> None:
         """Compare the waiting packets with their digests."""
         question = (
-            "SELECT epoch, part, ordinal, sequence, digest, data FROM packets JOIN sessions USING (epoch) "
+            "SELECT epoch, session, ordinal, sequence, digest, data FROM packets JOIN sessions USING (epoch) "
             f"WHERE {_IS_WAITING} ORDER BY epoch, sequence"
         )
-        for epoch, part, ordinal, sequence, digest, data in self._rows(question):
-            if not _is_whole(data, part, ordinal, digest):
+        for epoch, session, ordinal, sequence, digest, data in self._rows(question):
+            if not _is_whole(data, session, ordinal, digest):
                 raise StateError(
                     f"{self._path}: packet {sequence} of epoch {epoch} is damaged, and later packets depend on "
                     "it; give another --state"
@@ -125,7 +125,7 @@ class Outbox:
             StateError: the last start read another recording.
         """
         with self._transaction() as connection:
-            last, before = _one(connection, "SELECT max(epoch), recording FROM sessions WHERE part = 0")
+            last, before = _one(connection, "SELECT max(epoch), recording FROM sessions WHERE session = 0")
             if resume and last is not None:
                 if before != recording:
                     raise StateError(
@@ -140,7 +140,7 @@ class Outbox:
 
     @property
     def first_epoch(self) -> int:
-        """Epoch of the first part of this start."""
+        """Epoch of the first session of this start."""
         return self._first
 
     @property
@@ -148,9 +148,9 @@ class Outbox:
         """Whether the cloud has confirmed every session; packets of other sessions are not sent."""
         return not self._rows("SELECT 1 FROM sessions WHERE met = 0 LIMIT 1")
 
-    def part(self, epoch: int) -> int | None:
-        """The part of this start that an epoch stands for; None for epochs of earlier starts."""
-        rows = self._rows("SELECT part FROM sessions WHERE epoch = ? AND epoch >= ?", (epoch, self._first))
+    def session_of(self, epoch: int) -> int | None:
+        """The session of this start with this epoch; None for epochs of earlier starts."""
+        rows = self._rows("SELECT session FROM sessions WHERE epoch = ? AND epoch >= ?", (epoch, self._first))
         return int(rows[0][0]) if rows else None
 
     @property
@@ -317,18 +317,18 @@ class Outbox:
             raise StateError(f"{self._path}: belongs to robot '{row[0]}', not '{robot}'; give each its own --state")
         return str(row[1])
 
-    def _open_session(self, connection: sqlite3.Connection, part: int, recording: str) -> int:
+    def _open_session(self, connection: sqlite3.Connection, session: int, recording: str) -> int:
         (self.epoch,) = _one(connection, "SELECT coalesce(max(epoch) + 1, 0) FROM sessions")
-        connection.execute("INSERT INTO sessions VALUES (?, ?, ?, 0, 0)", (self.epoch, part, recording))
+        connection.execute("INSERT INTO sessions VALUES (?, ?, ?, 0, 0)", (self.epoch, session, recording))
         return self.epoch
 
-    def _epoch_of(self, connection: sqlite3.Connection, part: int) -> int:
-        """Epoch of a part of this start; a new part opens a session."""
-        row = _one(connection, "SELECT epoch FROM sessions WHERE part = ? AND epoch >= ?", part, self._first)
+    def _epoch_of(self, connection: sqlite3.Connection, session: int) -> int:
+        """Epoch of a session of this start; a new one is stored."""
+        row = _one(connection, "SELECT epoch FROM sessions WHERE session = ? AND epoch >= ?", session, self._first)
         if row is not None:
             return int(row[0])
         (recording,) = _one(connection, "SELECT recording FROM sessions WHERE epoch = ?", self._first)
-        return self._open_session(connection, part, recording)
+        return self._open_session(connection, session, recording)
 
     def _is_known(self, connection: sqlite3.Connection, epoch: int, ordinal: int, digest: bytes) -> bool:
         row = _one(connection, "SELECT digest FROM packets WHERE epoch = ? AND ordinal = ?", epoch, ordinal)
@@ -364,10 +364,10 @@ def _digest(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=8).digest()
 
 
-def _is_whole(data: bytes, part: int, ordinal: int, digest: bytes) -> bool:
+def _is_whole(data: bytes, session: int, ordinal: int, digest: bytes) -> bool:
     """Whether a packet as it is sent is the one that the front end made."""
     try:
-        return _digest(readdress(data, part, ordinal)) == digest
+        return _digest(readdress(data, session, ordinal)) == digest
     except PacketError:
         return False
 

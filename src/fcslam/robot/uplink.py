@@ -50,14 +50,14 @@ class Uplink:
             folder: holds refused packets and detectors.
             rng: of the delays after failures.
             clock: seconds.
-            correct: called in the sender's thread, with the part of this start and its correction.
+            correct: called in the sender's thread, with the session of this start and its correction.
             known: number of packets that the outbox has from before an interruption, and that come again.
             budget: None: every packet is sent.
         """
         self._outbox = outbox
         self._refused = folder / "refused"
         self._budget = budget
-        self._correct_part = correct
+        self._correct_session = correct
         self._known = known
         self._detector_updates = DetectorUpdates(folder / "detectors", outbox, frontend)
         self._detector_updates.resume()
@@ -178,9 +178,9 @@ class Uplink:
             self._put += len(chosen)
 
     def _correct(self, epoch: int, correction: Correction) -> None:
-        part = self._outbox.part(epoch)
-        if part is not None:
-            self._correct_part(part, correction)
+        session = self._outbox.session_of(epoch)
+        if session is not None:
+            self._correct_session(session, correction)
 
     def _keep_refused(self, data: bytes, reason: str) -> None:
         try:

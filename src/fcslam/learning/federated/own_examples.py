@@ -51,7 +51,7 @@ def _split(path: Path, frames: Sequence[KeptKeyframe], settings: HeldOutSettings
     known: dict[str, bool] = {}
     with suppress(OSError, ValueError, AttributeError):
         known = {str(name): bool(value) for name, value in json.loads(path.read_text(encoding="utf-8")).items()}
-    names = [f"{frame.part}-{frame.image.keyscan}" for frame in frames]
+    names = [f"{frame.session}-{frame.image.keyscan}" for frame in frames]
     for name, frame in zip(names, frames, strict=True):
         known.setdefault(name, settings.is_held_out(frame.T_own_base))
     write_file(path, json.dumps(known))
