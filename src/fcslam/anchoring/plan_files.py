@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.maps.ros_map import read_ros_map
+from fcslam.maps.ros_map import decoded_image, read_ros_map
 from fcslam.records import FloatArray, frozen
 from fcslam.untrusted import read_bytes
 
@@ -81,14 +81,7 @@ def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
 def _drawn_plan(path: Path, scale: float | None) -> OccupancyMap:
     if scale is None:
         raise SourceError(f"{path}: a picture has no scale; give metres per pixel, as in --plan-scale 0.02")
-    data = read_bytes(path)
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        pixels: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except cv2.error:  # more pixels than OpenCV reads
-        pixels = None
-    finally:
-        cv2.utils.logging.setLogLevel(before)
+    pixels = decoded_image(read_bytes(path))
     if pixels is None:
         raise SourceError(f"{path}: cannot be read as a picture; save the plan as PNG, DXF or a ROS map (YAML)")
     if pixels.shape[0] * pixels.shape[1] > MOST_PIXELS:

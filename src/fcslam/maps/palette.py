@@ -36,5 +36,5 @@ def robot_colors(sessions: Iterable[str]) -> dict[str, int]:
 
 
 def _robot(session: str) -> str:
-    """A session's name ends in its epoch after a plus sign if the robot was started again."""
+    """A session's name ends in its number after a plus sign if the robot was started again."""
     return re.sub(r"\+\d+$", "", session)

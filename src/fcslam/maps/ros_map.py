@@ -107,14 +107,21 @@ def _map(image: bytes, description: str) -> OccupancyMap:
     return OccupancyMap(frozen(cells, np.uint8), resolution_m, origin_xy)
 
 
+def decoded_image(image: bytes) -> Any:
+    """The pixels as OpenCV reads them, without its messages; None if it cannot read them."""
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) if image else None
+    except cv2.error:  # more pixels than OpenCV reads
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
 def _decoded(image: bytes) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Grey values and which pixels are opaque, each (H, W); None if all are."""
     check_image(image)
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) if image else None
-    finally:
-        cv2.utils.logging.setLogLevel(before)
+    pixels = decoded_image(image)
     if pixels is None:
         raise ValueError("the image cannot be read; copy it again, or save it as PGM or PNG")
     if (white := _white(image, pixels.dtype)) != 255:

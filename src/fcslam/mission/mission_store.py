@@ -170,8 +170,8 @@ class MissionStore:
         if conflict is not None:
             packet = packets[conflict]
             raise PacketConflictError(
-                f"{packet.robot}: packet {packet.sequence} of epoch {packet.epoch} was stored before with "
-                "other content; restart the robot in a new epoch",
+                f"{session_name(packet.robot, packet.epoch)}: packet {packet.sequence} was stored before with other "
+                "content; restart the robot in a new session",
                 conflict,
             )
         return new
@@ -387,14 +387,13 @@ class MissionStore:
         packed = unpacked = 0
         tracks: dict[tuple[str, int], Track] = {}
         for robot, epoch, *blobs in rows:
-            name = f"{robot}, epoch {epoch}"
             try:
                 columns = [unpack(blob, "zlib") for blob in blobs]
                 packed, unpacked = packed + sum(map(len, blobs)), unpacked + sum(map(len, columns))
                 check_unpacked(packed, unpacked)
                 tracks[robot, epoch] = _track(*columns)
             except (OSError, ValueError) as error:
-                raise StoreError(f"the scans of {name} are broken ({error})") from error
+                raise StoreError(f"the scans of {session_name(robot, epoch)} are broken ({error})") from error
         return tracks
 
     def traffic(self) -> Ledger:
