@@ -287,7 +287,6 @@ def _contradiction(seen: Mapping[Tag, FloatArray], survey: Survey, a: Tag, b: Ta
 
 
 def _distances_m(seen: Mapping[Tag, FloatArray], survey: Survey, a: Tag, b: Tag) -> tuple[float, float]:
-    """How far apart two tags are in the map and in the survey."""
     here, there = seen[a][:2] - seen[b][:2], np.subtract(survey[a][:2], survey[b][:2])
     return float(np.hypot(*here)), float(np.hypot(*there))
 

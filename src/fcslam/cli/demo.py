@@ -83,7 +83,6 @@ def demo(
 
 
 def _prepare(output: Path) -> None:
-    """Create the folder, and remove the results of an earlier demo from it."""
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():

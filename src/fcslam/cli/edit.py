@@ -252,7 +252,6 @@ def _draw(folder: Path, use: str, name: str, corners: str, map_index: int) -> No
 
 
 def _opened(folder: Path) -> "tuple[Run, SavedMission]":
-    """A run and its mission."""
     from fcslam.mission.mission_file import read_mission
     from fcslam.runs import open_run
 

@@ -40,19 +40,11 @@ class ProgressDisplay:
         self._interval_s = interval_s
         self._is_live = console.is_terminal and not console.is_dumb_terminal and not console.quiet
         self._bars = Progress(
-            TextColumn(
-                "{task.description}",
-                markup=False,
-                table_column=Column(no_wrap=True, overflow="ellipsis", max_width=LONGEST_STAGE),
-            ),
+            _text("{task.description}", max_width=LONGEST_STAGE),
             BarColumn(bar_width=BAR_WIDTH),
             _TextOf(_count),
             _TextOf(_time),
-            TextColumn(
-                "{task.fields[details]}",
-                markup=False,
-                table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1),
-            ),
+            _text("{task.fields[details]}", ratio=1),
             console=console,
             transient=True,
             expand=True,
@@ -114,6 +106,11 @@ class ProgressDisplay:
             if line:
                 print_line(self._console, line)
             interval_s = max(self._interval_s, min((monotonic() - began) / 20.0, LONGEST_INTERVAL_S))
+
+
+def _text(text: str, max_width: int | None = None, ratio: int | None = None) -> TextColumn:
+    column = Column(no_wrap=True, overflow="ellipsis", max_width=max_width, ratio=ratio)
+    return TextColumn(text, markup=False, table_column=column)
 
 
 class _TextOf(ProgressColumn):

@@ -150,7 +150,6 @@ def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") ->
 
 
 def _with_progress(source: "Source", total: int, console: "Console") -> "Iterator[SensorRecord]":
-    """The records of a recording of ``total`` scans, with a progress display."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.records import LaserScan
 

@@ -116,7 +116,6 @@ def shared_state(
 
 
 def _limit(variable: str, least: int, otherwise: int) -> int:
-    """A limit that the environment gives."""
     text = os.environ.get(variable) or str(otherwise)
     if not (text.isdecimal() and int(text) >= least):
         raise ServiceError(f"{variable}={text}: is not a number from {least} on")

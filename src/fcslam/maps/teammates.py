@@ -149,7 +149,6 @@ def _returns_near(ranges_m, origins, directions, reach_m, T_map_base, begin, end
 
 
 def _drop(scans: list[Casting], suspects: _Suspects, chosen: NDArray[np.bool_]) -> None:
-    """Make the chosen points invalid."""
     numbers, beams = suspects.scans[chosen], suspects.beams[chosen]  # scan by scan
     kinds, first = np.unique(numbers, return_index=True)
     if not len(numbers):

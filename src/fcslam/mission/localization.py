@@ -83,7 +83,6 @@ def pose_in_map(name: str, given: ArrayLike, occupancy: OccupancyMap) -> FloatAr
 
 
 def _floors(folder: Path) -> dict[int, str]:
-    """Floor of each map of a run folder."""
     try:
         return dict(read_robots(folder / ROBOTS).values())
     except (OSError, ValueError, csv.Error) as error:

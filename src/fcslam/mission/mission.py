@@ -220,7 +220,6 @@ class MissionCloud:
 
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
-    """The packets that one robot sends over its recording."""
     for leg in legs:
         meter.count(leg)
         yield from leg.packets

@@ -473,7 +473,6 @@ def _edits(query: Callable[[str, tuple[int]], Iterable[Any]], after: int) -> lis
 
 
 def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
-    """Check a log of edits."""
     edits: list[Edit] = []
     for number, author, time_s, kind, content in rows:
         edit = Edit(number, author, time_s, read_edit(kind, content))
@@ -512,7 +511,6 @@ def _put(database: Transaction, packets: Sequence[StoredPacket], received_s: flo
 
 
 def _known(database: Transaction, packets: Sequence[StoredPacket]) -> dict[tuple[str, int, int], bytes]:
-    """The stored packets of the same numbers."""
     known: dict[tuple[str, int, int], bytes] = {}
     for begin in range(0, len(packets), _ASKED_AT_ONCE):
         asked = packets[begin : begin + _ASKED_AT_ONCE]
