@@ -11,18 +11,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from fcslam.errors import EvaluationError
-from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift
+from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.detector import (
     BUNDLED_NETWORK,
     MATCHING_SCALES,
     GreyImage,
-    KeypointDetector,
     Keypoints,
     OnnxConfig,
     OnnxDetector,
@@ -31,6 +31,8 @@ from fcslam.features.files import read_grey
 from fcslam.learning.homography import Size
 from fcslam.records import FloatArray, frozen
 from fcslam.untrusted import read_text
+
+from .baselines import Fast, Harris, KeypointDetector, ShiTomasi, Sift, logit_features
 
 
 class EvaluatedDetectorKind(StrEnum):
@@ -164,7 +166,7 @@ def one_thread() -> Iterator[None]:
 def _network(name: EvaluatedDetectorKind, weights: Path | None) -> EvaluatedDetector:
     network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES, scales=MATCHING_SCALES))
     if name is EvaluatedDetectorKind.LOGITS:
-        return _run_here(f"{network.version}-logits", network.detect_floats)
+        return _run_here(f"{network.version}-logits", partial(logit_features, network))
     return _run_here(network.version, network.detect)
 
 

@@ -20,8 +20,7 @@ import cv2
 import numpy as np
 
 from fcslam.errors import writing
-from fcslam.features.detector import FloatFeatures, ImageFeatures, Keypoints
-from fcslam.features.matching import mutual_pairs, nearest_neighbours
+from fcslam.features.detector import ImageFeatures, Keypoints
 from fcslam.features.nms import box_nms
 from fcslam.learning.homography import (
     Repeatability,
@@ -38,6 +37,7 @@ from fcslam.learning.homography import (
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
 
+from .baselines import FloatFeatures
 from .detectors import (
     EvaluatedDetector,
     FramedImage,
@@ -48,6 +48,7 @@ from .detectors import (
     frame,
     one_thread,
 )
+from .matching import mutual_pairs, nearest_neighbours
 
 SMALL: Final[Size] = (320, 240)
 LARGE: Final[Size] = (640, 480)

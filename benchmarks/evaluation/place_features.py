@@ -21,7 +21,6 @@ from fcslam.features.codes import code_words, hamming_matrix, mutual_matches
 from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.files import extract, find_files, read_features, read_grey
-from fcslam.features.matching import mutual_pairs
 from fcslam.lidar.lost import LostConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.kmeans_tree import Tree, TreeShape, find_leaves, grow_tree
@@ -34,6 +33,7 @@ from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
+from .matching import mutual_pairs
 from .place_sets import PlaceSet, all_images, read_place_set
 from .retrieval import PairTruth, excluding_recent
 

@@ -28,11 +28,7 @@ class Settings(StrictModel):
     """Base class of all settings: frozen, no unknown keys, finite numbers only."""
 
     def __init__(self, **values: Any) -> None:
-        """Check ``values``; keys that are not given have their defaults.
-
-        Raises:
-            ConfigError: see ``parse``.
-        """
+        """Check ``values``; keys that are not given have their defaults."""
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -47,11 +43,7 @@ SettingsType = TypeVar("SettingsType", bound=Settings)
 
 
 def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None) -> SettingsType:
-    """Read a YAML file over the settings ``over``; None: the defaults of ``kind``.
-
-    Raises:
-        ConfigError: the file cannot be read, is not a mapping, or has an unknown key or a wrong value.
-    """
+    """Read a YAML file over the settings ``over``; None: the defaults of ``kind``."""
     try:
         content = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, UnicodeDecodeError) as error:
@@ -66,11 +58,7 @@ def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None)
 
 
 def changed(settings: SettingsType, content: dict[str, Any], where: str) -> SettingsType:
-    """The settings with the keys of ``content`` changed, checked as a whole; ``where`` names its origin in messages.
-
-    Raises:
-        ConfigError: see ``parse``.
-    """
+    """The settings with the keys of ``content`` changed, checked as a whole; ``where`` names its origin in messages."""
     return parse(type(settings), _merged(settings.model_dump(), content), where)
 
 
@@ -174,11 +162,7 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str | bytes, most: int = MOST_TEXT_BYTES) -> Any:
-    """Content of YAML text of unknown origin.
-
-    Raises:
-        ValueError: it is longer than ``most``, or not valid YAML; the message is one line.
-    """
+    """Content of YAML text of unknown origin."""
     if len(text) > most:
         raise ValueError(f"{len(text)} characters of YAML; the limit is {most}")
     try:

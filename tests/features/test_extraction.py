@@ -6,8 +6,8 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift, make_detector
-from fcslam.features.detector import NO_FEATURES, FloatFeatures, OnnxConfig
+from fcslam.features.classical import Orb, OrbConfig, make_detector
+from fcslam.features.detector import NO_FEATURES, OnnxConfig
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.files import extract, read_features, read_grey, write_features
 from tests.features.networks import tiny_network
@@ -153,25 +153,6 @@ def test_what_is_written_is_read_again_the_strongest_first(tmp_path, image):
     assert size == (320, 240)
     assert np.array_equal(again.scores, features.scores)
     assert sorted(map(bytes, again.descriptors)) == sorted(map(bytes, features.descriptors))
-
-
-@pytest.mark.parametrize("detector", [Fast(), Harris(), ShiTomasi(), Sift(500)], ids=lambda one: type(one).__name__)
-def test_detectors_to_compare_with_find_what_a_shifted_image_has_shifted(detector, image):
-    found, shifted = detector.detect(image), detector.detect(np.roll(image, (6, 9), (0, 1)))
-    assert len(found.scores) > 50
-    assert np.all(np.diff(found.scores) <= 0)
-    assert np.all((found.keypoints_px >= 0) & (found.keypoints_px < image.shape[::-1]))
-    gaps = np.linalg.norm(found.keypoints_px[:50, None] + (9, 6) - shifted.keypoints_px, axis=2).min(axis=1)
-    assert np.mean(gaps < 1.0) > 0.8
-    empty = detector.detect(np.full((64, 64), 100, np.uint8))
-    assert empty.keypoints_px.shape == (0, 2)
-
-
-def test_sift_describes_by_numbers(image):
-    features = Sift(100).detect(image)
-    assert isinstance(features, FloatFeatures)
-    assert features.descriptors.shape == (len(features.scores), 128)
-    assert Sift(100).detect(np.zeros((64, 64), np.uint8)).descriptors.shape == (0, 128)
 
 
 def test_taking_some_takes_all_that_is_known_of_them(image):

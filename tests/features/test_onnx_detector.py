@@ -51,24 +51,12 @@ def test_bits_are_the_signs_of_the_logits_at_a_cells_centre(tmp_path):
     assert np.array_equal(np.unpackbits(found.descriptors[0]), expected)
 
 
-def test_floats_are_what_the_bits_are_the_signs_of(weights):
+def test_bits_are_the_signs_of_the_logits(weights):
     image = np.random.default_rng(2).integers(0, 256, (61, 50), np.uint8)
     detector = OnnxDetector(OnnxConfig(weights=weights))
-    bits, floats = detector.detect(image), detector.detect_floats(image)
-    assert np.array_equal(floats.keypoints_px, bits.keypoints_px)
-    assert np.array_equal(floats.scores, bits.scores)
-    assert np.array_equal(np.packbits(floats.descriptors >= 0, axis=1), bits.descriptors)
-    assert np.linalg.norm(floats.descriptors, axis=1) == pytest.approx(1.0)
-
-
-def test_logits_that_are_all_zero_stay_so(weights, monkeypatch):
-    detector = OnnxDetector(OnnxConfig(weights=weights))
-    scores = np.zeros((16, 16), np.float32)
-    scores[5, 6] = 0.5
-    monkeypatch.setattr("fcslam.features.detector._run", lambda *_: (scores, np.zeros((256, 2, 2), np.float32)))
-    found = detector.detect_floats(np.zeros((16, 16), np.uint8))
-    assert found.keypoints_px.tolist() == [[6, 5]]
-    assert not found.descriptors.any()
+    bits, (found, logits) = detector.detect(image), detector.find(image)
+    assert np.array_equal(found.keypoints_px, bits.keypoints_px)
+    assert np.array_equal(np.packbits(logits >= 0, axis=1), bits.descriptors)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (7, 300), (8, 8), (240, 320), (241, 317)])
@@ -83,8 +71,6 @@ def test_nothing_to_see_is_an_empty_well_shaped_result(weights):
     for shape in ((240, 320), (0, 0)):
         found = OnnxDetector(OnnxConfig(weights=weights)).detect(np.zeros(shape, np.uint8))
         assert (found.keypoints_px.shape, found.scores.shape, found.descriptors.shape) == ((0, 2), (0,), (0, 32))
-        floats = OnnxDetector(OnnxConfig(weights=weights)).detect_floats(np.zeros(shape, np.uint8))
-        assert (floats.keypoints_px.shape, floats.descriptors.shape) == ((0, 2), (0, 256))
 
 
 def test_settings_bound_what_is_kept(weights):

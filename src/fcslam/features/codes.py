@@ -47,11 +47,7 @@ def popcount(_context: Any, word: Any) -> Any:
 
 
 def code_words(codes: Codes) -> CodeWords:
-    """View codes (N, 32) as read-only, aligned uint64 (N, 4); a copy if a view is impossible.
-
-    Raises:
-        ValueError: ``codes`` is not (N, 32) uint8.
-    """
+    """View codes (N, 32) as read-only, aligned uint64 (N, 4); a copy if a view is impossible."""
     if codes.ndim != 2 or codes.shape[1] != CODE_BYTES or codes.dtype != np.uint8:
         raise ValueError(f"expected codes of shape (N, {CODE_BYTES}) uint8, not {codes.shape} {codes.dtype}")
     words: CodeWords = np.ascontiguousarray(codes).view(np.uint64)
@@ -71,9 +67,6 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
     """Match codes of ``a`` (N, 32) and ``b`` (M, 32) that are each other's nearest neighbour.
 
     Pairs are at most ``max_distance`` bits apart. Of equally near neighbours, the one with the lowest index counts.
-
-    Raises:
-        ValueError: a set is not (N, 32) uint8, or has more than 2 ** 22 codes.
     """
     if max(len(a), len(b)) > _MOST_CODES:
         raise ValueError(f"at most {_MOST_CODES} codes a set, not {max(len(a), len(b))}")
@@ -83,9 +76,6 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
 def nearest_codes(a: Codes, b: Codes) -> NDArray[np.int64]:
     """Index of the nearest code of ``b`` (M, 32), M > 0, to every code of ``a`` (N, 32), shape (N,); of equal ones the
     first.
-
-    Raises:
-        ValueError: as ``mutual_matches``.
     """
     if len(b) > _MOST_CODES:
         raise ValueError(f"at most {_MOST_CODES} codes a set, not {len(b)}")

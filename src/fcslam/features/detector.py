@@ -77,27 +77,12 @@ class ImageFeatures(Keypoints):
     """Shape (K, 32)."""
 
 
-@dataclass(frozen=True, slots=True)
-class FloatFeatures(Keypoints):
-    """Keypoints with float descriptors, compared by Euclidean distance."""
-
-    descriptors: NDArray[np.float32]
-    """Shape (K, D)."""
-
-
 NO_FEATURES = ImageFeatures(
     frozen(np.empty((0, 2)), np.float32), frozen(np.empty(0), np.float32), frozen(np.empty((0, CODE_BYTES)), np.uint8)
 )
 
 
-class KeypointDetector(Protocol):
-    """Finds keypoints."""
-
-    def detect(self, image: GreyImage) -> Keypoints:
-        """Keypoints of an image (H, W), the strongest first; K = 0 without any."""
-
-
-class FeatureDetector(KeypointDetector, Protocol):
+class FeatureDetector(Protocol):
     """Finds keypoints and describes each by 256 bits."""
 
     @property
@@ -143,11 +128,7 @@ class OnnxDetector:
     """Keypoints and codes by a network."""
 
     def __init__(self, config: OnnxConfig) -> None:
-        """Load and try the network; the bundled one is loaded for the first image.
-
-        Raises:
-            FeatureError: the file is missing, or is not a network of this format.
-        """
+        """Load and try the network; the bundled one is loaded for the first image."""
         self._config = config
         if config.weights is None and not BUNDLED_NETWORK.is_file():
             raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or choose orb")
@@ -176,17 +157,8 @@ class OnnxDetector:
 
     def detect(self, image: GreyImage) -> ImageFeatures:
         """Features of an image (H, W) of any size, ranked by keypoint probability."""
-        found, sampled = self._find(image)
+        found, sampled = self.find(image)
         return ImageFeatures(found.keypoints_px, found.scores, frozen(np.packbits(sampled >= 0.0, axis=1), np.uint8))
-
-    def detect_floats(self, image: GreyImage) -> FloatFeatures:
-        """The keypoints of ``detect`` in an image (H, W), with their logits, scaled to unit length, as descriptors.
-
-        A comparison with ``detect`` measures the loss by quantisation to bits.
-        """
-        found, sampled = self._find(image)
-        lengths = np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), np.finfo(np.float32).tiny)
-        return FloatFeatures(found.keypoints_px, found.scores, frozen(sampled / lengths, np.float32))
 
     def infer(self, image: GreyImage) -> tuple[Probabilities, Logits]:
         """Keypoint probabilities (H, W) of an image, and logits (256, rows, columns) of the cells that cover it."""
@@ -196,7 +168,7 @@ class OnnxDetector:
         scores, logits = _run(self._loaded[0], padded(image))
         return scores[:height, :width], logits
 
-    def _find(self, image: GreyImage) -> tuple[Keypoints, NDArray[np.float32]]:
+    def find(self, image: GreyImage) -> tuple[Keypoints, NDArray[np.float32]]:
         """The strongest keypoints of all scales, and their logits (K, 256)."""
         levels = [self._find_at(image, scale) for scale in self._config.scales]
         positions, strengths, logits = (np.concatenate(parts) for parts in zip(*levels, strict=True))

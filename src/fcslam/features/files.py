@@ -42,11 +42,7 @@ def read_grey(path: Path) -> GreyImage:
 
 
 def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, int]) -> None:
-    """Write the features of an image of ``image_size`` (width, height), pixels; makes the folder of the file.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the features of an image of ``image_size`` (width, height), pixels; makes the folder of the file."""
     arrays: Arrays = {
         "keypoints": features.keypoints_px,
         "scores": features.scores,
@@ -105,11 +101,7 @@ class Extraction:
 
 
 def find_files(images: Path) -> list[Path]:
-    """Return the file itself, or all files in the folder and its subfolders, sorted.
-
-    Raises:
-        FeatureError: there is no file.
-    """
+    """Return the file itself, or all files in the folder and its subfolders, sorted."""
     files = [images] if images.is_file() else sorted(path for path in images.rglob("*") if path.is_file())
     if not files:
         raise FeatureError(f"{images}: no file there; name an image or a folder of images")
@@ -122,9 +114,6 @@ def extract_all(
     """Write the features of each image below ``output``, at the image's path relative to ``root``.
 
     Files that cannot be read are skipped and reported.
-
-    Raises:
-        OutputError: features cannot be written.
     """
     written: dict[Path, Path] = {}
     for path in files:

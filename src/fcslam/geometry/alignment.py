@@ -34,9 +34,6 @@ def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> Array:
 
     Returns:
         ``T_a_b``, shape (3,), metres and radians.
-
-    Raises:
-        ValueError: the points have another shape, are not finite, or the two of one frame coincide.
     """
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
     if a.shape != (2, 2) or b.shape != (2, 2):
@@ -67,9 +64,6 @@ def n_point_alignment(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLi
     Returns:
         Poses, shape (..., 3), metres and radians; NaN if the points determine no rotation (all coincide, or fewer than
         two have a weight).
-
-    Raises:
-        ValueError: the shapes do not fit, or a weight is negative.
     """
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
     if a.shape != b.shape or a.ndim < 2 or a.shape[-1] != 2:

@@ -130,11 +130,7 @@ class PlaceIndex(Generic[PlaceId]):
         return self._training
 
     def add(self, place: PlaceId, descriptors: Codes) -> None:
-        """Store a place with its descriptors (N, 32): Algorithm 1, lines 3-11.
-
-        Raises:
-            ValueError: the place is stored already, or the descriptors are malformed.
-        """
+        """Store a place with its descriptors (N, 32): Algorithm 1, lines 3-11."""
         if place in self._row_of:
             raise ValueError(f"place {place} is in the index already")
         codes = code_words(descriptors)
@@ -184,11 +180,7 @@ class PlaceIndex(Generic[PlaceId]):
         return BagOfWords(words[order], weights[order], self.version)
 
     def descriptors(self, place: PlaceId) -> Codes:
-        """The descriptors of a stored place, shape (N, 32).
-
-        Raises:
-            KeyError: it is not stored.
-        """
+        """The descriptors of a stored place, shape (N, 32)."""
         return frozen(self._postings.codes(self._row_of[place]).view(np.uint8), np.uint8)
 
     def all_descriptors(self) -> Codes:
@@ -196,11 +188,7 @@ class PlaceIndex(Generic[PlaceId]):
         return self._postings.gather(self._rows()).view(np.uint8)
 
     def forget(self, place: PlaceId) -> None:
-        """Remove a place.
-
-        Raises:
-            KeyError: it is not stored.
-        """
+        """Remove a place."""
         leaves = self._postings.forget(self._row_of.pop(place))
         if self._training and self._config.strategy is Strategy.INCREMENTAL:
             self._merge(leaves)

@@ -333,11 +333,7 @@ class PlaceMatcher:
         return self._indexed(i) if i in self._index else self._places[i]
 
     def forget(self, place: KeyscanId) -> None:
-        """Remove a place.
-
-        Raises:
-            KeyError: it is not stored.
-        """
+        """Remove a place."""
         gone = self._places.pop(place)
         if place in self._index:
             self._index.forget(place)

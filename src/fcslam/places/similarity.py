@@ -41,11 +41,7 @@ def bag_of_words(words: NDArray[np.int64], idf: FloatArray, vocabulary_version: 
 
 
 def similarity(x: BagOfWords, y: BagOfWords) -> float:
-    """L1 score 1 - |x - y|_1 / 2 = sum of min(x_i, y_i), in [0, 1]: a quarter of ``paper_similarity``.
-
-    Raises:
-        ValueError: the bags come from different versions of the vocabulary.
-    """
+    """L1 score 1 - |x - y|_1 / 2 = sum of min(x_i, y_i), in [0, 1]: a quarter of ``paper_similarity``."""
     values_x, values_y = _common(x, y)
     return float(np.minimum(values_x, values_y).sum())
 
@@ -54,9 +50,6 @@ def paper_similarity(x: BagOfWords, y: BagOfWords) -> float:
     """Equation (4) of FC-SLAM as printed, in [0, 4]: four times ``similarity``.
 
     The sum runs over the common words, because any other word adds |z| + 0 - |z| = 0.
-
-    Raises:
-        ValueError: the bags come from different versions of the vocabulary.
     """
     values_x, values_y = _common(x, y)
     return float(2.0 * np.sum(np.abs(values_x) + np.abs(values_y) - np.abs(values_x - values_y)))  # eq. (4)

@@ -79,11 +79,7 @@ def train_words(
 
 
 def write_vocabularies(vocabularies: Sequence[WordVocabulary], path: Path) -> None:
-    """Write a file of vocabularies, at most one of each channel. Equal vocabularies give equal files.
-
-    Raises:
-        OutputError: the file cannot be written, or ``path`` is a file of another kind.
-    """
+    """Write a file of vocabularies, at most one of each channel. Equal vocabularies give equal files."""
     _check_replaceable(path)
     arrays: dict[str, NDArray[np.uint8]] = {}
     for vocabulary in vocabularies:
@@ -105,11 +101,7 @@ def _check_replaceable(path: Path) -> None:
 
 
 def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
-    """Read a file of vocabularies.
-
-    Raises:
-        InputError: the file cannot be read, or is not one.
-    """
+    """Read a file of vocabularies."""
     try:
         archive = read_arrays(path)
         found = tuple(_read(archive, channel) for channel in PLACE_CHANNELS if f"{channel}.centres" in archive)

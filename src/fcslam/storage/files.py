@@ -18,9 +18,6 @@ def write_file(path: Path, content: bytes | memoryview | str, *, private: bool =
         path: the file; its folder exists.
         content: what it holds afterwards; text is encoded as UTF-8.
         private: only the owner may read it, from the first moment.
-
-    Raises:
-        OSError: the file cannot be written; the old one is unchanged.
     """
     data = content.encode() if isinstance(content, str) else content
     with replacing(path) as unfinished:
@@ -38,11 +35,7 @@ def keep_private() -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a path beside ``path`` for a file to be written; it replaces ``path`` when the block succeeds.
-
-    Raises:
-        OSError: the file cannot be replaced; the old one is unchanged.
-    """
+    """Give a path beside ``path`` for a file to be written; it replaces ``path`` when the block succeeds."""
     unfinished = path.with_name(f".{path.name}.partial")
     unfinished.unlink(missing_ok=True)
     try:
@@ -54,11 +47,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Give a new folder beside ``path``; it replaces ``path`` when the block succeeds and is removed otherwise.
-
-    Raises:
-        OSError: the folder cannot be written or replaced; the old one is unchanged.
-    """
+    """Give a new folder beside ``path``; it replaces ``path`` when the block succeeds and is removed otherwise."""
     bring_back(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
     retired = path.with_name(f".{path.name}.{os.getpid()}.retired")
@@ -72,11 +61,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def bring_back(path: Path) -> None:
-    """Give the old folder its name again if a process was killed while it replaced it.
-
-    Raises:
-        OSError: the folder cannot be renamed.
-    """
+    """Give the old folder its name again if a process was killed while it replaced it."""
     if not path.exists():
         for retired in path.parent.glob(f".{glob.escape(path.name)}.*.retired"):
             retired.rename(path)

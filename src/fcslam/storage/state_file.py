@@ -35,9 +35,6 @@ def write_state(path: Path, fits: str, state: State) -> None:
         path: the file; its folder exists.
         fits: what the state fits: a program of a version, for instance.
         state: what is written.
-
-    Raises:
-        OSError: the file cannot be written; the old one is unchanged.
     """
     data = state_bytes(fits, state)
     write_file(path, _hash(data) + data)
@@ -71,11 +68,7 @@ def read_state(path: Path, fits: str) -> State | None:
 
 
 def parse_state(path: Path, data: bytes, fits: str) -> State:
-    """Read what ``state_bytes`` gave, found at ``path``.
-
-    Raises:
-        InputError: it does not fit, or is something else.
-    """
+    """Read what ``state_bytes`` gave, found at ``path``."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             about = json.loads(archive["text"].tobytes())

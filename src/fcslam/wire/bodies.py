@@ -1,9 +1,8 @@
 """Conversion between records and protobuf messages, with writing and reading side by side."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import Message
@@ -57,8 +56,6 @@ from fcslam.wire.streams import (
     unpack_ranges,
     unpack_words,
 )
-
-Measurement = TypeVar("Measurement", Constraint, TagSighting)
 
 _CHANNELS = {Channel.LIDAR: pb.CHANNEL_LIDAR, Channel.CAMERA: pb.CHANNEL_CAMERA}
 _CONSTRAINT_KINDS = {
@@ -164,10 +161,6 @@ def _read_information(numbers: Sequence[float], what: str) -> FloatArray:
     return unpack_information(numbers)
 
 
-def _round_information(body: Measurement) -> Measurement:
-    return replace(body, information=unpack_information(pack_information(body.information)))
-
-
 def _write_place(place: Place) -> pb.Place:
     codes, order = _in_order(place)
     return pb.Place(**_described(place, codes), descriptors=pack_descriptors(place.descriptors[order]))
@@ -196,16 +189,6 @@ def _described(place: Place | WordPlace, codes: KeypointCodes) -> dict[str, Any]
         "count": len(codes),
         "keypoints": pack_keypoints(codes),
     }
-
-
-def _round_place(place: Place) -> Place:
-    codes, order = _in_order(place)
-    return replace(place, keypoints=dequantise_keypoints(codes), descriptors=frozen(place.descriptors[order], np.uint8))
-
-
-def _round_word_place(place: WordPlace) -> WordPlace:
-    codes, order = _in_order(place)
-    return replace(place, keypoints=dequantise_keypoints(codes), words=frozen(place.words[order], np.uint16))
 
 
 def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
@@ -338,19 +321,11 @@ def _read_pose(message: Message, field: str) -> FloatArray:
 
 
 def read_channel(code: int) -> Channel:
-    """The channel of a code in a packet.
-
-    Raises:
-        PacketError: the code is unknown.
-    """
+    """The channel of a code in a packet."""
     channel = _CHANNEL_OF_CODE.get(code)
     if channel is None:
         raise PacketError(f"channel {code} is unknown")
     return channel
-
-
-def _same(body: Any) -> Any:
-    return body
 
 
 def _always(number: int) -> Callable[[Any], int]:
@@ -374,20 +349,18 @@ class Codec(NamedTuple):
     type: type
     write: Callable[[Any], Message]
     read: Callable[[Any, pb.Packet], Any]
-    round: Callable[[Any], Any] = _same
-    """Return a record as it is after writing and reading, without doing either; most kinds keep every number."""
     unpacked_bytes: Callable[[Any], int] = _always(0)
     """Bytes of the streams of a message, unpacked, by its counts."""
 
 
 CODECS = {
     PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
-    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, unpacked_bytes=_RANGES),
-    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_information),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place, _DESCRIBED),
-    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place, _IN_WORDS),
-    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, unpacked_bytes=_always(limits.BYTES_PER_TILE)),
-    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting, _round_information),
+    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _RANGES),
+    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _DESCRIBED),
+    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _IN_WORDS),
+    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, _always(limits.BYTES_PER_TILE)),
+    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting),
     PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),

@@ -35,11 +35,7 @@ _OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
 
 
 def check(packet: Packet) -> None:
-    """Refuse a packet that violates the format.
-
-    Raises:
-        PacketError: the packet is not valid; the message says why.
-    """
+    """Refuse a packet that violates the format."""
     check_name(packet.robot, "robot")
     _check_count(packet.epoch, "epoch", limits.MAXIMUM_EPOCH)
     _check_count(packet.sequence, "sequence", limits.MAXIMUM_SEQUENCE)
@@ -51,11 +47,7 @@ def check(packet: Packet) -> None:
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that is not 1 to 64 letters, digits and ``. _ + -``.
-
-    Raises:
-        PacketError: the name is not valid; the message begins with ``what``.
-    """
+    """Refuse a name that is not 1 to 64 letters, digits and ``. _ + -``."""
     if NAME.fullmatch(name) is None:
         raise PacketError(f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
 
@@ -76,11 +68,7 @@ def _check_hello(hello: Hello, packet: Packet) -> None:
 
 
 def check_floor(floor: str) -> None:
-    """Refuse a floor that is not 1 to 16 letters, digits and ``. _ + -``; "-1" is one.
-
-    Raises:
-        PacketError: the floor is not valid.
-    """
+    """Refuse a floor that is not 1 to 16 letters, digits and ``. _ + -``; "-1" is one."""
     _require(FLOOR.fullmatch(floor) is not None, f"floor {floor[:64]!r} is not 1 to 16 of A-Z a-z 0-9 . _ + -")
 
 

@@ -29,11 +29,7 @@ NO_CREDENTIALS: Final = Credentials()
 
 
 def read_credentials(folder: Path) -> Credentials:
-    """The credentials in a robot's folder, as `fcslam tools certificates` writes it; each file may be missing.
-
-    Raises:
-        InputError: there is no such file, the token cannot be read, or a certificate has no key.
-    """
+    """The credentials in a robot's folder, as `fcslam tools certificates` writes it; each file may be missing."""
     there = {name for name in (TOKEN, AUTHORITY, CERTIFICATE, KEY) if os.path.exists(folder / name)}
     if not there:
         raise InputError(
@@ -50,20 +46,12 @@ def read_credentials(folder: Path) -> Credentials:
 
 
 def no_passphrase() -> str:
-    """Password callback for ``load_cert_chain``, so that OpenSSL does not ask on the terminal.
-
-    Raises:
-        ssl.SSLError: always; OpenSSL calls it only for an encrypted key.
-    """
+    """Password callback for ``load_cert_chain``, so that OpenSSL does not ask on the terminal."""
     raise ssl.SSLError("the key is encrypted; give one without a passphrase: openssl pkey -in KEY -out KEY2")
 
 
 def read_token(path: Path) -> str:
-    """The token in a file.
-
-    Raises:
-        InputError: the file cannot be read, or holds something else.
-    """
+    """The token in a file."""
     try:
         token = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:

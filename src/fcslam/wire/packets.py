@@ -1,6 +1,5 @@
 """Encoding and decoding of packets (format: docs/reference/wire.md)."""
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from google.protobuf.message import DecodeError
@@ -63,14 +62,9 @@ class SizedPacket(NamedTuple):
 
 
 def measure(packet: Packet) -> SizedPacket:
-    """Return the packet as a receiver reads it, and its bytes: as by ``encode`` and ``decode``, but without decoding.
-
-    Raises:
-        PacketError: as ``encode``.
-    """
+    """Return the packet as a receiver reads it, and its bytes."""
     data = encode(packet)
-    _, codec = CODEC_OF_TYPE[type(packet.body)]
-    return SizedPacket(replace(packet, body=codec.round(packet.body)), data)
+    return SizedPacket(decode(data), data)
 
 
 def decode(data: bytes) -> Packet:
@@ -88,11 +82,7 @@ def decode(data: bytes) -> Packet:
 
 
 def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
-    """The same packet with another epoch and sequence number.
-
-    Raises:
-        PacketError: ``data`` is not a packet of this version; the message says why.
-    """
+    """The same packet with another epoch and sequence number."""
     message, _ = _parse(data)
     message.epoch, message.sequence = epoch, sequence
     return message.SerializeToString(deterministic=True)

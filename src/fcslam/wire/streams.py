@@ -18,7 +18,6 @@ RangeCodes = NDArray[np.uint16]
 KeypointCodes = NDArray[np.int16]
 Words = NDArray[np.uint16]
 
-_LEVEL: Final = 9
 _RAW: Final = -15
 """Window of zlib's raw format, without a header and a checksum."""
 _BITS: Final = 8 * CODE_BYTES
@@ -31,11 +30,7 @@ def pack_ranges(codes: RangeCodes) -> bytes:
 
 
 def unpack_ranges(data: bytes, count: int) -> RangeCodes:
-    """Inverse of ``pack_ranges``: ``count`` ranges in steps of 2 mm, shape (count,).
-
-    Raises:
-        PacketError: ``data`` is not a stream of ``count`` ranges.
-    """
+    """Inverse of ``pack_ranges``: ``count`` ranges in steps of 2 mm, shape (count,)."""
     zigzag = _from_high_and_low(_inflate(data, BYTES_PER_RANGE * count, "keyscan: ranges"))
     return np.cumsum(zigzag >> 1 ^ -(zigzag & 1), dtype=np.uint16)
 
@@ -47,11 +42,7 @@ def pack_keypoints(codes: KeypointCodes) -> bytes:
 
 
 def unpack_keypoints(data: bytes, count: int, axes: int) -> KeypointCodes:
-    """Inverse of ``pack_keypoints``: ``count`` keypoints in steps of 1 cm, shape (count, axes).
-
-    Raises:
-        PacketError: ``data`` is not a stream of ``count`` keypoints.
-    """
+    """Inverse of ``pack_keypoints``: ``count`` keypoints in steps of 1 cm, shape (count, axes)."""
     differences = _from_high_and_low(_inflate(data, BYTES_PER_AXIS * count * axes, "place: keypoints"))
     steps = differences.view(np.int16).reshape(axes, count)
     codes: KeypointCodes = np.ascontiguousarray(np.cumsum(steps, axis=1, dtype=np.int16).T)
@@ -83,11 +74,7 @@ def pack_descriptors(descriptors: Codes) -> bytes:
 
 
 def unpack_descriptors(data: bytes, count: int) -> Codes:
-    """Inverse of ``pack_descriptors``: ``count`` descriptors, shape (count, 32).
-
-    Raises:
-        PacketError: ``data`` is not a stream of ``count`` descriptors.
-    """
+    """Inverse of ``pack_descriptors``: ``count`` descriptors, shape (count, 32)."""
     if len(data) >= CODE_BYTES * count:
         return np.frombuffer(_inflate(data, CODE_BYTES * count, "place: descriptors"), np.uint8).reshape(-1, CODE_BYTES)
     columns = -(-count // 8)
@@ -105,11 +92,7 @@ def pack_words(words: Words) -> bytes:
 
 
 def unpack_words(data: bytes, count: int) -> Words:
-    """Inverse of ``pack_words``: ``count`` words, shape (count,).
-
-    Raises:
-        PacketError: ``data`` is not a stream of ``count`` words.
-    """
+    """Inverse of ``pack_words``: ``count`` words, shape (count,)."""
     return _from_high_and_low(_inflate(data, BYTES_PER_WORD * count, "place: words"))
 
 
@@ -120,11 +103,7 @@ def pack_cells(cells: NDArray[np.uint8]) -> bytes:
 
 
 def unpack_cells(data: bytes) -> NDArray[np.uint8]:
-    """Inverse of ``pack_cells``: shape (256, 256).
-
-    Raises:
-        PacketError: ``data`` is not a stream of a tile's cells.
-    """
+    """Inverse of ``pack_cells``: shape (256, 256)."""
     fours = np.frombuffer(_inflate(data, BYTES_PER_TILE, "map tile: cells"), np.uint8)[:, None]
     return (fours >> np.arange(0, 8, 2, dtype=np.uint8) & 3).astype(np.uint8).reshape(TILE_CELLS, TILE_CELLS)
 
@@ -140,7 +119,7 @@ def _from_high_and_low(data: bytes) -> NDArray[np.uint16]:
 
 
 def _deflate(plain: bytes) -> bytes:
-    return min(plain, zlib.compress(plain, _LEVEL, _RAW), key=len)
+    return min(plain, zlib.compress(plain, wbits=_RAW), key=len)
 
 
 def _inflate(data: bytes, size: int, what: str) -> bytes:

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from evaluation.matching import mutual_pairs, nearest_neighbours
 
 from fcslam.features.codes import mutual_matches
-from fcslam.features.matching import mutual_pairs, nearest_neighbours
 
 
 def sets(kind):
