@@ -170,7 +170,11 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
     with ProgressDisplay(console) as display:
         watch = _watch(display, console, 100)
         for times_lost, quality in [(0, 0.0), (1, 0.0), (1, 0.5), (1, 0.0), (2, 0.0)]:
-            watch(RobotStatus(9, 9, WaitingPackets(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
+            watch(
+                RobotStatus(
+                    scans=9, keyscans=9, confirmed=9, sent_bytes=9, map_index=0, quality=quality, times_lost=times_lost
+                )
+            )
     said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]
     assert said == ["connected", "lost", "relocalized in map 0, quality 0.50", "not relocalized", "lost"]
 
@@ -180,7 +184,7 @@ def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
     with ProgressDisplay(console, interval_s=0.01) as display:
         watch = _watch(display, console, total=10)
         trouble = "http://cloud:8340: Connection refused"
-        now = RobotStatus(10, 3, WaitingPackets(7, 900), 0, 0, 0, 0, None, None, 0.0, 0, trouble, False, ())
+        now = RobotStatus(scans=10, keyscans=3, waiting=WaitingPackets(7, 900), trouble=trouble)
         for _ in range(3):
             watch(now)
         time.sleep(0.2)
@@ -194,7 +198,16 @@ def test_a_robot_that_has_sent_everything_shows_no_old_count():
     with ProgressDisplay(console, interval_s=0.05) as display:
         watch = _watch(display, console, total=10)
         for waiting, confirmed in ((7, 0), (0, 7)):
-            watch(RobotStatus(10, 3, WaitingPackets(waiting, 0), confirmed, 0, 0, 0, 0, 0.0, 0.5, 0, None, False, ()))
+            watch(
+                RobotStatus(
+                    scans=10,
+                    keyscans=3,
+                    waiting=WaitingPackets(waiting, 0),
+                    confirmed=confirmed,
+                    map_index=0,
+                    quality=0.5,
+                )
+            )
         display.show("learning", 1, 100)
         time.sleep(0.2)
     text = console.file.getvalue()

@@ -9,7 +9,7 @@ import pytest
 
 import fcslam
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, classify
-from fcslam.live.fleet_view import Mates
+from fcslam.live.fleet_view import MapTeammates
 from fcslam.live.joint_map import JointMap
 from fcslam.live.records import Wiring
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
@@ -55,8 +55,8 @@ def joint():
     return OccupancyMap(classify(grid, config), grid.resolution_m, grid.origin_xy)
 
 
-def on(scan, joint, *mates, pose=HERE):
-    found = beams_on_teammates(scan, pose, scan.T_odom_base, np.array(mates), 0.0, joint, 0.35)
+def on(scan, joint, *teammates, pose=HERE):
+    found = beams_on_teammates(scan, pose, scan.T_odom_base, np.array(teammates), 0.0, joint, 0.35)
     return np.zeros(360, bool) if found is None else found
 
 
@@ -94,13 +94,13 @@ class Fleet:
 
     def __init__(self, joint):
         self.joint_map, self.news, self.map_index, self.drawn_s = joint, [], 0, -np.inf
-        self.mates = None
+        self.teammates = None
 
     def clock(self):
         return 0.0
 
-    def hear(self, *mates):
-        self.mates = Mates(0, frozenset("b"), np.array(mates), 0.0)
+    def hear(self, *teammates):
+        self.teammates = MapTeammates(0, frozenset("b"), np.array(teammates), 0.0)
 
 
 def corridor_map():

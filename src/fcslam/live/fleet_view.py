@@ -47,7 +47,7 @@ class Teammate:
     """Time since it was there."""
 
 
-class Mates(NamedTuple):
+class MapTeammates(NamedTuple):
     """The map that a robot is in, and the others in it, as the cloud knows them at one moment."""
 
     map_index: int
@@ -85,7 +85,7 @@ class FleetView:
         self._tiled, self._etag = TiledMap(), ""
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
-        self.mates: Mates | None = None
+        self.teammates: MapTeammates | None = None
         """As the newest reply says; None if the robot is in no map that the cloud draws."""
         self.joint_map: OccupancyMap | None = None
         """The joint map of the newest tiles, in its own frame; None before all tiles of that frame came."""
@@ -129,7 +129,7 @@ class FleetView:
     @property
     def map_index(self) -> int | None:
         """Index of the map that the robot is in, as the cloud draws it; None if it is in none."""
-        return None if self.mates is None else self.mates.map_index
+        return None if self.teammates is None else self.teammates.map_index
 
     def robots(self) -> list[Teammate]:
         """All robots that the cloud knows, with the ages of their poses now."""
@@ -173,9 +173,9 @@ class FleetView:
             self._is_settling = (self._is_settling or is_new) and not is_complete
             self.joint_map = None if self._is_settling else self._tiled.occupancy()
             self.version += 1
-        before, self._reply = self.mates, reply
-        self.mates = _mates(self._robot, *reply)
-        self._tell(before, self.mates)
+        before, self._reply = self.teammates, reply
+        self.teammates = _map_teammates(self._robot, *reply)
+        self._tell(before, self.teammates)
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
         if self.clock() - self._frontiers_s >= FRONTIERS_S:
@@ -196,7 +196,7 @@ class FleetView:
                 self.trouble, self._failures = str(error), self._failures + 1
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 
-    def _tell(self, before: Mates | None, now: Mates | None) -> None:
+    def _tell(self, before: MapTeammates | None, now: MapTeammates | None) -> None:
         """Note one line if the robots of the map changed."""
         known = {one.robot for one in self.robots()}
         earlier, others = (frozenset() if one is None else one.robots for one in (before, now))
@@ -218,10 +218,10 @@ class FleetView:
             self.news.append(line)
 
 
-def _mates(robot: str, reply: FleetReply, came_s: float) -> Mates | None:
+def _map_teammates(robot: str, reply: FleetReply, came_s: float) -> MapTeammates | None:
     own = next((one.map_index for one in reply.robots if one.robot == robot), None)
     if own is None:
         return None
     others = [one for one in reply.robots if one.map_index == own and one.robot != robot]
     places = np.array([(*one.T_map_base[:2], one.age_s) for one in others], np.float64).reshape(-1, 3)
-    return Mates(own, frozenset(one.robot for one in others), places, came_s)
+    return MapTeammates(own, frozenset(one.robot for one in others), places, came_s)

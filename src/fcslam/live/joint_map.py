@@ -104,15 +104,15 @@ class JointMap:
         """
         fleet, radius_m = self._fleet, self._config.robot_radius_m
         before, self._newest = self._newest, (session, scan.T_odom_base)
-        joint, mates = fleet.joint_map, fleet.mates
-        if joint is None or mates is None or newest is None or radius_m <= 0.0:
+        joint, teammates = fleet.joint_map, fleet.teammates
+        if joint is None or teammates is None or newest is None or radius_m <= 0.0:
             return scan
         if before is None or before[0] != session:
             return scan
-        if mates.map_index != newest.map_index:  # the joint map is that of the mates
+        if teammates.map_index != newest.map_index:  # the joint map is that of the teammates
             return scan
-        since_s = fleet.clock() - mates.moment_s
-        on_teammates = beams_on_teammates(scan, newest.T_map_base, before[1], mates.places, since_s, joint, radius_m)
+        places, since_s = teammates.places, fleet.clock() - teammates.moment_s
+        on_teammates = beams_on_teammates(scan, newest.T_map_base, before[1], places, since_s, joint, radius_m)
         if on_teammates is None:
             return scan
         self._met[_key(scan.stamp, scan.laser)] = on_teammates

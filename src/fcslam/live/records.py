@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
@@ -16,7 +16,7 @@ from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend_runner import worker_process
-from fcslam.robot.outbox import WaitingPackets
+from fcslam.robot.uplink import UplinkStatus
 from fcslam.wire.http_transport import BatchTransport
 
 
@@ -110,21 +110,11 @@ class LocalizationState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class RobotStatus:
+class RobotStatus(UplinkStatus):
     """State of a robot: its place in the map, its connection, and counts since its start."""
 
-    scans: int
-    keyscans: int
-    waiting: WaitingPackets = field(default=WaitingPackets(0, 0))
-    """Packets that the server has not confirmed."""
-    confirmed: int = 0
-    """Packets that the server has confirmed."""
-    sent_bytes: int = 0
-    """Bytes of the packets that were sent, each time that they were."""
-    left_out: int = 0
-    """Places that are not sent, because the state folder or the budget has no room for them."""
-    refused: int = 0
-    """Packets that the server will never store."""
+    scans: int = 0
+    keyscans: int = 0
     map_index: int | None = None
     """Index of the robot's map; None before the first correction."""
     correction_age_s: float | None = None
@@ -133,10 +123,6 @@ class RobotStatus:
     """Quality of the newest correction, in [0, 1]: how well other sessions support the robot's place in the map."""
     times_lost: int = 0
     """Number of times the robot was lost since it started or came to its floor."""
-    trouble: str | None = None
-    """Why packets do not arrive; None if they do, or if there is no server."""
-    is_catching_up: bool = False
-    """Whether a resumed recording has not yet reached the point of interruption."""
     notices: tuple[str, ...] = ()
     """Messages about packets of another mission, refused packets, the last detector update, a failed back end, and
     jumps of the odometry, if there were any."""

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -48,7 +48,7 @@ from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import CONNECTING
-from fcslam.robot.uplink import Uplink
+from fcslam.robot.uplink import Uplink, UplinkStatus
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_tracking
 from fcslam.wire.checks import check_floor
@@ -226,7 +226,9 @@ class Robot(LiveTracker):
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         notices = tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps)))
-        status = RobotStatus(
+        sent = UplinkStatus() if uplink is None else uplink.status()
+        return RobotStatus(
+            **{field.name: getattr(sent, field.name) for field in fields(sent)},
             scans=self._scans,
             keyscans=self._keyscans,
             map_index=localizer.map_index,
@@ -234,18 +236,6 @@ class Robot(LiveTracker):
             quality=localizer.quality,
             times_lost=self._session - max(session for session, track in enumerate(tracks) if track.is_new_floor),
             notices=notices,
-        )
-        if uplink is None:
-            return status
-        return replace(
-            status,
-            waiting=uplink.waiting,
-            confirmed=uplink.confirmed,
-            sent_bytes=uplink.sent_bytes,
-            left_out=uplink.left_out,
-            refused=uplink.refused,
-            trouble=uplink.trouble,
-            is_catching_up=uplink.is_catching_up,
         )
 
     def map(self) -> OccupancyMap:
@@ -559,7 +549,7 @@ class Robot(LiveTracker):
         if self._uplink.failure is not None:
             self._tell_failure(f"nothing is sent or kept any more: {self._uplink.failure}")
         trouble, was_online = self._uplink.trouble, self._is_online
-        if trouble is None and was_online is not True and self._uplink.confirmed:
+        if trouble is None and was_online is not True and self._uplink.status().confirmed:
             self._is_online = True
             self._event(EventKind.ONLINE, "the server confirms packets")
         elif trouble not in (None, CONNECTING) and was_online is not False:

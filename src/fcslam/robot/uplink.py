@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,26 @@ from fcslam.wire.messages import Packet
 
 STOP_TIMEOUT_S = 2.0
 """Time that a running request may take when the robot stops; its packets are sent again at the next start."""
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkStatus:
+    """Counts of packets since the start of a robot."""
+
+    waiting: WaitingPackets = field(default=WaitingPackets(0, 0))
+    """Packets that the server has not confirmed."""
+    confirmed: int = 0
+    """Packets that the server has confirmed."""
+    sent_bytes: int = 0
+    """Bytes of the packets that were sent, each time that they were."""
+    left_out: int = 0
+    """Places that are not sent, because the state folder or the budget has no room for them."""
+    refused: int = 0
+    """Packets that the server will never store."""
+    trouble: str | None = None
+    """Why packets do not arrive; None if they do, or if there is no server."""
+    is_catching_up: bool = False
+    """Whether a resumed recording has not yet reached the point of interruption."""
 
 
 class Uplink:
@@ -80,7 +101,7 @@ class Uplink:
 
     def before_record(self) -> None:
         """Give the front end the detector that is due before the next record."""
-        self._detector_updates.apply_due(self._records, self.is_catching_up)
+        self._detector_updates.apply_due(self._records, self._put < self._known)
         self._records += 1
 
     def between_records(self) -> None:
@@ -118,34 +139,25 @@ class Uplink:
         return self._sender is not None and self._outbox.is_full
 
     @property
-    def is_catching_up(self) -> bool:
-        """Whether a resumed recording has not yet reached the point of interruption."""
-        return self._put < self._known
-
-    @property
     def waiting(self) -> WaitingPackets:
         """Packets that the cloud has not confirmed."""
         return self._outbox.waiting if self._sender is not None else WaitingPackets(0, 0)
 
-    @property
-    def confirmed(self) -> int:
-        """Number of packets that the cloud has confirmed."""
-        return 0 if self._sender is None else self._sender.confirmed
-
-    @property
-    def sent_bytes(self) -> int:
-        """Bytes of packets, counted as often as they were sent."""
-        return 0 if self._sender is None else self._sender.sent_bytes
-
-    @property
-    def left_out(self) -> int:
-        """Places that are not sent, because the outbox or the budget has no room for them."""
-        return self._crowded_out + (0 if self._budget is None else self._budget.left_out)
-
-    @property
-    def refused(self) -> int:
-        """Packets that the cloud will never store."""
-        return 0 if self._sender is None else self._sender.refusals
+    def status(self) -> UplinkStatus:
+        """The counts so far."""
+        left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
+        status = UplinkStatus(left_out=left_out, is_catching_up=self._put < self._known)
+        sender = self._sender
+        if sender is None:
+            return status
+        return replace(
+            status,
+            waiting=self.waiting,
+            confirmed=sender.confirmed,
+            sent_bytes=sender.sent_bytes,
+            refused=sender.refusals,
+            trouble=sender.trouble,
+        )
 
     @property
     def trouble(self) -> str | None:
