@@ -63,8 +63,8 @@ from fcslam.learning.code_batches import MOST_POINTS, RevisitExamples, RevisitPa
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import FederatedClient, RobotClient
-from fcslam.learning.federated.client_app import in_process_grid
-from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
+from fcslam.learning.federated.fleets import InProcessFleet
 from fcslam.learning.federated.held_out import inliers
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
@@ -162,9 +162,6 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of training")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="which networks")
     parser.add_argument("--rounds", type=int, default=60, help="of federated training")
-    parser.add_argument(
-        "--compatible", type=float, default=4.0, help="weight of the loss that keeps codes as they were"
-    )
     parser.add_argument("--keep", type=Path, help="file that keeps finished arms; the same one resumes")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
@@ -174,15 +171,14 @@ def main() -> None:
     unseen = [recorded(seed, 3, chosen.fleets) for seed in chosen.test]
     examples = [fleet_examples(folder, chosen.fleets) for folder in fleets]
     settings = FederatedSettings(
-        rounds=chosen.rounds, local_steps=LOCAL_STEPS, participation=PARTICIPATION, normalisation="frozen",
-        compatible=chosen.compatible, trained="codes",
+        rounds=chosen.rounds, local_steps=LOCAL_STEPS, participation=PARTICIPATION,
         training=TrainingSettings(learning_rate=1e-3),
     )  # fmt: skip
     rows: list[tuple] = []
     forgetting: list[tuple] = []
     for arm in (arm for arm in ARMS if arm in chosen.arms):
         for seed in chosen.seeds[: 3 if arm in REPEATED else 1]:
-            key = (arm, seed, chosen.rounds, chosen.compatible, *chosen.train)
+            key = (arm, seed, chosen.rounds, *chosen.train)
             place = chosen.fleets / "-".join(["networks", common.commit(), *map(str, key)]).replace(" ", "_")
             networks = kept_networks(place, partial(trained, arm, seed, examples, settings))
             forgetting += kept.rows((*key, "photographs"), partial(photograph_rows, arm, seed, networks))
@@ -319,7 +315,7 @@ def trained(
         return [None]
     training = settings.training.model_copy(update={"seed": seed})
     settings = settings.model_copy(update={"training": training})
-    start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings, ExecutionOptions(), lambda *_: None)
+    start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings.training, ExecutionOptions(), lambda *_: None)
     learners = [(k, learner) for k, fleet in enumerate(fleets) for learner in fleet.learners]
     steps = settings.rounds * settings.local_steps
     if arm == "central":
@@ -342,8 +338,8 @@ def trained_here(
     """Training in one place, with the losses and the rate of a robot in the fleet."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
-    plan = LocalTrainingPlan(training, 0, steps, compatible=settings.compatible)
-    return train_codes(state, revisits, CodeInputs(), plan).network
+    before = weights_to_network(start, settings.training.encoder)
+    return train_codes(state, revisits, CodeInputs(), LocalTrainingPlan(training, 0, steps), before).network
 
 
 def federated(
@@ -365,10 +361,10 @@ def federated(
         clients.append(PoisonedClient(client, "reversed") if is_poisoned else client)
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
-        evaluate_fn=lambda _weights: {},  # without metrics the last version counts, as in the other arms
         on_round=lambda row: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),
     )
-    state = Coordinator(in_process_grid(clients), settings, start, folder / "rounds", hooks).run()
+    rules = RoundRules(fewest_pairs=1)  # no robot holds out pairs, so nothing is released
+    state = Coordinator(InProcessFleet(clients), settings, start, folder / "rounds", hooks, rules).run()
     return weights_to_network(state.average, settings.training.encoder)
 
 

@@ -111,7 +111,7 @@ def trained(learners: Mapping[str, Learner], folder: Path) -> dict[str, Path]:
     networks = {"bundled": BUNDLED_NETWORK}
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
-        start = prepare_initial_weights(BUNDLED_NETWORK, Path(place), rounds, ExecutionOptions(), lambda *_: None)
+        start = prepare_initial_weights(BUNDLED_NETWORK, Path(place), training, ExecutionOptions(), lambda *_: None)
         for name, learner in learners.items():
             revisits = RevisitExamples([each.image for each in learner.keyframes], learner.pairs)
             steps = rounds.rounds * rounds.local_steps

@@ -43,17 +43,16 @@ from subpixel_loss import localization_loss
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.learning.batches import TrainingBatch
+from fcslam.learning.batches import POINTS, TrainingBatch
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network
 from fcslam.learning.federated.onnx_weights import read_onnx_weights
-from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork, sample_codes
-from fcslam.learning.objective import grid_shift, negatives, objective
+from fcslam.learning.objective import LOSSES, LossWeights, grid_shift, negatives, objective
 from fcslam.learning.pairs import TrainingExample
-from fcslam.learning.settings import LossSettings, TrainingSettings
+from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import keypoint_response, read_labelled_images
 from fcslam.learning.trainer import AVERAGE_DECAY, ExecutionOptions
 from fcslam.learning.training_step import CLIP_NORM, create_optimizer, learning_rate
@@ -90,6 +89,9 @@ class Arm:
     localization: float = 0.0
     """Weight of the localization loss."""
     start: Path = BUNDLED_NETWORK
+    losses: LossWeights = LOSSES["default"]
+    points: int = POINTS
+    """Points of a pair whose descriptors are compared."""
     steps: int | None = None
     """None: as many as the time allows."""
     after: str | None = None
@@ -97,15 +99,13 @@ class Arm:
 
 
 def light(*changes: Change, after: str | None = None) -> Arm:
-    settings = TrainingSettings(pairs=64, side_px=256, points=448, learning_rate=1e-3)
-    return Arm(settings, changes, localization=2.0, after=after)
+    settings = TrainingSettings(pairs=64, side_px=256, learning_rate=1e-3)
+    return Arm(settings, changes, points=448, localization=2.0, after=after)
 
 
 def vgg(**loss: Any) -> Arm:
-    settings = TrainingSettings(
-        encoder="vgg", pairs=32, side_px=192, learning_rate=5e-4, loss=LossSettings(**loss), steps=EQUATIONS_STEPS
-    )
-    return Arm(settings, (AS_IN_TRAINING,), start=Path("vgg"), steps=EQUATIONS_STEPS)
+    settings = TrainingSettings(encoder="vgg", pairs=32, side_px=192, learning_rate=5e-4, steps=EQUATIONS_STEPS)
+    return Arm(settings, (AS_IN_TRAINING,), losses=LossWeights(**loss), start=Path("vgg"), steps=EQUATIONS_STEPS)
 
 
 AS_IN_TRAINING = Change(turn_rad=0.2, any_turn_share=0.1, scale_spread=0.7, tilt=0.12)
@@ -198,9 +198,8 @@ def labelled(files: list[ImageFile], cache: Path) -> tuple[list[TrainingExample]
 
 def bundled(start: Path, settings: TrainingSettings, folder: Path, images: list[TrainingExample]) -> KeypointNetwork:
     """A network that comes with fcslam, with the statistics of images."""
-    rounds = FederatedSettings(training=settings)
     public = [example.image for example in images]
-    weights = prepare_initial_weights(start, folder, rounds, ExecutionOptions(), lambda *_: None, public)
+    weights = prepare_initial_weights(start, folder, settings, ExecutionOptions(), lambda *_: None, public)
     return weights_to_network(weights, settings.encoder)
 
 
@@ -220,7 +219,7 @@ def train_arm(
     average = KeypointNetwork(settings.encoder).to(device).eval()
     average.load_state_dict(network.state_dict())
     optimizer = create_optimizer(network)
-    draw = partial(draw_on_device, side=settings.side_px, points=settings.points, changes=arm.changes)
+    draw = partial(draw_on_device, side=settings.side_px, points=arm.points, changes=arm.changes)
     photographs = Photographs.of(train_on, device)
     generator = torch.Generator(device).manual_seed(SEED)
     seen = draw(Photographs.of(held_out, device), WATCHED_PAIRS, generator=torch.Generator(device).manual_seed(SEED))
@@ -233,7 +232,7 @@ def train_arm(
         batch = draw(photographs, settings.pairs, generator=generator)
         maps = network.train()(batch.images.contiguous(memory_format=torch.channels_last))
         shift = grid_shift(settings.encoder, SEED, step)
-        total, parts = objective(maps, batch, settings.loss, progress, shift, None)
+        total, parts = objective(maps, batch, arm.losses, progress, shift, None)
         if arm.localization:
             parts["localization"] = localization_loss(maps.point_logits.float().sigmoid(), batch.homographies)
             total = total + arm.localization * parts["localization"]

@@ -30,6 +30,7 @@ pairs of one image resemble one another, so they are somewhat too narrow; most s
 
 import csv
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator, Set
 from pathlib import Path
@@ -40,6 +41,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, points, robots, run
 
+from fcslam.learning.federated.coordinator import RoundRules
+from fcslam.learning.federated.screening import ScreeningBounds
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.metrics.bootstrap import mean_interval
 
@@ -49,30 +52,28 @@ if TYPE_CHECKING:
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
-START = {"shape_steps": 400, "steps": 1000, "label_copies": 4, "pairs": 4, "side_px": 128, "points": 160}
+START = {"shape_steps": 400, "steps": 1000, "label_copies": 4, "pairs": 4, "side_px": 128}
 
 ROUNDS, STEPS = FederatedSettings().rounds, FederatedSettings().local_steps
-TRAINING = {"label_copies": 4, "pairs": 2, "side_px": 128, "points": 160, "learning_rate": 3e-3}
+TRAINING = {"label_copies": 4, "pairs": 2, "side_px": 128, "learning_rate": 3e-3}
 FEDERATED = {"rounds": ROUNDS, "local_steps": STEPS, "training": TRAINING}
 WIDE = TRAINING | {"pairs": 10, "learning_rate": 6e-3}
 """In one step what five robots take together."""
-TRUSTING = {"screening": {"largest_change": None, "longest": None, "least_agreement": None}}
+TRUSTING = RoundRules(bounds=ScreeningBounds(math.inf, math.inf, -math.inf, math.inf))
 ROBUST: dict[str, dict[str, Any]] = {
-    "fedavg": TRUSTING,
+    "fedavg": {"rules": TRUSTING},
     "screened": {},
-    "median": {"strategy": "fedmedian", **TRUSTING},
+    "median": {"settings": {"strategy": "fedmedian"}, "rules": TRUSTING},
 }
-KEPT = {"compatible-30": 30.0}
-"""Strengths of the pull to the codes of the start."""
 AT_HOME = {"arm": "s", "images": "s", "pairs": "d", "homographies, %": ".1f", "below central": "s",
            "below together": "s", "MMA, %": ".1f", "below central ": "s", "below together ": "s"}  # fmt: skip
 LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
 LOSSES = {"arm": "s"} | LOST
-KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "below together": "s",
+KEEPING = {"arm": "s", "new and new, MMA, %": ".1f", "below together": "s",
            "old and new, MMA, %": ".1f", "below together ": "s"}  # fmt: skip
 REFUSED = {"arm": "s", "updates of honest robots": "d", "refused": "d", "of the poisoned one": "s"}
 SEEDS, PAIRS, IMAGES, TRAINED = 3, 2000, 64, 16
-COMPARED = ("start", "central", "wide", "local", "alone", "together", "plain", "frozen", *KEPT)
+COMPARED = ("start", "central", "wide", "local", "alone", "together", "plain")
 """Arms without poison."""
 
 
@@ -82,11 +83,9 @@ def arms() -> dict[str, Any]:
     poisoned: dict[str, Any] = {"poison": "reversed", **few}
     return {
         "together": {},
-        **{f"{name}-reversed": {"settings": how, **poisoned} for name, how in ROBUST.items()},
+        **{f"{name}-reversed": {**how, **poisoned} for name, how in ROBUST.items()},
         "wide": {"together": False, "settings": {"training": WIDE}, **few},
-        "frozen": {"settings": {"normalisation": "frozen"}, **few},
-        **{name: {"settings": {"compatible": strength}, **few} for name, strength in KEPT.items()},
-        "plain": {"settings": {"server_momentum": 0.0}, **few},
+        "plain": {"rules": RoundRules(momentum=0.0), **few},
     }
 
 
@@ -196,7 +195,7 @@ def poison_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
 def refused_rows(study: Path, known: Set[str]) -> Iterator[tuple[object, ...]]:
     """Of the arms that screen."""
     for arm, what in arms().items():
-        if arm not in known or not what.get("together", True) or "screening" in what.get("settings", {}):
+        if arm not in known or not what.get("together", True) or what.get("rules") is TRUSTING:
             continue
         files = study.glob(f"seed*/{arm}/rounds.csv")
         rows = [row for file in files for row in csv.DictReader(file.open(encoding="utf-8"))]
@@ -214,10 +213,10 @@ def lost(rows: "Rows", arm: str) -> list[object]:
 
 
 def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
-    for arm in [each for each in ("start", "central", "together", *KEPT) if ("mma_3px", each) in rows]:
+    for arm in [each for each in ("start", "central", "together") if ("mma_3px", each) in rows]:
         found = [rows[measure, arm] for measure in ("mma_3px", "mma_3px_former")]
         cells = [cell for row in found for cell in (100 * row.mean, points(row.gap))]
-        yield arm, KEPT.get(arm, 0.0), *cells
+        yield arm, *cells
 
 
 def draw(rows: "Rows") -> Figure:

@@ -37,9 +37,8 @@ KILLED = ROBOTS[-1]
 PATIENCE_S = 1800.0
 TINY = """rounds: 2
 local_steps: 4
-judge_every: 1
 minimum_robots: 4
-training: {shape_steps: 2, pairs: 1, side_px: 96, points: 32, label_copies: 1}
+training: {shape_steps: 2, pairs: 1, side_px: 96, label_copies: 1}
 """
 ROUNDS = {"round": "", "robots": "", "left out": "", "up, MB": ".2f", "down, MB": ".2f", "deployed, s": ".0f",
           "one process, s": ".1f", "same version": ""}  # fmt: skip
@@ -182,8 +181,9 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     import torch
 
     from fcslam.learning.federated import client
-    from fcslam.learning.federated.client_app import in_process_grid
-    from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+    from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
+    from fcslam.learning.federated.fleets import InProcessFleet
+    from fcslam.learning.federated.messages import TrainingRequest
     from fcslam.learning.federated.networks import network_to_weights, weights_version
     from fcslam.learning.federated.public_images import public_evaluation, read_public_images
     from fcslam.learning.federated.settings import FederatedSettings
@@ -193,7 +193,7 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     torch.set_num_threads(1)
     torch.manual_seed(1)
     training = TrainingSettings(label_copies=1)
-    settings = FederatedSettings(local_steps=steps, rounds=count, judge_every=1, training=training)
+    settings = FederatedSettings(local_steps=steps, rounds=count, training=training)
     fleet = [
         client.RobotClient(name, drawn(folder / name, 5, seed), folder / "labels" / name)
         for seed, name in enumerate(ROBOTS)
@@ -201,13 +201,14 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     start = network_to_weights(KeypointNetwork("light"))
     for each in fleet:
         # Labels, and what torch does first.
-        each.train(start, 0, "first", settings.model_copy(update={"local_steps": 1}))
+        once = settings.model_copy(update={"local_steps": 1})
+        each.train(TrainingRequest(True, start, "", 0, "first", "images", once))
     training_time, evaluation_time = Stopwatch(), Stopwatch()
     evaluate = public_evaluation(read_public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
     hooks = CoordinatorHooks(partial(weights_version, encoder="light"), evaluation_time.around(evaluate))
     local_training, client.local_training = client.local_training, training_time.around(client.local_training)
     began = time.process_time()
-    Coordinator(in_process_grid(fleet), settings, start, folder / "run", hooks).run()
+    Coordinator(InProcessFleet(fleet), settings, start, folder / "run", hooks, RoundRules(judge_every=1)).run()
     total_s = time.process_time() - began
     client.local_training = local_training
     rest_s = (total_s - training_time.spent_s - evaluation_time.spent_s) / count

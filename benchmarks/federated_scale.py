@@ -31,14 +31,15 @@ import numpy as np
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client import ClientUpdate
-from fcslam.learning.federated.client_app import build_client_app, in_process_grid
-from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import FleetApp, listening
-from fcslam.learning.federated.flower import RobotGrid
+from fcslam.learning.federated.fleets import InProcessFleet, TrainingFleet
+from fcslam.learning.federated.held_out import Judgement
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import read_detector_weights
+from fcslam.learning.federated.messages import TrainingRequest
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
@@ -68,14 +69,17 @@ class DrawnRobot:
     on_missing: Callable[["DrawnRobot", bool], None]
     """Called in a round in which the robot does not answer in time, with whether it is silent rather than late."""
 
-    def train(self, weights: Weights, round_number: int, _run_id: str, _settings: FederatedSettings) -> ClientUpdate:
-        rng = np.random.default_rng([*self.name.encode(), round_number])
+    def train(self, request: TrainingRequest) -> ClientUpdate:
+        rng = np.random.default_rng([*self.name.encode(), request.round_number])
         fate = rng.uniform()
         if fate < self.missing:
             self.on_missing(self, fate < self.missing / 2)
-        return ClientUpdate(drawn_update(weights, rng, round_number), {"drawn": STEP})
+        return ClientUpdate(drawn_update(request.weights, rng, request.round_number), {"drawn": STEP})
 
-    def evaluate(self, *_request: object) -> dict[str, float]:
+    def evaluate(self, _request: TrainingRequest) -> dict[str, float]:
+        raise TrainingError("has no images")
+
+    def judge(self, _request: TrainingRequest) -> Judgement:
         raise TrainingError("has no images")
 
 
@@ -108,9 +112,7 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
-    settings = FederatedSettings(
-        rounds=chosen.rounds, judge_every=1, participation=PARTICIPATION, deadline_s=DEADLINE_S, normalisation="frozen"
-    )
+    settings = FederatedSettings(rounds=chosen.rounds, participation=PARTICIPATION, deadline_s=DEADLINE_S)
     names = [f"robot-{number:03}" for number in range(chosen.robots)]
     alone = [found for found, _ in one_process(names, chosen.missing, settings)]
     deployed, peak_mb = over_a_network(names, chosen.missing, settings)
@@ -124,7 +126,7 @@ def main() -> None:
 def one_process(names: list[str], missing: float, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
     """The reference."""
     robots = [DrawnRobot(name, missing, fail) for name in names]
-    return train(in_process_grid(robots), settings)
+    return train(InProcessFleet(robots), settings)
 
 
 def fail(robot: DrawnRobot, _is_silent: bool) -> None:
@@ -143,9 +145,9 @@ def over_a_network(
         robots(names, missing, listener.getsockname()[1]),
     ):
         end = time.monotonic() + CONNECTING_S
-        while len(grid.nodes()) < len(names):
+        while len(grid.robots()) < len(names):
             if time.monotonic() > end:
-                sys.exit(f"only {len(grid.nodes())} of {len(names)} robots connected")
+                sys.exit(f"only {len(grid.robots())} of {len(names)} robots connected")
             time.sleep(0.2)
         return train(grid, settings), peak()
 
@@ -155,7 +157,7 @@ def token_entry(name: str) -> TokenEntry:
     return TokenEntry(name=name, role=Role.ROBOT, sha256=hashlib.sha256(name.encode()).hexdigest())
 
 
-def train(grid: RobotGrid, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
+def train(grid: TrainingFleet, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
     """Every round with the CPU seconds of this process."""
     rounds: list[tuple[RoundReport, float]] = []
     spent = time.process_time()
@@ -168,7 +170,9 @@ def train(grid: RobotGrid, settings: FederatedSettings) -> list[tuple[RoundRepor
 
     hooks = CoordinatorHooks(version, lambda _: {"repeatability": 0.5, "mma_3px": 0.5}, note)
     with tempfile.TemporaryDirectory() as folder:
-        Coordinator(grid, settings, read_detector_weights(DETECTOR, "light"), Path(folder), hooks).run()
+        Coordinator(
+            grid, settings, read_detector_weights(DETECTOR, "light"), Path(folder), hooks, RoundRules(judge_every=1)
+        ).run()
     return rounds
 
 
@@ -211,11 +215,10 @@ def answer(name: str, missing: float, port: int) -> None:
         time.sleep(DEADLINE_S + LATE_S)
 
     client = DrawnRobot(name, missing, stay_away)
-    app = build_client_app(client)
     while True:
         try:
             with RobotLink(f"http://127.0.0.1:{port}", name, Credentials(name)) as link:
-                serve_requests(link, app, lambda _: None)
+                serve_requests(link, client, lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)
 

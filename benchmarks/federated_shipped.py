@@ -4,8 +4,7 @@
 
 Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained and measured; the same command goes on
 where it was interrupted. The robots are those of federated.py,
-with three times as many images; settings are the defaults, but for the number of rounds. Kept is training together with
-`compatible: 30`, so that places which robots stored before are still matched.
+with three times as many images; settings are the defaults, but for the number of rounds.
 
 The first tables are of pairs of views of images that these robots held out, in the place where they train; gaps are to
 central training, in points, with 95 % by paired bootstrap. Old codes are those of the detector that comes along, in the
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 
 SCENES = ("oxford_affine", "hpatches_subset")
 ROUNDS, PAIRS, IMAGES = 40, 1000, 64
-ARMS: dict[str, Any] = {"together": {}, "kept": {"settings": {"compatible": 30.0}}}
+ARMS: dict[str, Any] = {"together": {}}
 COMPARED = ("start", "central", *ARMS)
 OTHERS = {"mma_3px_former": "MMA at 3 px with old codes in the first view, %", "repeatability": "Repeatability, %"}
 SEED, NMS_PX = 1, 8

@@ -45,7 +45,6 @@ from fcslam.learning.batches import draw_batch
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network
-from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.images import find_images, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.local_training import LocalTrainingPlan, train_layers
@@ -77,7 +76,7 @@ def main() -> None:
     chosen.networks.mkdir(parents=True, exist_ok=True)
     kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__ or "", chosen)
-    settings = TrainingSettings(steps=chosen.steps, pairs=4, side_px=192, points=16, learning_rate=1e-3)
+    settings = TrainingSettings(steps=chosen.steps, pairs=4, side_px=192, learning_rate=1e-3)
     rows: list[tuple] = []
     photographs: list[tuple] = []
     for arm in (arm for arm in ARMS if arm in chosen.arms):
@@ -101,8 +100,7 @@ def trained(arm: str, settings: TrainingSettings, folder: Path) -> list[Path | N
     vision = common.recordings(*PHOTOGRAPHS, kind="vision")
     files = find_images([vision / name for name in PHOTOGRAPHS])
     examples = [TrainingExample(image, UNLABELLED) for file in files if (image := read_image(file.path)) is not None]
-    start = FederatedSettings(normalisation="frozen", trained="codes")
-    weights = prepare_initial_weights(BUNDLED_NETWORK, folder, start, ExecutionOptions(), lambda *_: None)
+    weights = prepare_initial_weights(BUNDLED_NETWORK, folder, settings, ExecutionOptions(), lambda *_: None)
     network, before = (weights_to_network(weights, settings.encoder) for _ in range(2))
 
     def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:

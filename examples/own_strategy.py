@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from flwr.serverapp.strategy import FedAvg
 
+from fcslam.learning.federated.coordinator import RoundRules
+from fcslam.learning.federated.flower import flower_aggregate
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, federate_locally
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.trainer import ExecutionOptions
@@ -32,6 +34,7 @@ class WithoutFurthest(FedAvg):
 
 
 if __name__ == "__main__":
-    job = FederatedJob(Path(sys.argv[1]), SETTINGS, strategy=WithoutFurthest)
+    rules = RoundRules(flower_aggregate(WithoutFurthest), judge_every=1)
+    job = FederatedJob(Path(sys.argv[1]), SETTINGS, rules=rules)
     options = ExecutionOptions(validation_pairs=1)
     print(*federate_locally([Path(folder) for folder in sys.argv[2:]], job, options, ProgressCallbacks()), sep="\n")

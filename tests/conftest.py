@@ -141,7 +141,7 @@ def brief_validation():
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fcslam.learning.trainer.VALIDATION_VIEW", (96, 96))
+        patch.setattr("fcslam.learning.validation.VALIDATION_VIEW", (96, 96))
         patch.setattr("fcslam.learning.stages.HELD_OUT_SHAPES", 2)
         yield
 

@@ -30,8 +30,8 @@ def test_every_key_of_the_configuration_has_a_row_with_its_default():
     assert "| `map.resolution_m` | `0.05` m | >= 0.001, <= 10 |" in mission
     assert "| `fleet.fusion` | `joint` | `joint`, `two_point` |" in mission
     page = settings_reference.training_page()
-    assert "| `loss.margin` |" in page
-    assert "| `screening.quorum` |" in page
+    assert "| `losses` |" in page
+    assert "| `local_steps` |" in page
     assert "`training.steps`" not in page, "it refers to the section on training"
 
 

@@ -24,6 +24,7 @@ from evaluation.federated.study import Arm, Study, StudyResults, run_study  # no
 
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
+from fcslam.learning.federated.messages import TrainingRequest  # noqa: E402
 from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
@@ -32,7 +33,7 @@ from tests.learning.federated.fakes import Fake  # noqa: E402
 TINY = {
     "rounds": 2,
     "local_steps": 2,
-    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
+    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "label_copies": 1},
 }
 ARMS = {"averaged": Arm(), "bad": Arm(settings={"strategy": "fedmedian"}, poison="nan")}
 
@@ -112,10 +113,10 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
 @pytest.mark.training
 def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
-    arms = {"frozen": Arm(settings={"normalisation": "frozen"}, seeds=1)}
+    arms = {"median": Arm(settings={"strategy": "fedmedian"}, seeds=1)}
     found = run_study(study(robots, tmp_path, arms=arms, local_seeds=1))
     shapes = {name: values.shape[:2] for name, values in found.measured.items()}
-    assert shapes == {"start": (1, 1), "central": (2, 1), "local": (1, 2), "alone": (1, 2), "frozen": (1, 1)}
+    assert shapes == {"start": (1, 1), "central": (2, 1), "local": (1, 2), "alone": (1, 2), "median": (1, 1)}
 
 
 @pytest.mark.training
@@ -231,7 +232,8 @@ def test_nothing_is_closed_where_central_is_no_better():
 def test_poison_is_what_it_says(poison):
     before = {"weight": np.zeros(6, np.float32)}
     bad = PoisonedClient(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
-    sent = bad.train(before, 0, "run", FederatedSettings()).weights["weight"]
+    request = TrainingRequest(True, before, "v", 0, "run", "images", FederatedSettings())
+    sent = bad.train(request).weights["weight"]
     expected = {
         "flipped": -np.arange(6.0),
         "scaled": 10 * np.arange(6.0),

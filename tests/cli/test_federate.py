@@ -18,7 +18,7 @@ pytest.importorskip("onnx", reason="needs fcslam[federated]")
 TINY = {
     "rounds": 2,
     "local_steps": 2,
-    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
+    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "label_copies": 1},
 }
 pytestmark = pytest.mark.usefixtures("brief_validation")
 TLS_ONLY, ALL = ("--credentials", "{fleet}/tls"), ("--credentials", "{fleet}/all")

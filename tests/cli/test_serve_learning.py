@@ -3,7 +3,6 @@
 import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import main
 from fcslam.cli.training_options import learning_plan
@@ -16,16 +15,14 @@ from fcslam.wire.http_transport import Server
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--learn", "--data", "all"], "set federated.trained to codes"),
         (["--learn", "--data", "few"], "fewest_pairs"),
         (["--learn", "--store", "postgresql://u@h/d"], "leave out --store"),
     ],
 )
 def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for name, settings in (("all", "federated: {trained: all}"), ("few", "gate: {fewest_pairs: 0}")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "learning.yaml").write_text(settings)
+    (tmp_path / "few").mkdir()
+    (tmp_path / "few" / "learning.yaml").write_text("fewest_pairs: 0")
     assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0", *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line

@@ -38,7 +38,7 @@ def first(some_photos, tmp_path_factory, brief_validation):
 
     folder = tmp_path_factory.mktemp("first")
     (folder / "settings.yaml").write_text(
-        f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1, learning_rate: {LAST_RATE}}}"
+        f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, label_copies: 1, learning_rate: {LAST_RATE}}}"
     )
     command = ["tools", "train", str(some_photos), "--config", str(folder / "settings.yaml"), "--output"]
     assert main([*command, str(folder / "first")]) == 0
@@ -56,7 +56,7 @@ def complaint(capsys, *arguments):
 def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, capsys):
     pytest.importorskip("torch", reason="needs fcslam[train]")
     settings = tmp_path / "settings.yaml"
-    settings.write_text("{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, points: 32, label_copies: 1}")
+    settings.write_text("{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, label_copies: 1}")
     output = photos / "out"  # what is in there is no image to train on
     arguments = ["tools", "train", str(photos), "-o", str(output), "--config", str(settings)]
     assert main(arguments) == 0

@@ -249,56 +249,42 @@ def maps(folder: Path) -> Iterator[Target]:
 @contextmanager
 def federated(_: Path) -> Iterator[Target]:
     """Replies of robots to the server, as bytes, and the server's requests to a robot."""
-    from fcslam.learning.federated.flower import (
-        Message,
-        RecordDict,
-        message_to_bytes,
-        reply_from_bytes,
-        request_from_bytes,
-        use_own_identity,
-    )
     from fcslam.learning.federated.messages import (
-        ARRAYS_KEY,
-        CONFIG_KEY,
-        GlobalModel,
-        client_reply,
-        read_replies,
+        TrainingReply,
+        TrainingRequest,
+        collect_updates,
+        read_reply,
         read_request,
-        request_config,
-        weights_to_record,
+        write_reply,
+        write_request,
     )
-    from fcslam.learning.federated.screening import screen
+    from fcslam.learning.federated.screening import BOUNDS, screen
     from fcslam.learning.federated.settings import FederatedSettings
 
-    use_own_identity()
     rng = np.random.default_rng(0)
     names = ("a.weight", "a.bias", "a.running_mean", "a.running_var")
-    sent = GlobalModel({name: np.abs(rng.normal(size=4)).astype(np.float32) for name in names}, "light-1")
-    settings = FederatedSettings()
-    content = {ARRAYS_KEY: sent.record, CONFIG_KEY: request_config(sent.version, 0, "run", settings)}
-    request = Message(RecordDict(content), 7, "train")
+    sent = {name: np.abs(rng.normal(size=4)).astype(np.float32) for name in names}
     moved = {
-        robot: {name: (array * (1.0 + 0.01 * k)).astype(np.float32) for name, array in sent.weights.items()}
+        robot: {name: (array * (1.0 + 0.01 * k)).astype(np.float32) for name, array in sent.items()}
         for k, robot in enumerate(("alice", "bob", "carol", "dave"))
     }
     replies = [
-        message_to_bytes(Message(client_reply(robot, sent.version, {"detector": 0.5}, record), reply_to=request))
-        for robot, record in ((robot, weights_to_record(weights)) for robot, weights in moved.items())
+        write_reply(TrainingReply(robot, "light-1", weights, {"detector": 0.5})) for robot, weights in moved.items()
     ]
-    asked = message_to_bytes(request)
+    asked = write_request(TrainingRequest(True, sent, "light-1", 0, "run", "images", FederatedSettings()))
 
     def one(rng: random.Random) -> bool:
         data = mutate(rng, rng.choice((asked, *replies)), replies)
         try:
-            reply, order = reply_from_bytes(data, request), request_from_bytes(data)
+            reply = read_reply(data)
         except ValueError:
-            return False
-        found = read_replies([reply], {7: "alice"}, sent)
+            return attempt(lambda: read_request(data))
+        found = collect_updates({"alice": reply}, ["alice"], "light-1")
         assert all(text.isprintable() and text for text in found.left_out.values())
-        refused = screen(moved | found.weights, sent.weights, settings.screening)
+        refused = screen(moved | found.weights, sent, BOUNDS)
         kept = [weights for robot, weights in (moved | found.weights).items() if robot not in refused]
         assert all(np.isfinite(array).all() for weights in kept for array in weights.values())
-        return attempt(lambda: read_request(order.content)) if order.has_content() else bool(found.weights)
+        return bool(found.weights)
 
     yield Target(one)
 

@@ -45,7 +45,6 @@ def test_the_script_knows_every_target(fuzz):
 def test_every_target_reads_some_inputs_and_refuses_others(target, tmp_path):
     if target == "federated":
         pytest.importorskip("torch", reason="needs fcslam[federated]")
-        pytest.importorskip("flwr", reason="needs fcslam[federated]")
     with TARGETS[target](tmp_path) as opened:
         outcomes = (opened.attempt(random.Random(f"{target} {number}")) for number in range(150))
         first = next(outcomes)

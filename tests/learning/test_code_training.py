@@ -47,6 +47,11 @@ def light():
     return weights_to_network(read_detector_weights(BUNDLED_NETWORK, "light"), "light").state_dict()
 
 
+def trained(state, plan, encoder="light", revisits=OWN, inputs=None, before=None):
+    network = network_from_state(encoder, state if before is None else before)
+    return train_codes(state, revisits, inputs or CodeInputs(), plan, network)
+
+
 def codes(state, image, points):
     network = network_from_state("light", state)
     with torch.inference_mode():
@@ -56,7 +61,7 @@ def codes(state, image, points):
 
 def test_only_the_layers_of_the_codes_change(encoder, start):
     settings = SMALL.model_copy(update={"encoder": encoder})
-    network = train_codes(start, OWN, CodeInputs(), LocalTrainingPlan(settings, 0, 3)).network
+    network = trained(start, LocalTrainingPlan(settings, 0, 3), encoder).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
     assert changed
     assert changed <= layer_names(network, network.body.code_layers)
@@ -82,41 +87,30 @@ def test_training_brings_the_codes_of_a_point_together(light):
         first, second = (codes(state, image, points) for image, points in zip(OWN.images, PAIR.points, strict=True))
         return float(np.mean(first != second))
 
-    done = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(SMALL, 0, 20))
-    assert {"contrastive", "balance", "keypoints"} == done.losses.keys()
+    done = trained(light, LocalTrainingPlan(SMALL, 0, 20))
+    assert {"contrastive", "balance", "keypoints", "rehearsal"} == done.losses.keys()
     assert distance(done.network.state_dict()) < 0.8 * distance(light)
 
 
-def test_earlier_codes_and_keypoints_hold_as_hard_as_asked(light):
-    loose = SMALL.model_copy(update={"loss": SMALL.loss.model_copy(update={"keypoints": 0.0})})
-    free = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(loose, 0, 20))
-    held = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(SMALL, 0, 20, compatible=100.0))
-    assert held.losses["keypoints"] < 0.5 * free.losses["keypoints"]
-    same = [
-        np.mean(codes(each.network.state_dict(), OWN.images[0], POINTS) == codes(light, OWN.images[0], POINTS))
-        for each in (free, held)
-    ]
-    assert same[1] > same[0] + 0.05
-
-
-def test_rehearsal_keeps_the_codes_of_pictures_that_the_robot_does_not_see(light):
+def test_codes_of_pictures_that_the_robot_does_not_see_are_those_of_the_network_before(light):
     elsewhere = textured(9)[:SIZE, :SIZE]
+    noise = torch.Generator().manual_seed(7)
+    layer = light["body.code_head.1.weight"]
+    noisy = light | {"body.code_head.1.weight": layer + 2.0 * layer.std() * torch.randn(layer.shape, generator=noise)}
 
-    def kept(compatible):
-        done = train_codes(light, OWN, CodeInputs(), LocalTrainingPlan(SMALL, 0, 20, compatible=compatible))
-        assert ("compatible" in done.losses) is (compatible > 0.0)
-        return np.mean(codes(done.network.state_dict(), elsewhere, POINTS) == codes(light, elsewhere, POINTS))
+    def likeness(before):
+        state = trained(light, LocalTrainingPlan(SMALL, 0, 20), before=before).network.state_dict()
+        return np.mean(codes(state, elsewhere, POINTS) == codes(noisy, elsewhere, POINTS))
 
-    assert kept(20.0) > kept(0.0) + 0.03
+    assert likeness(noisy) > likeness(light) + 0.04
 
 
 def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light):
     inputs = CodeInputs()
-    plan = LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 1, compatible=1.0, legacy=light)
-    whole = train_codes(light, OWN, inputs, plan)
-    first = train_codes(light, OWN, inputs, LocalTrainingPlan(SMALL, 0, RAMP_STEPS, compatible=1.0))
-    after = LocalTrainingPlan(SMALL, RAMP_STEPS, 1, compatible=1.0, legacy=light, optimizer_state=first.optimizer_state)
-    second = train_codes(first.network.state_dict(), OWN, inputs, after)
+    whole = trained(light, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 1), inputs=inputs)
+    first = trained(light, LocalTrainingPlan(SMALL, 0, RAMP_STEPS), inputs=inputs)
+    after = LocalTrainingPlan(SMALL, RAMP_STEPS, 1, optimizer_state=first.optimizer_state)
+    second = trained(first.network.state_dict(), after, inputs=inputs, before=light)
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
 
@@ -134,5 +128,5 @@ def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):
 
 
 def test_a_robot_that_saw_nothing_again_is_told_so(light):
-    with pytest.raises(TrainingError, match="no place was; set trained to all"):
-        train_codes(light, RevisitExamples(OWN.images), CodeInputs(), LocalTrainingPlan(SMALL, 0, 1))
+    with pytest.raises(TrainingError, match="no place was"):
+        trained(light, LocalTrainingPlan(SMALL, 0, 1), revisits=RevisitExamples(OWN.images))

@@ -18,13 +18,13 @@ from fcslam.learning.code_batches import (  # noqa: E402
 )
 from fcslam.learning.network import Description  # noqa: E402
 from fcslam.learning.objective import (  # noqa: E402
+    KEYPOINTS_WEIGHT,
     MIN_NEGATIVE_DISTANCE_M,
     MIN_NEGATIVE_DISTANCE_PX,
     rehearsal_loss,
     revisit_negatives,
     revisit_objective,
 )
-from fcslam.learning.settings import LossSettings  # noqa: E402
 
 SIZE = 96
 RNG = np.random.default_rng(2)
@@ -72,10 +72,10 @@ def test_points_of_two_pairs_differ_if_they_are_far_apart_in_the_map_and_of_one_
     assert not revisit_negatives(unknown).numpy()[~same].any()
 
 
-def objective(code_logits, batch, context=0.0, **weights):
+def objective(code_logits, batch, context=0.0):
     still = torch.randn(len(code_logits), 16, 4, 4, generator=torch.Generator().manual_seed(1))
     before = Description(code_logits, still)
-    return revisit_objective(Description(code_logits, still + context), before, batch, LossSettings(**weights))
+    return revisit_objective(Description(code_logits, still + context), before, batch)
 
 
 def test_codes_that_agree_cost_least_and_equal_codes_of_all_points_do_not_pay():
@@ -98,7 +98,7 @@ def test_keypoints_that_move_cost():
     moved_total, moved = objective(columns, batch, context=0.5)
     assert same["keypoints"] == 0.0
     assert moved["keypoints"] == pytest.approx(0.25, rel=0.1)
-    assert float(moved_total - total) == pytest.approx(LossSettings().keypoints * float(moved["keypoints"]), rel=1e-3)
+    assert float(moved_total - total) == pytest.approx(KEYPOINTS_WEIGHT * float(moved["keypoints"]), rel=1e-3)
 
 
 def test_codes_that_leave_the_earlier_ones_cost_in_rehearsal():

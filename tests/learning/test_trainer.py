@@ -23,14 +23,13 @@ from fcslam.learning.trainer import (  # noqa: E402
     PROGRESS_FILE,
     ExecutionOptions,
     TrainingRun,
-    validation_pairs,
 )
 from fcslam.learning.training_step import learning_rate, reduced_precision  # noqa: E402
-from fcslam.learning.validation import collapse_warnings, validate  # noqa: E402
+from fcslam.learning.validation import collapse_warnings, validate, validation_pairs  # noqa: E402
 from fcslam.storage.files import replacing  # noqa: E402
 
 CPU_FLAGS = Path("/proc/cpuinfo")
-SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
+SMALL = TrainingSettings(steps=6, pairs=1, side_px=64)
 pytestmark = pytest.mark.usefixtures("brief_validation")
 PACE = ExecutionOptions(validate_every=100, checkpoint_every_s=0.0, log_every=1)
 

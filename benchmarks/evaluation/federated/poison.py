@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.learning.federated.client import ClientUpdate, FederatedClient
-from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.learning.federated.weights import FloatVector, Weights, trained_names, update_vector
+from fcslam.learning.federated.held_out import Judgement
+from fcslam.learning.federated.messages import TrainingRequest
+from fcslam.learning.federated.weights import FloatVector, Weights, parameter_names, update_vector
 
 Poison = Literal["flipped", "scaled", "reversed", "random", "nan"]
 SCALE = 10.0
@@ -28,10 +29,10 @@ class PoisonedClient:
         """Name of the other client."""
         return self.client.name
 
-    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
+    def train(self, request: TrainingRequest) -> ClientUpdate:
         """As in ``FederatedClient``."""
-        trained = self.client.train(weights, round_number, run_id, settings)
-        names = trained_names(weights, frozen_statistics=True)
+        trained, weights = self.client.train(request), request.weights
+        names = parameter_names(weights)
         update = update_vector(trained.weights, weights, names)
         match self.poison:
             case "flipped":
@@ -41,16 +42,20 @@ class PoisonedClient:
             case "reversed":
                 update = -SCALE * update
             case "random":
-                update = np.random.default_rng([settings.training.seed, round_number]).permutation(update)
+                update = np.random.default_rng([request.settings.training.seed, request.round_number]).permutation(
+                    update
+                )
             case "nan":
                 update = np.full_like(update, np.nan)
         return ClientUpdate(apply_update(weights, update, names), trained.losses)
 
-    def evaluate(
-        self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings
-    ) -> dict[str, float]:
+    def evaluate(self, request: TrainingRequest) -> dict[str, float]:
         """As in ``FederatedClient``."""
-        return self.client.evaluate(weights, round_number, run_id, settings)
+        return self.client.evaluate(request)
+
+    def judge(self, request: TrainingRequest) -> Judgement:
+        """As in ``FederatedClient``."""
+        return self.client.judge(request)
 
 
 def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:

@@ -20,10 +20,10 @@ from fcslam.config import parse
 from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.checkpoint import run_id
 from fcslam.learning.federated.client import FederatedClient, RobotClient
-from fcslam.learning.federated.client_app import in_process_grid
-from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
+from fcslam.learning.federated.coordinator import RULES, Coordinator, CoordinatorHooks, RoundRules
+from fcslam.learning.federated.fleets import InProcessFleet
+from fcslam.learning.federated.flower import flower_aggregate
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.settings import FederatedSettings
@@ -67,6 +67,8 @@ class Arm:
     """True: federated training; false: central training with as many steps as one robot of the fleet."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Federated settings of this arm that differ from those of the study."""
+    rules: RoundRules = RULES
+    """Of the coordinator; its aggregation is that of the settings."""
     poison: Poison | None = None
     """How the last robot falsifies updates; None: it does not."""
     seeds: int | None = None
@@ -119,8 +121,8 @@ class StudyResults:
     owners: tuple[int, ...]
     """For each pair the index in ``robots`` of the robot whose image it shows."""
     measured: Mapping[str, FloatArray]
-    """By arm: shape (seeds, networks, pairs, measures). The arms ``local`` and ``alone``, and arms with private
-    layers, have a network for each robot, all others one. Each pair is measured with one network only; the others have
+    """By arm: shape (seeds, networks, pairs, measures). The arms ``local`` and ``alone`` have a
+    network for each robot, all others one. Each pair is measured with one network only; the others have
     NaN there. An arm may have fewer seeds than central, and ``local`` and ``alone`` may be missing.
     """
 
@@ -189,7 +191,7 @@ def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
         study.on_progress(stage, progress.step, progress.steps)
 
     device = torch.device(study.options.device)
-    start = prepare_initial_weights(study.start, study.folder, study.federated, study.options, on_progress)
+    start = prepare_initial_weights(study.start, study.folder, training, study.options, on_progress)
     network = weights_to_network(start, training.encoder)
     labeller = keypoint_response(network.to(device), device)
     images = {
@@ -219,19 +221,18 @@ def _trained(study: Study, common: SharedInputs, name: str, seed: int) -> list[K
     settings = arm.federated(study.federated, seed)
     if not arm.together:
         return [_centrally(study, common, name, seed, everything, settings.client_training())]
-    return _federated(study, common, name, seed, settings)
+    return [_federated(study, common, name, seed, settings)]
 
 
 def _federated(
     study: Study, common: SharedInputs, name: str, seed: int, settings: FederatedSettings
-) -> list[KeypointNetwork]:
-    """Train the network of an arm: the one that could be released at its end. With private layers, each robot's."""
+) -> KeypointNetwork:
+    """Train the network of an arm: the one that could be released at its end."""
     folder, encoder = study.folder / f"seed{seed}" / name, settings.training.encoder
-    robots = [
+    clients: list[FederatedClient] = [
         RobotClient(robot, Path(robot), folder / robot, study.options.device, images=own)
         for robot, own in common.images.items()
     ]
-    clients: list[FederatedClient] = [*robots]
     poison = study.arms[name].poison
     if poison is not None:
         clients[-1] = PoisonedClient(clients[-1], poison)
@@ -241,11 +242,9 @@ def _federated(
         evaluate_fn=lambda _weights: {},
         on_round=lambda report: study.on_progress(f"{name}, seed {seed}", report.round_number, settings.rounds),
     )
-    state = Coordinator(in_process_grid(clients), settings, common.start, folder, hooks).run()
-    if not settings.private:
-        return [weights_to_network(state.average, encoder)]
-    request = settings.rounds - 1, run_id(settings, weights_version(common.start, encoder)), settings
-    return [weights_to_network(robot.own_weights(state.average, *request), encoder) for robot in robots]
+    rules = replace(study.arms[name].rules, aggregate=flower_aggregate(settings.strategy))
+    state = Coordinator(InProcessFleet(clients), settings, common.start, folder, hooks, rules).run()
+    return weights_to_network(state.average, encoder)
 
 
 def _steps_of(study: Study, seed: int, shares: int) -> TrainingSettings:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.learning.federated.coordinator import RoundRules
     from fcslam.learning.federated.history import RoundReport
     from fcslam.learning.federated.job import ProgressCallbacks
     from fcslam.learning.federated.settings import FederatedSettings
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 QUICK: dict[str, object] = {
     "rounds": 3,
     "local_steps": 6,
-    "judge_every": 1,
     "training": {"shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2},
 }
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
@@ -81,7 +81,7 @@ def local(
     from fcslam.learning.federated.job import FederatedJob, federate_locally
 
     console = notices()
-    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
+    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()), _rules(settings, quick))
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {job.output}") as display:
         shown, most_images = _callbacks(display, console, settings), QUICK_IMAGES if quick else None
@@ -128,7 +128,7 @@ def serve(
     host, port = _host_and_port(address)
     options, console = compute_budget(quick), notices()
     authenticator = Authenticator(None if insecure or tokens is None else read_tokens(tokens))
-    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
+    job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()), _rules(settings, quick))
     with listen(host, port) as listener, ProgressDisplay(console, f"output: {job.output}") as display:
         progress, say = _callbacks(display, console, settings), once_printer(console, MAX_LINES)
         with open_port(listener, None if insecure else tls, authenticator, say) as grid:
@@ -160,9 +160,8 @@ def join(
 
     The robot runs the installed fcslam and no program of the server.
     """
-    require_training_libraries("flwr", extra="federated")
+    require_training_libraries()
     from fcslam.learning.federated.client import RobotClient
-    from fcslam.learning.federated.client_app import build_client_app
     from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
     from fcslam.wire.checks import check_name
     from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
@@ -177,7 +176,7 @@ def join(
     found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
     client = RobotClient(robot, images, output / "labels", compute_budget().device)
     with RobotLink(server, robot, replace(found, own=None)) as link:
-        serve_requests(link, build_client_app(client), once_printer(notices()))
+        serve_requests(link, client, once_printer(notices()))
 
 
 def round_line(row: Mapping[str, str], rounds: int) -> str:
@@ -219,6 +218,14 @@ def _settings(chosen: list[str] | None, quick: bool) -> "FederatedSettings":
 
     base = FederatedSettings()
     return chosen_settings(changed(base, QUICK, "--quick") if quick else base, chosen)
+
+
+def _rules(settings: "FederatedSettings", quick: bool) -> "RoundRules":
+    from fcslam.learning.federated.coordinator import RoundRules
+    from fcslam.learning.federated.flower import flower_aggregate
+
+    aggregate = flower_aggregate(settings.strategy)
+    return RoundRules(aggregate, judge_every=1) if quick else RoundRules(aggregate)
 
 
 def _host_and_port(address: str) -> tuple[str, int]:

@@ -175,9 +175,7 @@ def learning_settings(data: Path, store: str | None) -> FleetLearningSettings:
         raise ServiceError("--learn works with missions in --data; leave out --store")
     config = data / LEARNING_FILE
     settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
-    if not settings.federated.on_revisits:
-        raise ServiceError(f"{config}: a fleet that maps trains on what it saw again; set federated.trained to codes")
-    require_training_libraries("flwr", extra="federated")
+    require_training_libraries()
     return settings
 
 

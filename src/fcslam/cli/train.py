@@ -80,10 +80,8 @@ def _start_network(
     from fcslam.learning.federated.initial_weights import prepare_initial_weights
     from fcslam.learning.federated.networks import weights_to_network
     from fcslam.learning.federated.public_images import read_public_images
-    from fcslam.learning.federated.settings import FederatedSettings
 
-    rounds = FederatedSettings(training=settings)
-    weights = prepare_initial_weights(start, output, rounds, options, lambda *_: None, read_public_images(images))
+    weights = prepare_initial_weights(start, output, settings, options, lambda *_: None, read_public_images(images))
     return weights_to_network(weights, settings.encoder)
 
 

@@ -92,5 +92,5 @@ def learning_plan(
         raise InputError("--learn trains the camera's network; robot.channels or robot.views.detector leave it out")
     file = state / LEARNING_FILE
     chosen = load(RobotLearningSettings, file) if file.exists() else RobotLearningSettings()
-    require_training_libraries("flwr", extra="federated")
+    require_training_libraries()
     return RobotLearningPlan(addresses(server.url)[0], chosen, state, credentials)

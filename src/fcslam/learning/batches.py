@@ -13,6 +13,8 @@ from torch import Tensor
 from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 
+POINTS = 320
+"""Points of a pair whose descriptors are compared."""
 TEACHER_POINTS = 192
 """Most points of the teacher that are used in a pair."""
 
@@ -58,7 +60,7 @@ def draw_batch(examples: Sequence[TrainingExample], settings: TrainingSettings, 
     for index in range(settings.pairs):
         rng = np.random.default_rng([settings.seed, step, index])
         example = examples[int(rng.integers(len(examples)))]
-        pairs.append(draw_pair(example, (settings.side_px, settings.side_px), settings.points, TEACHER_POINTS, rng))
+        pairs.append(draw_pair(example, (settings.side_px, settings.side_px), POINTS, TEACHER_POINTS, rng))
     return collate(pairs)
 
 

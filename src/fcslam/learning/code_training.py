@@ -24,7 +24,7 @@ from fcslam.learning.local_training import (
     train_layers,
 )
 from fcslam.learning.network import Description, KeypointNetwork
-from fcslam.learning.objective import rehearsal_loss, revisit_objective
+from fcslam.learning.objective import REHEARSAL_WEIGHT, rehearsal_loss, revisit_objective
 from fcslam.learning.training_step import reduced_precision
 
 _IMAGES_AT_ONCE: Final = 8
@@ -38,12 +38,10 @@ class CodeInputs:
     _inputs: Tensor | None = None
     _seed: int | None = None
 
-    def of(
-        self, network: KeypointNetwork, images: Sequence[GreyImage], seed: int | None, device: torch.device
-    ) -> Tensor:
+    def of(self, network: KeypointNetwork, images: Sequence[GreyImage], seed: int, device: torch.device) -> Tensor:
         """Shape (K + V, C, H/8, W/8), float16, for K images, always the same, and the V views of ``draw_views``.
 
-        ``seed`` is that of the views; None for none.
+        ``seed`` is that of the views.
         """
         heads = layer_names(network, (*network.body.code_layers, *network.body.point_layers))
         frozen = {name: value for name, value in network.state_dict().items() if name not in heads}
@@ -53,7 +51,7 @@ class CodeInputs:
         if self._inputs is None or self._seed != seed or not is_same:
             self._seed = seed
             self._frozen = {name: value.clone() for name, value in frozen.items()}
-            parts, shown = [], [*images, *(() if seed is None else draw_views(images, seed))]
+            parts, shown = [], [*images, *draw_views(images, seed)]
             for k in range(0, len(shown), _IMAGES_AT_ONCE):
                 grey = np.stack(shown[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
                 with torch.no_grad():
@@ -63,34 +61,36 @@ class CodeInputs:
 
 
 def train_codes(
-    start: Mapping[str, Tensor], revisits: RevisitExamples, inputs: CodeInputs, plan: LocalTrainingPlan
+    start: Mapping[str, Tensor],
+    revisits: RevisitExamples,
+    inputs: CodeInputs,
+    plan: LocalTrainingPlan,
+    before: KeypointNetwork,
 ) -> LocalTrainingResult:
     """Train for some steps from the state ``start``, which is not changed, with the batch statistics as they are.
 
-    The result depends on the arguments alone. ``inputs`` are kept from call to call. Keypoints stay where the legacy
-    detector of the plan finds them; without one, where that of ``start`` does.
+    The result depends on the arguments alone. ``inputs`` are kept from call to call. Keypoints, and the codes of
+    distorted views, stay as the network ``before`` gives them.
 
     Raises:
         TrainingError: nothing was seen again, a state does not fit the network, or training diverged.
     """
     settings, device = plan.settings, plan.device
     if not revisits:
-        raise TrainingError("codes are trained on places seen again, but no place was; set trained to all")
+        raise TrainingError("codes are trained on places seen again, but no place was")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
-    before = network_from_state(settings.encoder, start if plan.legacy is None else plan.legacy).to(device)
-    known = inputs.of(network, revisits.images, settings.seed if plan.compatible else None, device)
+    before = before.to(device)
+    known = inputs.of(network, revisits.images, settings.seed, device)
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
 
     def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
         batch = draw_revisits(revisits, settings.seed, step).to(device)
         described = _described(known[batch.images], network, before)
-        total, losses = revisit_objective(*described, batch, settings.loss)
-        if plan.compatible:
-            views = draw_rehearsal(size, settings.seed, step).to(device)
-            described = _described(known[len(revisits.images) + views.numbers], network, before)
-            losses["compatible"] = rehearsal_loss(*described, views.points)
-            total = total + plan.compatible * losses["compatible"]
-        return total, losses
+        total, losses = revisit_objective(*described, batch)
+        views = draw_rehearsal(size, settings.seed, step).to(device)
+        described = _described(known[len(revisits.images) + views.numbers], network, before)
+        losses["rehearsal"] = rehearsal_loss(*described, views.points)
+        return total + REHEARSAL_WEIGHT * losses["rehearsal"], losses
 
     return train_layers(network, network.body.code_layers, losses_of, plan)
 

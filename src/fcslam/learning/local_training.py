@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from fcslam.errors import TrainingError
 from fcslam.learning.batches import batch_stream
 from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import LOSSES
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import Encoder, TrainingSettings
 from fcslam.learning.training_step import (
-    LegacyDetector,
     create_optimizer,
     descend,
     get_optimizer_state,
@@ -39,12 +39,6 @@ class LocalTrainingPlan:
     first_step: int
     """Counted from 0 over the whole run."""
     steps: int
-    compatible: float = 0.0
-    """Weight of the loss that keeps codes compatible with those of a legacy detector; 0 for none."""
-    legacy: Mapping[str, Tensor] | None = None
-    """State of the network whose codes are still in use."""
-    frozen_statistics: bool = False
-    """Batch normalisation uses the means and variances that it has, and does not change them."""
     optimizer_state: Mapping[str, Tensor] | None = None
     """Result of an earlier local training, which is continued."""
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
@@ -73,17 +67,12 @@ def local_training(
     settings, device = plan.settings, plan.device
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
-    if plan.frozen_statistics:
-        freeze_statistics(network)
-    legacy_detector = None
-    if plan.legacy is not None and plan.compatible > 0.0:
-        legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, plan.legacy).to(device))
     until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
     batches = batch_stream(examples, until, plan.first_step, ahead=2, threads=1)
 
     def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
         _, batch = next(batches)
-        return step_losses(network, batch.to(device), settings, step, legacy=legacy_detector)
+        return step_losses(network, batch.to(device), settings, step, LOSSES[settings.losses])
 
     with closing(batches):
         return _descended(network, losses_of, plan)
@@ -100,7 +89,7 @@ def train_layers(
     trained = layer_names(network, layers)
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(name in trained)
-    freeze_statistics(network)
+    network.eval()
     return _descended(network, losses_of, plan)
 
 
@@ -148,10 +137,3 @@ def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> Keypoin
         raise TrainingError(f"the weights are not those of a {encoder} network ({error})") from error
     network.eval()
     return network
-
-
-def freeze_statistics(network: nn.Module) -> None:
-    """Let batch normalisation neither use nor change batch statistics; its scale and shift stay trainable."""
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.eval()

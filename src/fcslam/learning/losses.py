@@ -5,13 +5,17 @@ with a point: those that are valid, and neither its match nor too close to it. A
 not depend on how many points there are.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from fcslam.features.dense import CELL_PX
 from fcslam.learning.network import cell_log_probabilities
-from fcslam.learning.settings import Negatives
+
+Negatives = Literal["hardest", "all"]
+"""Negatives of the triplet loss: the hardest one of a pair, or all; the paper does not say."""
 
 AGREEMENT_WINDOW_PX = 16
 """Side of the windows in which keypoint maps are compared."""

@@ -1,6 +1,7 @@
 """The objective of a training step: the losses of one batch, and their weighted sum."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from fcslam.learning import losses
 from fcslam.learning.batches import TensorRecord, TrainingBatch
 from fcslam.learning.code_batches import RevisitBatch
 from fcslam.learning.network import Description, Maps, sample_codes
-from fcslam.learning.settings import Encoder, LossSettings
+from fcslam.learning.settings import Encoder, Losses
 
 MIN_NEGATIVE_DISTANCE_PX = 8.0
 """Points closer to a match than this are not negatives, because their codes should be similar."""
@@ -26,6 +27,39 @@ _STILL = 1e-6
 """Least variance by which the change of the keypoints' context is divided."""
 _SEEN = 0.999
 """Least interpolated visibility of a pixel that counts as visible: all four neighbours are, up to rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class LossWeights:
+    """Weights of the losses, each of which is a mean, and their parameters."""
+
+    triplet: float = 1.0
+    """Of eq. (2)."""
+    margin: float = 1.0
+    """Of eq. (2) at the end of training, to which it rises; 0 in the paper."""
+    negatives: losses.Negatives = "hardest"
+    rounding: float = 0.01
+    """Added under the root of eq. (3); 0 in the paper."""
+    contrastive: float = 1.0
+    """Of the InfoNCE loss of the descriptors before they become binary."""
+    temperature: float = 0.05
+    """Of the InfoNCE loss, for similarities in [-1, 1]."""
+    distillation: float = 30.0
+    """Of a teacher's descriptors; falls to a quarter during training."""
+    balance: float = 0.1
+    detector: float = 1.0
+    agreement: float = 1.0
+
+
+LOSSES: Final[dict[Losses, LossWeights]] = {
+    "default": LossWeights(),
+    "paper": LossWeights(margin=0.0, rounding=1e-6, contrastive=0.0, distillation=0.0, balance=0.0, agreement=0.0),
+}
+"""By the setting."""
+KEYPOINTS_WEIGHT: Final = 100.0
+"""Of the loss that leaves keypoints where they are while the layers of the codes are trained."""
+REHEARSAL_WEIGHT: Final = 4.0
+"""Of the loss that keeps the codes of distorted views of a robot's images, so that less is forgotten."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +79,7 @@ class TeacherBits(TensorRecord):
 def objective(
     maps: Maps,
     batch: TrainingBatch,
-    weights: LossSettings,
+    weights: LossWeights,
     progress: float,
     grid_shift: tuple[int, int],
     bits: TeacherBits | None,
@@ -83,7 +117,7 @@ def objective(
 
 
 def revisit_objective(
-    described: Description, before: Description, batch: RevisitBatch, weights: LossSettings
+    described: Description, before: Description, batch: RevisitBatch
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise for points that were seen again, and the losses in it by name.
 
@@ -91,6 +125,7 @@ def revisit_objective(
     of other places. The balance of the bits, and the negatives, keep codes from becoming all the same. ``before`` is
     described by the network that training started from.
     """
+    weights = LOSSES["default"]
     soft = torch.tanh(sample_codes(described.code_logits.float(), batch.points))
     first, second = (side[batch.valid] for side in soft.chunk(2))
     every = torch.ones(len(first), dtype=torch.bool, device=first.device)
@@ -100,7 +135,8 @@ def revisit_objective(
         "balance": losses.balance_loss(soft, batch.valid.repeat(2, 1)),
         "keypoints": moved / before.context.float().var().clamp(min=_STILL),
     }
-    total = sum((getattr(weights, name) * part for name, part in parts.items()), start=torch.zeros_like(moved))
+    factors = {"contrastive": weights.contrastive, "balance": weights.balance, "keypoints": KEYPOINTS_WEIGHT}
+    total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(moved))
     return total, parts
 
 

@@ -23,9 +23,9 @@ from fcslam.learning.homographic_adaptation import Response, adapt, harris, peak
 from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
 from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse_keypoints, read_labels, read_teacher, write_labels
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import TeacherBits, teacher_bits
+from fcslam.learning.objective import LossWeights, TeacherBits, teacher_bits
 from fcslam.learning.pairs import TrainingExample
-from fcslam.learning.settings import LossSettings, TrainingSettings
+from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.synthetic_shapes import draw_shapes
 from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 
@@ -37,7 +37,7 @@ SHAPE_COUNT: Final = 1_000_000
 """Number of different synthetic shapes, more than any training draws."""
 HELD_OUT_SHAPES: Final = 32
 SHAPE_SIDE_PX: Final = 240
-SHAPE_LOSSES: Final = LossSettings(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
+SHAPE_LOSSES: Final = LossWeights(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
 """Only the keypoint maps are trained on shapes: descriptors would learn nothing useful there."""
 
 StageCallback = Callable[[str, TrainingProgress], None]
@@ -132,7 +132,10 @@ def train_detector(
     state = None if first is None else first.state_dict()
     run = TrainingRun(settings, "joint", folder / "joint", options, state, key)
     return run.train(
-        images.train, images.held_out, _teacher_bits(images.train, settings.seed), partial(on_progress, "joint")
+        images.train,
+        images.held_out,
+        _teacher_bits(images.train, settings.seed),
+        on_progress=partial(on_progress, "joint"),
     ), images
 
 
@@ -255,10 +258,13 @@ def train_on_shapes(
         TrainingError: ``folder`` belongs to another run.
         OutputError: a file cannot be written.
     """
-    shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
+    shapes = settings.model_copy(update={"steps": settings.shape_steps})
     run = TrainingRun(shapes, "shapes", folder, options)
     return run.train(
-        SyntheticShapes(0, SHAPE_COUNT), SyntheticShapes(1, HELD_OUT_SHAPES), on_progress=partial(on_progress, "shapes")
+        SyntheticShapes(0, SHAPE_COUNT),
+        SyntheticShapes(1, HELD_OUT_SHAPES),
+        weights=SHAPE_LOSSES,
+        on_progress=partial(on_progress, "shapes"),
     )
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,8 +17,8 @@ from fcslam.errors import TrainingError, writing
 from fcslam.learning.batches import batch_stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import TeacherBits
-from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
+from fcslam.learning.objective import LOSSES, LossWeights, TeacherBits
+from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import (
     create_optimizer,
@@ -29,16 +28,10 @@ from fcslam.learning.training_step import (
     restore_optimizer_state,
     step_losses,
 )
-from fcslam.learning.validation import collapse_warnings, validate
+from fcslam.learning.validation import VALIDATION_PAIRS, collapse_warnings, validate, validation_pairs
 
 AVERAGE_DECAY: Final = 0.999
 """Share of the averaged network that a step keeps; early steps keep less, so that it forgets the initial network."""
-VALIDATION_PAIRS: Final = 24
-VALIDATION_VIEW: Final = (320, 240)
-"""Width and height of a view [px]."""
-VALIDATION_POINTS: Final = 16
-"""Points of a validation pair; validation does not use them, but drawing them is part of the random sequence."""
-VALIDATION_SEED: Final = 2026
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 PROGRESS_FILE: Final = "progress.csv"
 NETWORK, AVERAGE, OPTIMIZER = "network/", "average/", "optimizer/"
@@ -111,8 +104,11 @@ class TrainingRun:
         held_out: Sequence[TrainingExample],
         bits: TeacherBits | None = None,
         on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
+        weights: LossWeights | None = None,
     ) -> KeypointNetwork:
-        """Train to the last step; returns the averaged network. ``bits`` are a teacher's, if the examples have one.
+        """Train to the last step; returns the averaged network.
+
+        ``bits`` are a teacher's, if the examples have one; ``weights`` replace those that the settings name.
 
         Raises:
             TrainingError: the folder's checkpoint belongs to another run, or training diverged.
@@ -122,6 +118,7 @@ class TrainingRun:
             self.folder.mkdir(parents=True, exist_ok=True)
         self._resume()
         bits = None if bits is None else bits.to(self.device)
+        weights = weights or LOSSES[self.settings.losses]
         views = validation_pairs(held_out, self.options.validation_pairs)
         metrics: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
@@ -129,7 +126,7 @@ class TrainingRun:
             examples, self.settings, self.step, 4 * self.options.threads, self.options.threads
         ):
             self.network.train()
-            total, parts = step_losses(self.network, batch.to(self.device), self.settings, step, bits)
+            total, parts = step_losses(self.network, batch.to(self.device), self.settings, step, weights, bits)
             descend(self.network, self.optimizer, total, step, learning_rate(self.settings, step))
             self._average(step)
             self.step = step + 1
@@ -198,14 +195,3 @@ class TrainingRun:
             if not file.tell():
                 rows.writerow(("stage", "step", "name", "value"))
             rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
-
-
-def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION_PAIRS) -> list[ViewPair]:
-    """At most ``most`` pairs of views of held-out images, spread over all of them; always the same."""
-    pairs = []
-    count = min(most, len(held_out))
-    for index in range(count):
-        rng = np.random.default_rng([VALIDATION_SEED, index])
-        example = held_out[index * len(held_out) // count]
-        pairs.append(draw_pair(example, VALIDATION_VIEW, VALIDATION_POINTS, 0, rng))
-    return pairs

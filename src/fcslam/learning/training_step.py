@@ -1,7 +1,6 @@
 """One step of training: forward pass, losses, backward pass, update."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import torch
@@ -9,9 +8,8 @@ from torch import Tensor
 
 from fcslam.errors import TrainingError
 from fcslam.learning.batches import TrainingBatch
-from fcslam.learning.losses import distillation_loss
-from fcslam.learning.network import KeypointNetwork, Maps, sample_codes
-from fcslam.learning.objective import CODE_SHARPNESS, TeacherBits, grid_shift, objective
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import LossWeights, TeacherBits, grid_shift, objective
 from fcslam.learning.settings import TrainingSettings
 
 CLIP_NORM: Final = 1.0
@@ -23,23 +21,6 @@ LAST_RATE: Final = 1e-5
 """Learning rate at the end of training, and the lowest one."""
 DECAY_SHARE: Final = 0.3
 """Share of the steps, at the end, over which the learning rate falls."""
-
-
-@dataclass(frozen=True, slots=True)
-class LegacyDetector:
-    """An earlier detector whose codes are still in use, so the codes of the trained one should match them."""
-
-    strength: float
-    network: KeypointNetwork
-    """In evaluation mode, on the device of the one that is trained."""
-
-    def loss(self, maps: Maps, batch: TrainingBatch) -> Tensor:
-        """Cross entropy of the bits at the batch's points against the legacy detector's bits there."""
-        with torch.no_grad(), reduced_precision(batch.images.device):
-            legacy = self.network(batch.images.contiguous(memory_format=torch.channels_last))
-        wanted = torch.sigmoid(CODE_SHARPNESS * sample_codes(legacy.code_logits.float(), batch.points))
-        logits = CODE_SHARPNESS * sample_codes(maps.code_logits.float(), batch.points)
-        return distillation_loss(logits, wanted, batch.valid.repeat(2, 1))
 
 
 def reduced_precision(device: torch.device) -> torch.autocast:
@@ -86,8 +67,8 @@ def step_losses(
     batch: TrainingBatch,
     settings: TrainingSettings,
     step: int,
+    weights: LossWeights,
     bits: TeacherBits | None = None,
-    legacy: LegacyDetector | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise at a step, and the losses in it by name.
 
@@ -96,11 +77,7 @@ def step_losses(
     with reduced_precision(batch.images.device):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     shift = grid_shift(settings.encoder, settings.seed, step)
-    total, losses = objective(maps, batch, settings.loss, step / settings.steps, shift, bits)
-    if legacy is not None:
-        losses["former"] = legacy.loss(maps, batch)
-        total = total + legacy.strength * losses["former"]
-    return total, losses
+    return objective(maps, batch, weights, step / settings.steps, shift, bits)
 
 
 def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int, rate: float) -> None:

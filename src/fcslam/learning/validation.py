@@ -19,10 +19,16 @@ from fcslam.learning.homography import (
     repeatability,
 )
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import ViewPair
+from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.warps import well_inside
 from fcslam.records import Codes, FloatArray
 
+VALIDATION_PAIRS: Final = 24
+VALIDATION_VIEW: Final = (320, 240)
+"""Width and height of a view [px]."""
+VALIDATION_POINTS: Final = 16
+"""Points of a validation pair; validation does not use them, but drawing them is part of the random sequence."""
+VALIDATION_SEED: Final = 2026
 NMS_PX: Final = 4.0
 LEAST_SCORE: Final = 0.001
 """Probability below which a pixel is not a keypoint."""
@@ -35,6 +41,17 @@ LEAST_SPREAD_BITS: Final = 0.3 * CODE_BITS
 """Codes of different points that differ in fewer bits on average are collapsing; chance gives a half of all bits."""
 LARGEST_BIAS: Final = 0.25
 """Bits whose mean is farther from a half than this carry little information."""
+
+
+def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION_PAIRS) -> list[ViewPair]:
+    """At most ``most`` pairs of views of held-out images, spread over all of them; always the same."""
+    pairs = []
+    count = min(most, len(held_out))
+    for index in range(count):
+        rng = np.random.default_rng([VALIDATION_SEED, index])
+        example = held_out[index * len(held_out) // count]
+        pairs.append(draw_pair(example, VALIDATION_VIEW, VALIDATION_POINTS, 0, rng))
+    return pairs
 
 
 @torch.inference_mode()

@@ -1,14 +1,15 @@
 """Robots that learn nothing but answer what a test wants, and how a server is run with them."""
 
 import hashlib
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from fcslam.learning.federated.client import ClientUpdate
-from fcslam.learning.federated.client_app import build_client_app
-from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.flower import InProcessGrid
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
+from fcslam.learning.federated.fleets import InProcessFleet
+from fcslam.learning.federated.screening import ScreeningBounds
 from fcslam.learning.federated.settings import FederatedSettings
 
 START = {
@@ -16,6 +17,8 @@ START = {
     "a.running_var": np.ones(2, np.float32),
     "b.weight": np.full((), 0.5, np.float32),
 }
+LENIENT = ScreeningBounds(math.inf, math.inf, -math.inf, math.inf)
+PLAIN = RoundRules(bounds=LENIENT, momentum=0.0, smoothing=0.0, judge_every=1)
 
 
 def version(weights):
@@ -39,37 +42,24 @@ class Fake:
     figures: dict = field(default_factory=lambda: {"repeatability": 0.5, "mma_3px": 0.5})
     asked: list = field(default_factory=list)
 
-    def train(self, weights, round_number, _run_id, _settings):
-        self.asked.append(round_number)
-        new = self.answer(weights, round_number) if self.answer else shifted(weights, self.by)
+    def train(self, request):
+        self.asked.append(request.round_number)
+        new = self.answer(request.weights, request.round_number) if self.answer else shifted(request.weights, self.by)
         return ClientUpdate(new, {"detector": self.by})
 
-    def evaluate(self, *_):
+    def evaluate(self, _request):
         return self.figures
 
 
-def grid_of(robots, **extra):
-    return InProcessGrid({robot.name: build_client_app(robot) for robot in robots}, **extra)
-
-
 def settings(**given):
-    return FederatedSettings.model_validate(
-        {
-            "rounds": 2,
-            "local_steps": 1,
-            "judge_every": 1,
-            "screening": LENIENT,
-            "server_momentum": 0.0,
-            "smoothing": 0.0,
-        }
-        | given
-    )
+    return FederatedSettings.model_validate({"rounds": 2, "local_steps": 1} | given)
 
 
-LENIENT = {"largest_change": None, "longest": None, "least_agreement": None, "statistics_distance": None}
+def rules(**given):
+    return replace(PLAIN, **given)
 
 
-def run(robots, folder, chosen=None, grid=None, start=START, **given):
+def run(robots, folder, chosen=None, fleet=None, start=START, rules=PLAIN, **given):
     reports = []
     hooks = CoordinatorHooks(
         **{
@@ -79,5 +69,5 @@ def run(robots, folder, chosen=None, grid=None, start=START, **given):
         }
         | given
     )
-    coordinator = Coordinator(grid or grid_of(robots), chosen or settings(), start, folder, hooks)
-    return coordinator.run(), reports
+    fleet = fleet or InProcessFleet(robots)
+    return Coordinator(fleet, chosen or settings(), start, folder, hooks, rules).run(), reports

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
@@ -70,12 +69,12 @@ class LiveFleet:
         """The link of a robot that shows the token of ``owner``."""
         return RobotLink(f"https://{self.address}", robot, Credentials(self.token(owner or robot), self.ca))
 
-    def start(self, client, app=None):
+    def start(self, client):
         """Let a robot answer requests until the server ends."""
 
         def work():
             with contextlib.suppress(_EndedError), self.link(client.name) as link:
-                serve_requests(link, app or build_client_app(client), self._end, _end)
+                serve_requests(link, client, self._end, _end)
 
         threading.Thread(target=work, daemon=True).start()
 

@@ -3,31 +3,19 @@
 All servers listen on loopback.
 """
 
-import contextlib
-import os
-import signal
-import socket
 import ssl
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError
 from fcslam.learning.federated.client import ClientUpdate
-from fcslam.learning.federated.flower import QUIET
 from fcslam.learning.federated.settings import FederatedSettings
-from tests.learning.federated.authority import free_port
 from tests.learning.federated.fakes import Fake
 from tests.learning.federated.live import LiveFleet, honest_update
 
@@ -36,31 +24,6 @@ pytestmark = [pytest.mark.training, pytest.mark.attack]
 HONEST = ("one", "two", "three", "four")
 HOSTILE = "hostile"
 RUN_S = 90.0
-FOREIGN_APP = """import os, pathlib
-if "FOREIGN_APP_OWNER" not in os.environ:  # not in the stranger's own processes
-    pathlib.Path({marker!r}).write_text("a stranger's program ran here")
-    os._exit(0)
-from flwr.{side} import {kind}
-app = {kind}()
-"""
-FOREIGN_PROJECT = """[build-system]
-requires = ["hatchling"]
-build-backend = "hatchling.build"
-[project]
-name = "foreign"
-version = "1.0.0"
-description = "A stranger's app"
-license = { file = "LICENSE" }
-dependencies = ["flwr>=1.41.0,<2.0"]
-[tool.flwr.app]
-publisher = "stranger"
-fab-format-version = 1
-flwr-version-target = "1.41.0"
-[tool.flwr.app.components]
-serverapp = "foreign.server:app"
-clientapp = "foreign.client:app"
-[tool.flwr.app.config]
-"""
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +61,8 @@ class HostileClient:
     def __init__(self, falsify):
         self._honest, self._falsify = honest_update(99), falsify
 
-    def train(self, weights, round_number, _run_id, _settings):
-        update, losses = self._falsify(self._honest(weights, round_number), weights)
+    def train(self, request):
+        update, losses = self._falsify(self._honest(request.weights, request.round_number), request.weights)
         return ClientUpdate(update, losses)
 
     def evaluate(self, *_):
@@ -123,7 +86,6 @@ POISON = {
     "long flipped update": lambda update, sent: flipped(update, sent, -10.0),
     "wrong shape": lambda update, _: (update | {"a.weight": update["a.weight"][:5]}, {}),
     "another array": lambda update, _: (update | {"b.weight": update["a.weight"][:5]}, {}),
-    "doubles": lambda update, _: (update | {"a.weight": update["a.weight"].astype(np.float64)}, {}),
     "huge array": lambda update, _: (update | {"a.weight": np.zeros((3000, 3000), np.float32)}, {}),
 }
 
@@ -149,7 +111,7 @@ def test_a_poisoned_update_changes_nothing(poison, fleet, undisturbed, tmp_path)
 
 
 def wait_for_all(grid):
-    wait_until(lambda: len(grid.nodes()) == len(HONEST) + 1)
+    wait_until(lambda: len(grid.robots()) == len(HONEST) + 1)
 
 
 def wait_until(happened):
@@ -157,12 +119,6 @@ def wait_until(happened):
     while not happened():
         assert time.monotonic() < end
         time.sleep(0.05)
-
-
-def is_listening(port):
-    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
-        return True
-    return False
 
 
 def test_a_robot_that_sends_noise_is_left_out(fleet, undisturbed, tmp_path):
@@ -184,7 +140,7 @@ def test_a_robot_that_sends_noise_is_left_out(fleet, undisturbed, tmp_path):
         state, reports = fleet.run(grid, tmp_path, chosen_settings())
         ended.set()
         thread.join()
-    assert all("cannot be read" in report.left_out[HOSTILE] for report in reports)
+    assert all(report.left_out[HOSTILE] for report in reports)
     assert all(np.array_equal(state.weights[name], array) for name, array in undisturbed.items())
 
 
@@ -230,64 +186,10 @@ def test_a_robot_cannot_hold_many_requests_open(fleet):
 # ---- a stranger who has nothing but the certificate of the authority ----
 
 
-def foreign_app(folder, marker):
-    package = folder / "foreign"
-    package.mkdir(parents=True)
-    (package / "__init__.py").write_text("")
-    for side, kind in (("server", "ServerApp"), ("client", "ClientApp")):
-        text = FOREIGN_APP.format(marker=f"{marker}-{side}", side=f"{side}app", kind=kind)
-        (package / f"{side}.py").write_text(text)
-    (folder / "pyproject.toml").write_text(FOREIGN_PROJECT)
-    (folder / "LICENSE").write_text("none")
-    return folder
-
-
-def flwr(home, *words):
-    """A command of Flower in the stranger's hands."""
-    command = [str(Path(sys.executable).with_name("flwr")), *map(str, words)]
-    environment = {**os.environ, **QUIET, "FLWR_HOME": str(home), "FOREIGN_APP_OWNER": "1"}
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=RUN_S, check=False)
-
-
-def public_key(path):
-    key = ec.generate_private_key(ec.SECP384R1()).public_key()
-    path.write_bytes(key.public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH))
-    return path
-
-
-def connection(home, address, trust):
-    home.mkdir()
-    (home / "config.toml").write_text(f'[superlink]\ndefault = "x"\n[superlink.x]\naddress = "{address}"\n{trust}\n')
-    return home
-
-
-def markers(folder):
-    return sorted(path.name for path in folder.glob("marker*"))
-
-
-def test_a_stranger_starts_no_app_and_registers_no_key(fleet, undisturbed, tmp_path):
-    home = tmp_path / "home"
-    app = foreign_app(tmp_path / "app", tmp_path / "marker")
-    with fleet.server() as grid:
-        connection(home, fleet.address, f'root-certificates = "{fleet.ca}"')
-        start_honest(fleet)
-        run = flwr(home, "run", app, "x")
-        register = flwr(home, "supernode", "register", public_key(tmp_path / "own.pub"), "x")
-        state, _ = fleet.run(grid, tmp_path / "run", chosen_settings())
-    assert run.returncode != 0, run.stdout
-    assert register.returncode != 0, register.stdout
-    assert any("refused: POST /v1/control/start-run" in line for line in fleet.notices)
-    assert any("refused: POST /v1/control/register-node" in line for line in fleet.notices)
-    assert markers(tmp_path) == []
-    assert all(np.array_equal(state.weights[name], array) for name, array in undisturbed.items())
-
-
 def test_a_stranger_finds_no_operation(fleet):
-    """All of Flower's, and what a web server may offer beside; nothing is answered without a token."""
-    from flwr.supercore.protobuf.translation import PROTOBUF_REQUEST_TYPES
-
-    paths = [path for _, path in PROTOBUF_REQUEST_TYPES] + ["/", "/docs", "/openapi.json", "/health", "/v1/health"]
-    assert len(paths) > 50
+    """What Flower's servers and a web server may offer; nothing is answered without a token."""
+    operations = ("control/start-run", "control/register-node", "runtime/acquire-task", "fleet/push-messages")
+    paths = [f"/v1/{each}" for each in operations] + ["/", "/docs", "/openapi.json", "/health", "/v1/health"]
     with (
         fleet.server(),
         httpx.Client(base_url=f"https://{fleet.address}", verify=ssl.create_default_context(cafile=fleet.ca)) as client,
@@ -298,22 +200,3 @@ def test_a_stranger_finds_no_operation(fleet):
         client.headers["Authorization"] = "Bearer guessed"
         named = {client.post(path, content=b"x").status_code for path in operations}
     assert (unknown, unsigned, named) == ({404}, {401}, {401})
-
-
-def test_the_foreign_app_runs_on_a_superlink(tmp_path):
-    """So the attack is one: Flower's SuperLink runs what anybody submits."""
-    port = free_port()
-    app = foreign_app(tmp_path / "app", tmp_path / "marker")
-    home = connection(tmp_path / "home", f"127.0.0.1:{port}", "insecure = true")
-    program = Path(sys.executable).with_name("flower-superlink")
-    environment = {**os.environ, **QUIET, "FLWR_HOME": str(home), "PATH": f"{program.parent}:{os.environ['PATH']}"}
-    command = [str(program), "--insecure", "--host", "127.0.0.1", "--port", str(port)]
-    with (tmp_path / "log").open("wb") as log:
-        link = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
-    try:
-        wait_until(lambda: is_listening(port))
-        flwr(home, "run", app, "x")
-        wait_until(lambda: markers(tmp_path) == ["marker-server"])
-    finally:
-        os.killpg(link.pid, signal.SIGKILL)
-        link.wait(RUN_S)

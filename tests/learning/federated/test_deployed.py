@@ -29,8 +29,7 @@ TINY = {
     "rounds": 2,
     "local_steps": 2,
     "minimum_robots": 2,
-    "collapse": 1.0,
-    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
+    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "label_copies": 1},
 }
 
 

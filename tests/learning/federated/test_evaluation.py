@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli.federate import round_line
 from fcslam.errors import TrainingError
-from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.evaluation import PUBLIC_IMAGES, VersionComparison, valid_metrics
-from fcslam.learning.federated.flower import InProcessGrid
-from tests.learning.federated.fakes import START, Fake, run, settings, shifted
+from fcslam.learning.federated.fleets import InProcessFleet
+from tests.learning.federated.fakes import START, Fake, rules, run, settings, shifted
 
 
 def figures(value):
@@ -27,31 +25,29 @@ class Judging(Fake):
     level: float = 0.5
     slope: float = 0.01
 
-    def evaluate(self, weights, *_):
-        return figures(self.level + self.slope * 10.0 * float(weights["b.weight"] - START["b.weight"]))
+    def evaluate(self, request):
+        return figures(self.level + self.slope * 10.0 * float(request.weights["b.weight"] - START["b.weight"]))
 
 
-class Coming(InProcessGrid):
+class Coming(InProcessFleet):
     """Robots that are there from some round on."""
 
     def __init__(self, robots, since):
-        super().__init__({robot.name: build_client_app(robot) for robot in robots})
+        super().__init__(robots)
         self._first, self._since = robots[0], since
 
-    def nodes(self):
+    def robots(self):
         begun = len(self._first.asked)
-        return {
-            name: node for (name, node), since in zip(self._nodes.items(), self._since, strict=True) if begun >= since
-        }
+        return [name for name, since in zip(super().robots(), self._since, strict=True) if begun >= since]
 
 
 def run_coming(robots, since, folder, **given):
-    return run(robots, folder, settings(**given), grid=Coming(robots, since), evaluate_fn=None)
+    return run(robots, folder, settings(**given), Coming(robots, since), evaluate_fn=None)
 
 
 def test_only_some_rounds_are_judged_and_the_last(tmp_path):
     robots = [Judging("a")]
-    state, reports = run(robots, tmp_path, settings(rounds=5, judge_every=2), evaluate_fn=None)
+    state, reports = run(robots, tmp_path, settings(rounds=5), rules=rules(judge_every=2), evaluate_fn=None)
     assert [report.released for report in reports] == [False, True, False, True, True]
     assert [bool(report.metrics) for report in reports] == [False, True, False, True, True]
     assert state.best_round == 5
@@ -92,11 +88,11 @@ def test_nobody_who_can_judge_is_waited_for_and_is_no_collapse(tmp_path):
     class Sick(Judging):
         asked_to_judge = 0
 
-        def evaluate(self, weights, *rest):
+        def evaluate(self, request):
             self.asked_to_judge += 1
             if self.asked_to_judge in (1, 3, 4):
                 raise TrainingError("the disk is gone")
-            return super().evaluate(weights, *rest)
+            return super().evaluate(request)
 
     waited = []
     state, reports = run([Sick("a")], tmp_path / "waits", evaluate_fn=None, wait=waited.append)
@@ -120,10 +116,10 @@ def test_a_run_that_robots_judged_goes_on_with_public_images(tmp_path):
 
 def test_a_robot_that_only_fails_to_judge_the_best_is_named(tmp_path):
     class Late(Judging):
-        def evaluate(self, weights, *rest):
-            if weights["b.weight"] < START["b.weight"] + 0.25:
+        def evaluate(self, request):
+            if request.weights["b.weight"] < START["b.weight"] + 0.25:
                 raise TrainingError("too dark")
-            return super().evaluate(weights, *rest)
+            return super().evaluate(request)
 
     _, reports = run_coming([Judging("a", slope=-0.01), Late("b", slope=-0.01)], [0, 2], tmp_path, rounds=4)
     assert reports[2].left_out == {"judging by b": "too dark"}

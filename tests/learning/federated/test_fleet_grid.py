@@ -1,18 +1,24 @@
 """Requests and replies of a fleet, with a clock that the test moves."""
 
 import asyncio
+import contextlib
 import threading
+import time
 
 import httpx
+import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.learning.federated.fleet_grid import MAX_ROBOTS, ONLINE_S, FleetGrid
 from fcslam.learning.federated.fleet_server import PATH, FleetApp
-from fcslam.learning.federated.flower import Message, MessageType, RecordDict, message_to_bytes, request_from_bytes
+from fcslam.learning.federated.messages import TrainingReply, TrainingRequest, write_reply
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.service.http.authentication import Authenticator
+
+WEIGHTS = {"a": np.ones(3, np.float32)}
+REQUEST = TrainingRequest(True, WEIGHTS, "light-1", 0, "run", "images", FederatedSettings())
 
 
 class Clock:
@@ -34,110 +40,112 @@ def grid(clock):
     return grid
 
 
-def ask(grid, *nodes):
-    return grid.push_messages([Message(RecordDict({}), node, MessageType.TRAIN) for node in nodes])
+@contextlib.contextmanager
+def asked(grid, *robots):
+    """Replies to a request, complete after the block."""
+    replies = {}
+    for robot in robots:
+        grid.mark_online(robot)
+    waiting = threading.Thread(target=lambda: replies.update(grid.ask(robots, REQUEST, 30.0)))
+    waiting.start()
+    end = time.monotonic() + 30.0
+    while any(grid.next_request(robot) is None for robot in robots):
+        assert time.monotonic() < end
+    yield replies
+    waiting.join(30.0)
+    assert not waiting.is_alive()
 
 
-def reply_to(data):
-    return message_to_bytes(Message(RecordDict({}), reply_to=request_from_bytes(data)))
+def reply_of(robot):
+    return write_reply(TrainingReply(robot, REQUEST.version, WEIGHTS, {}))
 
 
-def test_a_reply_comes_back_under_the_number_of_its_request(grid):
-    (number,) = ask(grid, 2)
-    found = grid.next_request("one")
-    assert grid.next_request("two") is None
-    assert grid.reply_limit("one", found.number) > 0
-    assert grid.store_reply("one", found.number, reply_to(found.data))
-    (reply,) = grid.pull_messages([number])
-    assert reply.metadata.src_node_id == 2
-    assert grid.pull_messages([number]) == []
+def test_a_reply_comes_back_to_who_asked(grid):
+    with asked(grid, "one") as replies:
+        found = grid.next_request("one")
+        assert grid.next_request("two") is None
+        assert grid.reply_limit("one", found.number) > 0
+        assert grid.store_reply("one", found.number, reply_of("one"))
+    assert (replies["one"].robot, replies["one"].error) == ("one", "")
     assert grid.next_request("one") is None
 
 
 def test_a_robot_that_starts_again_gets_its_request_again(grid):
-    ask(grid, 2)
-    assert grid.next_request("one") is grid.next_request("one")
+    with asked(grid, "one"):
+        found = grid.next_request("one")
+        assert grid.next_request("one") is found
+        grid.store_reply("one", found.number, reply_of("one"))
 
 
 def test_only_the_first_reply_counts_and_only_that_of_the_robot_asked(grid):
-    ask(grid, 2)
-    found = grid.next_request("one")
-    assert not grid.store_reply("two", found.number, reply_to(found.data))
-    assert grid.reply_limit("two", found.number) == 0
-    assert grid.store_reply("one", found.number, reply_to(found.data))
-    assert not grid.store_reply("one", found.number, reply_to(found.data))
+    with asked(grid, "one") as replies:
+        found = grid.next_request("one")
+        assert not grid.store_reply("two", found.number, reply_of("two"))
+        assert not grid.store_reply("one", found.number + 1, reply_of("one"))
+        assert grid.reply_limit("two", found.number) == 0
+        assert grid.store_reply("one", found.number, reply_of("one"))
+        assert not grid.store_reply("one", found.number, b"\xff")
+    assert replies["one"].error == ""
 
 
 def test_a_reply_that_is_none_becomes_an_error(grid):
-    (number,) = ask(grid, 2)
-    assert grid.store_reply("one", grid.next_request("one").number, b"\xff")
-    (reply,) = grid.pull_messages([number])
-    assert "cannot be read" in reply.error.reason
+    with asked(grid, "one") as replies:
+        assert grid.store_reply("one", grid.next_request("one").number, b"\xff\xff\xff\xff")
+    assert replies["one"].error
 
 
 @pytest.mark.attack
 def test_a_reply_beyond_the_limit_is_read_no_further(grid):
-    (number,) = ask(grid, 2)
-    found = grid.next_request("one")
-    limit, read, part = grid.reply_limit("one", found.number), 0, bytes(10_000)
+    with asked(grid, "one") as replies:
+        found = grid.next_request("one")
+        limit, read, part = grid.reply_limit("one", found.number), 0, bytes(10_000)
 
-    async def endless():
-        nonlocal read
-        while read < 10 * limit:
-            read += len(part)
-            yield part
+        async def endless():
+            nonlocal read
+            while read < 10 * limit:
+                read += len(part)
+                yield part
 
-    async def reply():
-        app = FleetApp(grid, Authenticator(None), lambda _: None).asgi()
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
-            return await client.post(PATH.format(robot="one") + f"/reply/{found.number}", content=endless())
+        async def reply():
+            app = FleetApp(grid, Authenticator(None), lambda _: None).asgi()
+            async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
+                return await client.post(PATH.format(robot="one") + f"/reply/{found.number}", content=endless())
 
-    answer = asyncio.run(reply())
+        answer = asyncio.run(reply())
     assert (answer.status_code, answer.text) == (413, f"one: a reply of more than {limit} bytes")
     assert read <= limit + len(part)
-    (refused,) = grid.pull_messages([number])
-    assert refused.error.reason == f"a reply of more than {limit} bytes"
+    assert replies["one"].error == f"a reply of more than {limit} bytes"
 
 
 def test_a_robot_is_online_for_a_while(grid, clock):
-    assert grid.nodes() == {}
+    assert grid.robots() == []
     assert grid.admits("two")
-    assert grid.nodes() == {}
+    assert grid.robots() == []
     grid.mark_online("two")
-    assert grid.nodes() == {"two": 3}
+    assert grid.robots() == ["two"]
     clock.now = ONLINE_S + 0.1
-    assert grid.nodes() == {}
+    assert grid.robots() == []
 
 
 def test_nobody_waits_for_a_robot_that_is_gone(grid, clock):
     """Nor keeps its request."""
     grid.mark_online("one")
     clock.now = ONLINE_S + 1.0
-    messages = [Message(RecordDict({}), 2, MessageType.TRAIN)]
-    assert grid.send_and_receive(messages, timeout=None) == []
+    assert grid.ask(["one"], REQUEST) == {}
     assert grid.next_request("one") is None
 
 
-def test_a_request_is_withdrawn_at_the_deadline(grid, clock):
+def test_a_request_is_withdrawn_at_the_deadline(grid):
     grid.mark_online("one")
-    clock.now = 1.0
-    assert grid.send_and_receive([Message(RecordDict({}), 2, MessageType.TRAIN)], timeout=0.0) == []
+    assert grid.ask(["one"], REQUEST, 0.0) == {}
     assert grid.next_request("one") is None
 
 
 def test_who_waits_gets_the_replies(grid):
-    for robot in ("one", "two"):
-        grid.mark_online(robot)
-    got = []
-    messages = [Message(RecordDict({}), node, MessageType.TRAIN) for node in (2, 3)]
-    waiting = threading.Thread(target=lambda: got.extend(grid.send_and_receive(messages, timeout=30.0)))
-    waiting.start()
-    for robot in ("one", "two"):
-        while (found := grid.next_request(robot)) is None:
-            pass
-        grid.store_reply(robot, found.number, reply_to(found.data))
-    waiting.join(30.0)
-    assert sorted(reply.metadata.src_node_id for reply in got) == [2, 3]
+    with asked(grid, "one", "two") as replies:
+        for robot in ("one", "two"):
+            grid.store_reply(robot, grid.next_request(robot).number, reply_of(robot))
+    assert sorted(replies) == ["one", "two"]
 
 
 def test_a_fleet_has_room_for_so_many():

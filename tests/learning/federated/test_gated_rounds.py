@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.config import changed
-from fcslam.learning.federated.settings import FleetLearningSettings, GateSettings
-from tests.learning.federated.fakes import START, Fake, run, settings, version
+from fcslam.learning.federated.settings import FleetLearningSettings
+from tests.learning.federated.fakes import START, Fake, rules, run, settings, version
 
-CODES = {"trained": "codes", "normalisation": "frozen"}
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
 
 
@@ -23,15 +21,17 @@ class Judge(Fake):
     likes: float = 1.0
     pairs: int = 100
 
-    def judge(self, weights, *_):
+    def judge(self, request):
         rng = np.random.default_rng(1)
-        recall = 0.3 + 0.1 * self.likes * (float(weights["a.weight"][0, 0]) - 1.0) + 0.01 * rng.random(self.pairs)
+        recall = (
+            0.3 + 0.1 * self.likes * (float(request.weights["a.weight"][0, 0]) - 1.0) + 0.01 * rng.random(self.pairs)
+        )
         return np.column_stack((recall, rng.random(self.pairs) < 0.8)).astype(np.float32)
 
 
 def gated(robots, folder, rounds=2, **hooks):
-    given = {"evaluate_fn": None, "gate": GateSettings(), **hooks}
-    return run(robots, folder, settings(rounds=rounds, **CODES), start=TRAINED, **given)
+    given = {"evaluate_fn": None, "rules": rules(fewest_pairs=200), **hooks}
+    return run(robots, folder, settings(rounds=rounds), start=TRAINED, **given)
 
 
 def test_a_version_that_passes_is_released(tmp_path):

@@ -28,14 +28,11 @@ from tests.lab.simulation.gl import require_gl
 from tests.learning.federated.authority import free_port
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 LIMIT_S = 900.0
 SETTINGS = {
-    "gate": {"fewest_pairs": 20, "margin": 0.5},  # far fewer than 200, which only a test may do
-    "federated": {
-        "rounds": 2, "local_steps": 60, "judge_every": 1, "minimum_robots": 3, "compatible": 0.0, "smoothing": 0.0,
-    },
+    "fewest_pairs": 20,  # far fewer than 200, which only a test may do
+    "federated": {"rounds": 2, "local_steps": 60, "minimum_robots": 3},
 }  # fmt: skip
 BROKEN_LAYER, NOISE = "body.code_head.0.0.weight", 6.0
 """Noise in this layer, in standard deviations of its weights, makes a detector that soon learns something."""

@@ -14,9 +14,9 @@ from fcslam.learning.export import export_onnx  # noqa: E402
 from fcslam.learning.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network  # noqa: E402
 from fcslam.learning.federated.onnx_weights import with_batch_statistics  # noqa: E402
-from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
-from fcslam.learning.federated.weights import trained_names  # noqa: E402
+from fcslam.learning.federated.weights import parameter_names  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
+from fcslam.learning.settings import TrainingSettings  # noqa: E402
 from fcslam.learning.stages import SyntheticShapes  # noqa: E402
 from fcslam.learning.trainer import ExecutionOptions  # noqa: E402
 from tests.features.networks import tiny_network  # noqa: E402
@@ -68,7 +68,7 @@ def test_its_normalisations_begin_as_none(tmp_path):
     """So everything that training moves is there, and statistics can be frozen."""
     export_onnx(lived_in("light"), tmp_path / "detector.onnx")
     weights = read_detector_weights(tmp_path / "detector.onnx", "light")
-    statistics = set(weights) - set(trained_names(weights, frozen_statistics=True))
+    statistics = set(weights) - set(parameter_names(weights))
     assert statistics
     for name in statistics:
         assert np.allclose(weights[name], 0.0 if name.endswith("mean") else 1.0, atol=2e-5)
@@ -111,7 +111,7 @@ def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_
 
     def first(public):
         return prepare_initial_weights(
-            tmp_path / "detector.onnx", tmp_path, FederatedSettings(), ExecutionOptions(), lambda *_: None, public
+            tmp_path / "detector.onnx", tmp_path, TrainingSettings(), ExecutionOptions(), lambda *_: None, public
         )
 
     begun, read = first([pictures[0]]), read_detector_weights(tmp_path / "detector.onnx", "light")

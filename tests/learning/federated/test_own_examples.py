@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
 from fcslam.learning.federated.held_out import judge  # noqa: E402
@@ -19,7 +18,7 @@ from fcslam.learning.federated.robot_learning import (  # noqa: E402
     LearningEndError,
     LearningRobot,
 )
-from fcslam.learning.federated.settings import HeldOutSettings, RobotLearningSettings  # noqa: E402
+from fcslam.learning.federated.settings import RobotLearningSettings  # noqa: E402
 from fcslam.records import Channel, Place  # noqa: E402
 from fcslam.robot.backend import RobotBackend  # noqa: E402
 from fcslam.robot.backend_runner import InlineBackend  # noqa: E402
@@ -31,7 +30,7 @@ from tests.robot.test_views import records_of  # noqa: E402
 pytestmark = pytest.mark.slow
 
 CODE_LAYER, POINT_BIAS = "body.code_head.0.0.weight", "body.refine.4.bias"
-SETTINGS = RobotLearningSettings(held_out=HeldOutSettings(side_m=3.0))
+SIDE_M = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +55,7 @@ def test_keyframes_come_back_with_the_poses_of_the_robots_own_map(driven):
 
 def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
     (driven[0] / SPLIT_FILE).unlink(missing_ok=True)
-    _, held_out = own_examples(driven[0], SETTINGS)
+    _, held_out = own_examples(driven[0], SIDE_M)
     start = read_detector_weights(BUNDLED_NETWORK, "light")
     scale = np.random.default_rng(1).standard_normal(start[CODE_LAYER].shape) * start[CODE_LAYER].std()
     others = {"noisy": {CODE_LAYER: start[CODE_LAYER] + np.float32(2.0) * scale.astype(np.float32)},
@@ -76,14 +75,13 @@ def test_a_version_is_judged_by_the_keypoints_and_codes_that_it_finds(driven):
 def test_a_keyframe_that_is_held_out_is_never_trained_on(driven):
     folder, _ = driven
     (folder / SPLIT_FILE).unlink(missing_ok=True)
-    revisits, held_out = own_examples(folder, SETTINGS)
+    revisits, held_out = own_examples(folder, SIDE_M)
     trained = {image.tobytes() for image in revisits.images}
     judged = {frame.image.tobytes() for frame in held_out.frames}
     assert trained
     assert judged
     assert not trained & judged
-    moved = RobotLearningSettings(held_out=HeldOutSettings(side_m=1.0))  # as if the map had moved to other squares
-    _, again = own_examples(folder, moved)
+    _, again = own_examples(folder, 1.0)  # as if the map had moved to other squares
     assert {frame.image.tobytes() for frame in again.frames} == judged
 
 

@@ -8,7 +8,6 @@ import pytest
 from fastapi import FastAPI
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
-pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.learning.federated.relay import learning_router
 

@@ -9,7 +9,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -18,6 +17,8 @@ from fcslam.learning.federated.weights import Weights, weights_error
 
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 STAGE: Final = "federated"
+GROUPS: Final = ("weights", "average", "best", "momentum")
+"""Arrays of the state by their prefix in the file."""
 CHANGEABLE: Final = frozenset({"rounds", "deadline_s", "minimum_robots"})
 """Settings whose values may differ when a run is continued: they do not change the rounds that are done."""
 
@@ -37,8 +38,8 @@ class CoordinatorState:
     """Scores of the released weights in [0, 1], by everyone who evaluated them (``PUBLIC_IMAGES`` or a robot)."""
     best_round: int
     """The round that made them; 0 if they are the initial weights."""
-    strategy_state: Mapping[str, NDArray[Any]]
-    """Arrays that the aggregation carries from round to round."""
+    momentum: Weights
+    """Of the aggregation, carried from round to round; empty before the first one."""
     times_asked: Mapping[str, int]
     """How often each robot was asked to train: an upper bound of the updates that have left it."""
     origin: str
@@ -61,11 +62,8 @@ def run_id(settings: FederatedSettings, origin: str) -> str:
 
 
 def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings) -> None:
-    """Replace the checkpoint atomically.
-
-    Raises:
-        OutputError: the file cannot be written; the last checkpoint stays.
-    """
+    """Replace the checkpoint atomically; if it cannot be written, the last one stays."""
+    groups = {name: getattr(state, name) for name in GROUPS}
     numbers = {
         "best_scores": dict(state.best_scores),
         "best_round": state.best_round,
@@ -75,12 +73,7 @@ def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings
     }
     tensors = {
         f"{group}/{name}": torch.from_numpy(np.asarray(array, order="C"))
-        for group, arrays in (
-            ("weights", state.weights),
-            ("average", state.average),
-            ("best", state.best),
-            ("memory", state.strategy_state),
-        )
+        for group, arrays in groups.items()
         for name, array in arrays.items()
     }
     header = {"settings": settings.model_dump(mode="json"), **numbers}
@@ -100,33 +93,28 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
     checkpoint = read_checkpoint(path)
     if checkpoint.stage != STAGE:
         raise TrainingError(f"{path}: is not a checkpoint of federated training; give another --output")
-    groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "average": {}, "best": {}, "memory": {}}
+    groups = {
+        group: {name: tensor.numpy() for name, tensor in checkpoint.part(f"{group}/").items()} for group in GROUPS
+    }
     try:
-        for key, tensor in checkpoint.tensors.items():
-            group, _, name = key.partition("/")
-            groups[group][name] = tensor.numpy()
         header = checkpoint.settings
         fixed = _fixed(header["settings"])
         state = CoordinatorState(
-            checkpoint.step,
-            groups["weights"],
-            groups["average"],
-            groups["best"],
-            {str(evaluator): float(score) for evaluator, score in header["best_scores"].items()},
-            int(header["best_round"]),
-            groups["memory"],
-            {str(robot): int(rounds) for robot, rounds in header["asked"].items()},
-            str(header["origin"]),
-            float(header.get("update_length", 0.0)),
+            rounds_done=checkpoint.step,
+            **groups,
+            best_scores={str(evaluator): float(score) for evaluator, score in header["best_scores"].items()},
+            best_round=int(header["best_round"]),
+            times_asked={str(robot): int(rounds) for robot, rounds in header["asked"].items()},
+            origin=str(header["origin"]),
+            update_length=float(header["update_length"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(
             f"{path}: is not a checkpoint of this version of fcslam ({error}); give another --output"
         ) from error
     asked = _fixed(settings.model_dump(mode="json"))
-    if odd := sorted(asked.keys() ^ fixed.keys()):
-        raise TrainingError(f"{path}: comes from another version of fcslam ({odd[0]}); give another --output")
-    if others := sorted(name for name in asked if asked[name] != fixed[name]):
+    others = sorted(name for name in asked.keys() | fixed.keys() if asked.get(name) != fixed.get(name))
+    if others:
         raise TrainingError(
             f"{path}: belongs to a run with other settings ({', '.join(others)}); give the same or another --output"
         )

@@ -1,4 +1,4 @@
-"""State of a robot from round to round: weights of the legacy detector, state of its optimizer, private layers.
+"""State of a robot from round to round: the weights of its first round, and the state of its optimizer.
 
 File names contain a checksum of the run's number and nothing else that a server sends. So no server can make a robot
 write outside its folder.
@@ -9,11 +9,8 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fcslam.errors import TrainingError
@@ -21,56 +18,34 @@ from fcslam.learning.arrays import write_arrays
 from fcslam.learning.federated.weights import Weights
 from fcslam.untrusted import read_arrays
 
-_PRIVATE: Final = "private/"
-"""Prefix of the private layers among the arrays of the optimizer."""
 
-
-def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights) -> Weights:
-    """The weights of the first round of the run in which the robot took part; these ones if it is this round.
-
-    Raises:
-        TrainingError: the weights cannot be written or read.
-    """
+def first_weights(cache: Path, run_id: str, round_number: int, weights: Weights) -> Weights:
+    """The weights of the first round of the run in which the robot took part; these ones if it is this round."""
     path = cache / f"former-{_checksum(run_id)}.npz"
-    with translate_errors(path, "the weights of the legacy detector cannot be kept"):
+    with translate_errors(path, "the weights of the first round cannot be kept"):
         if round_number == 0 or not path.exists():
             write_arrays(path, weights)
         return read_arrays(path)
 
 
-def load_robot_state(
-    cache: Path, run_id: str, round_number: int
-) -> tuple[dict[str, Tensor] | None, dict[str, NDArray[np.float32]]]:
-    """The optimizer's state and the private layers after the latest earlier round in which the robot trained.
-
-    Without such a round these are None and no layers.
-
-    Raises:
-        TrainingError: the file cannot be read.
-    """
+def load_moments(cache: Path, run_id: str, round_number: int) -> dict[str, Tensor] | None:
+    """The optimizer's state after the latest earlier round in which the robot trained; None without such a round."""
     earlier = [each for each in _saved_rounds(cache, run_id) if each < round_number]
     if not earlier:
-        return None, {}
+        return None
     path = _state_path(cache, run_id, max(earlier))
     with translate_errors(path, "the optimizer's state cannot be read"):
-        arrays = read_arrays(path)
-        moments = {name: torch.from_numpy(array) for name, array in arrays.items() if not name.startswith(_PRIVATE)}
-        own = {name.removeprefix(_PRIVATE): array for name, array in arrays.items() if name.startswith(_PRIVATE)}
-        return moments, own
+        return {name: torch.from_numpy(array) for name, array in read_arrays(path).items()}
 
 
-def save_robot_state(cache: Path, run_id: str, round_number: int, moments: Mapping[str, Tensor], own: Weights) -> None:
-    """Save the optimizer's state and the private layers after a round, and keep those of the round before.
+def save_moments(cache: Path, run_id: str, round_number: int, moments: Mapping[str, Tensor]) -> None:
+    """Save the optimizer's state after a round, and keep that of the round before.
 
     A server that was killed may repeat the round.
-
-    Raises:
-        TrainingError: the file cannot be written.
     """
     path = _state_path(cache, run_id, round_number)
     with translate_errors(path, "the optimizer's state cannot be kept"):
-        kept = {f"{_PRIVATE}{name}": array for name, array in own.items()}
-        write_arrays(path, {name: value.cpu().numpy() for name, value in moments.items()} | kept)
+        write_arrays(path, {name: value.cpu().numpy() for name, value in moments.items()})
         before = [each for each in _saved_rounds(cache, run_id) if each < round_number]
         for each in _saved_rounds(cache, run_id):
             if each != round_number and each != max(before, default=None):
@@ -78,7 +53,6 @@ def save_robot_state(cache: Path, run_id: str, round_number: int, moments: Mappi
 
 
 def _saved_rounds(cache: Path, run_id: str) -> list[int]:
-    """Rounds of the run whose state is saved."""
     pattern = re.compile(r"moments-[0-9a-f]{8}-(\d+)")
     names = (pattern.fullmatch(file.stem) for file in cache.glob(f"moments-{_checksum(run_id)}-*"))
     return [int(name[1]) for name in names if name]

@@ -8,11 +8,12 @@ from typing import Final
 import numpy as np
 
 from fcslam.learning.federated.held_out import COLUMNS, Judgement, same_pairs
-from fcslam.learning.federated.settings import GateSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
 
+MOST_PLACES_LOST: Final = 0.05
+"""Largest loss of places found again that the lower end of the interval of a released version may allow, as a share."""
 SCORE_METRICS: Final = ("repeatability", "mma_3px")
 LOWEST_SCORE: Final = -1.0
 """Score of a version with an unknown metric: lower than that of any version whose metrics are known."""
@@ -40,7 +41,7 @@ class GateDecision:
 
 
 def decide(
-    candidate: Mapping[str, Judgement], released: Mapping[str, Judgement], settings: GateSettings, seed: int
+    candidate: Mapping[str, Judgement], released: Mapping[str, Judgement], fewest_pairs: int, seed: int
 ) -> GateDecision:
     """The release gate of a fleet that learns while it maps: compare a version with the released one.
 
@@ -58,25 +59,23 @@ def decide(
         for name, column in zip(COLUMNS, np.concatenate([*known, np.empty((0, len(COLUMNS)))]).T, strict=True)
     }
     reason = _objection(
-        rows, [float(np.mean(each[:, 0])) for each in differences.values() if len(each)], gains, settings
+        rows, [float(np.mean(each[:, 0])) for each in differences.values() if len(each)], gains, fewest_pairs
     )
     return GateDecision(reason is None, reason or "better on held-out pairs", len(rows), gains, values)
 
 
-def _objection(
-    rows: FloatArray, by_robot: list[float], gains: Mapping[str, Interval], settings: GateSettings
-) -> str | None:
+def _objection(rows: FloatArray, by_robot: list[float], gains: Mapping[str, Interval], fewest_pairs: int) -> str | None:
     """Why a version is not released; None if it is."""
     recall, found = (gains[name] for name in COLUMNS)
-    if len(rows) < settings.fewest_pairs:
-        return f"{len(rows)} held-out pairs, {settings.fewest_pairs} needed"
+    if len(rows) < fewest_pairs:
+        return f"{len(rows)} held-out pairs, {fewest_pairs} needed"
     if not recall.low > 0.0:
         return f"not better on held-out pairs: {_shown(recall)}"
     if float(np.median(by_robot)) < 0.0:  # the reports of a few robots do not decide for the others
         return "not better for most robots"
     if not np.isfinite(found.mean):
         return "no robot knows two different places to compare"
-    if not found.low >= -settings.margin:
+    if not found.low >= -MOST_PLACES_LOST:
         return f"may find fewer places: {_shown(found)}"
     return None
 

@@ -18,6 +18,7 @@ import torch
 
 from fcslam.errors import FcslamError, writing
 from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.learning.federated.coordinator import RoundRules
 from fcslam.learning.federated.fleet_server import open_port, waiting
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
@@ -54,7 +55,8 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
             told.add(line)
             _log.info("%s", line)
 
-    job = FederatedJob(output, settings.federated, _start(data, output), gate=settings.gate)
+    rules = RoundRules(fewest_pairs=settings.fewest_pairs)
+    job = FederatedJob(output, settings.federated, _start(data, output), rules=rules)
     options = ExecutionOptions(device="cpu", threads=1)
     everybody = Authenticator(None)  # the service has asked for the token
     with open_port(listener, None, everybody, say_once) as grid:

@@ -1,6 +1,6 @@
-"""A robot of a fleet on several machines: it fetches requests, lets its own app answer them, and brings the replies.
+"""A robot of a fleet on several machines: it fetches requests, lets its own client answer them, and brings the replies.
 
-The app is part of fcslam as it is installed on the robot. A server can send weights and settings, and no program.
+The client is part of fcslam as it is installed on the robot. A server can send weights and settings, and no program.
 """
 
 import contextlib
@@ -14,21 +14,9 @@ from urllib.parse import quote
 import httpx
 
 from fcslam.errors import TrainingError, UnavailableError
+from fcslam.learning.federated.client import FederatedClient, answer
 from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER
-from fcslam.learning.federated.flower import (
-    FIRST_NODE,
-    RUN_ID,
-    ClientApp,
-    Context,
-    Message,
-    MessageType,
-    RecordDict,
-    error_reply,
-    message_to_bytes,
-    request_from_bytes,
-    use_own_identity,
-)
-from fcslam.learning.federated.messages import printable_line
+from fcslam.learning.federated.messages import TrainingReply, printable_line, read_request, write_reply
 from fcslam.wire.http_transport import HttpClient
 from fcslam.wire.keys import NO_CREDENTIALS, Credentials
 
@@ -111,7 +99,7 @@ class RobotLink(HttpClient):
 
 def serve_requests(
     link: RobotLink,
-    app: ClientApp,
+    client: FederatedClient,
     on_notice: Callable[[str], None],
     sleep: Callable[[float], None] = time.sleep,
     is_ready: Callable[[], bool] = lambda: True,
@@ -124,8 +112,6 @@ def serve_requests(
     Raises:
         TrainingError: the server does not accept the robot.
     """
-    use_own_identity()
-    context = Context(RUN_ID, FIRST_NODE, {}, RecordDict(), {})  # the app keeps nothing in it
 
     def fetch() -> tuple[int, bytes] | None:
         if is_ready():
@@ -139,27 +125,19 @@ def serve_requests(
             continue
         number, data = found
         with _signs_of_life(link):
-            reply = answer(app, context, data, on_notice)
-        reason = _retried(partial(link.reply, number, reply), on_notice, sleep)
+            reply = _answer(client, data)
+        if reply.error:
+            on_notice(f"refused: {printable_line(reply.error)}")
+        reason = _retried(partial(link.reply, number, write_reply(reply)), on_notice, sleep)
         if reason is not None:
             on_notice(f"the server does not take a reply: {reason}")
 
 
-def answer(app: ClientApp, context: Context, data: bytes, on_notice: Callable[[str], None]) -> bytes:
-    """The serialised reply of the robot's own app to a serialised request, or an error in its place."""
+def _answer(client: FederatedClient, data: bytes) -> TrainingReply:
     try:
-        request = request_from_bytes(data)
-    except ValueError as error:
-        on_notice(f"refused: {error}")
-        # The request has no metadata that a reply could take, so the reply is one to an empty request.
-        return message_to_bytes(error_reply(str(error), Message(RecordDict(), RUN_ID, MessageType.QUERY)))
-    try:
-        reply = app(request, context)
-    except Exception as error:  # a failure ends one request and not the robot
-        reply = error_reply(f"{type(error).__name__}: {error}", request)
-    if reply.has_error():
-        on_notice(f"refused: a request to {request.metadata.message_type}: {printable_line(reply.error.reason or '')}")
-    return message_to_bytes(reply)
+        return answer(client, read_request(data))
+    except TrainingError as error:
+        return TrainingReply(client.name, "", error=str(error))
 
 
 def _retried(operation: Callable[[], _T], on_notice: Callable[[str], None], sleep: Callable[[float], None]) -> _T:

@@ -14,8 +14,7 @@ from fcslam.learning.checkpoint import read_checkpoint
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network, weights_version
 from fcslam.learning.federated.onnx_weights import SUFFIX, read_onnx_weights, with_batch_statistics
 from fcslam.learning.federated.public_images import statistics_images
-from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.learning.settings import Encoder
+from fcslam.learning.settings import Encoder, TrainingSettings
 from fcslam.learning.stages import StageCallback, train_on_shapes
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.untrusted import read_arrays
@@ -27,7 +26,7 @@ GROUPS: Final = ("best/", "average/")
 def prepare_initial_weights(
     start: Path | None,
     folder: Path,
-    settings: FederatedSettings,
+    settings: TrainingSettings,
     options: ExecutionOptions,
     on_progress: StageCallback,
     public: Sequence[GreyImage] = (),
@@ -45,8 +44,8 @@ def prepare_initial_weights(
         OutputError: a file cannot be written.
     """
     if start is None:
-        return network_to_weights(train_on_shapes(folder / "shapes", settings.training, options, on_progress))
-    start, encoder = network_file(start), settings.training.encoder
+        return network_to_weights(train_on_shapes(folder / "shapes", settings, options, on_progress))
+    start, encoder = network_file(start), settings.encoder
     weights = read_detector_weights(start, encoder)
     if start.suffix != SUFFIX:
         return weights

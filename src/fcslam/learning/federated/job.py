@@ -11,15 +11,13 @@ from fcslam.errors import TrainingError, writing
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.artifacts import write_federated_artifacts
 from fcslam.learning.federated.client import RobotClient
-from fcslam.learning.federated.client_app import in_process_grid
-from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.learning.federated.flower import RobotGrid
+from fcslam.learning.federated.coordinator import RULES, Coordinator, CoordinatorHooks, RoundRules
+from fcslam.learning.federated.fleets import InProcessFleet, TrainingFleet
 from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.public_images import public_evaluation, read_public_images
-from fcslam.learning.federated.settings import DETECTOR, FederatedSettings, GateSettings
-from fcslam.learning.federated.strategies import StrategyFactory
+from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.stages import StageCallback
 from fcslam.learning.trainer import ExecutionOptions
@@ -38,10 +36,7 @@ class FederatedJob:
     """Checkpoint or exported detector to start from; None for a detector trained on synthetic shapes."""
     public: Sequence[Path] = ()
     """Folders of images that the server may read; without any, the robots evaluate."""
-    strategy: StrategyFactory | None = None
-    """Makes a strategy of your own; None: the one that the settings name."""
-    gate: GateSettings | None = None
-    """Decides on releases by pairs that robots hold out; None: every version that is not worse is released."""
+    rules: RoundRules = RULES
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +57,7 @@ def run_job(
     job: FederatedJob,
     options: ExecutionOptions,
     callbacks: ProgressCallbacks,
-    grid: RobotGrid,
+    fleet: TrainingFleet,
     wait: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Run a job, or continue it; returns the files for the user: detector, picture of the rounds, and model card.
@@ -75,7 +70,7 @@ def run_job(
     """
     images = read_public_images(job.public)
     _write_config(job, job.output / CONFIG_FILE)
-    initial = prepare_initial_weights(job.start, job.output, job.settings, options, callbacks.stage, images)
+    initial = prepare_initial_weights(job.start, job.output, job.settings.training, options, callbacks.stage, images)
     encoder = job.settings.training.encoder
 
     def on_release(weights: Weights) -> None:
@@ -84,15 +79,15 @@ def run_job(
 
     version = partial(weights_version, encoder=encoder)
     evaluate = public_evaluation(images, encoder, options.device)
-    hooks = CoordinatorHooks(version, evaluate, callbacks.rounds, on_release, wait, job.gate, job.strategy)
-    state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
+    hooks = CoordinatorHooks(version, evaluate, callbacks.rounds, on_release, wait)
+    state = Coordinator(fleet, job.settings, initial, job.output, hooks, job.rules).run()
     _write_config(job, job.output / CONFIG_FILE, again=True)
     judged_on = (
         "on pairs of public images"
         if images
         else "on images of the robots, 4 % held out or one trained on; median of the robots"
     )
-    if job.gate is not None:
+    if job.rules.lesson == "revisits":
         judged_on = "on revisits that no robot trained on, mean"
     return write_federated_artifacts(state, job.output, job.settings, judged_on)
 
@@ -135,4 +130,4 @@ def federate_locally(
         )
         for name, folder in zip(names, folders, strict=True)
     ]
-    return run_job(job, options, callbacks, in_process_grid(clients))
+    return run_job(job, options, callbacks, InProcessFleet(clients))

@@ -17,8 +17,7 @@ from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import Encoder
 from fcslam.learning.stages import SyntheticShapes
-from fcslam.learning.trainer import validation_pairs
-from fcslam.learning.validation import validate
+from fcslam.learning.validation import validate, validation_pairs
 
 STATISTICS_IMAGES: Final = 64
 

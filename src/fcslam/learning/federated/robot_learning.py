@@ -21,7 +21,6 @@ import torch
 from fcslam.errors import FcslamError, TrainingError
 from fcslam.learning.code_training import CodeInputs
 from fcslam.learning.federated.client import RobotClient
-from fcslam.learning.federated.client_app import build_client_app
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.learning_process import NOTICE
 from fcslam.learning.federated.own_examples import own_examples
@@ -84,7 +83,7 @@ class LearningRobot:
         return bool(self._client.revisits)
 
     def _look(self) -> None:
-        revisits, held_out = own_examples(self._folder, self._settings)
+        revisits, held_out = own_examples(self._folder)
         self._client.revisits, self._client.held_out, self._client.inputs = revisits, held_out, CodeInputs()
         emit_event(
             NOTICE,
@@ -100,7 +99,7 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: Learni
         TrainingError: the server does not accept the robot.
         CloudError: the server's address or certificate cannot be used.
     """
-    app, told = build_client_app(client), ""
+    told = ""
 
     def notice(line: str) -> None:
         nonlocal told
@@ -112,7 +111,7 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: Learni
         idle.wait()
         try:
             with open_link() as link:
-                serve_requests(link, app, notice, is_ready=robot.prepare)
+                serve_requests(link, client, notice, is_ready=robot.prepare)
         except BusyRobotError:
             continue
         except LearningEndError as end:

@@ -4,20 +4,23 @@ An update must fit the network, have a plausible length, batch statistics like t
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from fcslam.learning.federated.settings import ScreeningSettings
 from fcslam.learning.federated.weights import (
     MEAN,
     VARIANCE,
     FloatVector,
     Weights,
-    trained_names,
+    parameter_names,
     update_vector,
     weights_error,
 )
+
+QUORUM: Final = 4
+"""Fewest updates in a round for which they are compared with one another."""
 
 SMALLEST_MEDIAN: Final = 3
 """Least number of updates of which one can be recognised as an outlier."""
@@ -30,10 +33,28 @@ BATCH_NORM_EPSILON: Final = 1e-5
 """Added to variances by batch normalisation."""
 
 
+@dataclass(frozen=True, slots=True)
+class ScreeningBounds:
+    """Bounds beyond which an update is refused; malformed and non-finite updates are always refused."""
+
+    largest_change: float = 1.0
+    """Of the norm of an update, as a multiple of the norm of the weights."""
+    longest: float = 3.0
+    """Of the norm of an update, as a multiple of the median norm in the round."""
+    least_agreement: float = -0.02
+    """Of the cosine between an update and the mean direction of the others."""
+    statistics_distance: float = 0.4
+    """Of the distance of batch statistics from the median of three robots or more, in standard deviations, root mean
+    square over the channels."""
+
+
+BOUNDS: Final = ScreeningBounds()
+
+
 def screen(
     updates: Mapping[str, Weights],
     sent: Weights,
-    settings: ScreeningSettings,
+    bounds: ScreeningBounds,
     frozen: bool = False,
     earlier_length: float = 0.0,
 ) -> dict[str, str]:
@@ -46,21 +67,21 @@ def screen(
     ``update_length`` of the round before; 0 in the first round.
     """
     refused = {robot: reason for robot, weights in updates.items() if (reason := weights_error(weights, sent))}
-    parameters = trained_names(sent, frozen_statistics=True)
+    parameters = parameter_names(sent)
     statistics = [name for name in sent if name not in set(parameters)]
     for robot in [robot for robot in updates if frozen and robot not in refused]:
         if any(not np.array_equal(updates[robot][name], sent[name]) for name in statistics):
             refused[robot] = "batch statistics that were to stay as they are have changed"
     for names, earlier in ((parameters, earlier_length), (statistics, 0.0)):
         rest = _vectors(updates, sent, names, refused)
-        refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), earlier, settings)
-    refused |= _odd_statistics(updates, refused, settings)
-    return refused | _disagreeing(_vectors(updates, sent, parameters, refused), settings)
+        refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), earlier, bounds)
+    refused |= _odd_statistics(updates, refused, bounds)
+    return refused | _disagreeing(_vectors(updates, sent, parameters, refused), bounds)
 
 
 def update_length(updates: Mapping[str, Weights], sent: Weights) -> float:
     """Median norm of the accepted updates of a round, without batch statistics; 0 if none was accepted."""
-    names = trained_names(sent, frozen_statistics=True)
+    names = parameter_names(sent)
     lengths = [float(np.linalg.norm(each)) for each in _vectors(updates, sent, names, {}).values()]
     return float(np.median(lengths)) if lengths else 0.0
 
@@ -76,19 +97,16 @@ def _vector(weights: Weights, names: Sequence[str]) -> FloatVector:
 
 
 def _too_long(
-    updates: Mapping[str, FloatVector], size: float, earlier: float, settings: ScreeningSettings
+    updates: Mapping[str, FloatVector], size: float, earlier: float, bounds: ScreeningBounds
 ) -> dict[str, str]:
     lengths = {robot: float(np.linalg.norm(update)) for robot, update in updates.items()}
-    limits = []
-    if settings.largest_change is not None:
-        limits.append(settings.largest_change * size)
-    if settings.longest is not None and len(lengths) >= settings.quorum:
-        limits.append(settings.longest * float(np.median(list(lengths.values()))))
-    if settings.longest is not None and earlier > 0.0:
-        bound = LONGER_THAN_BEFORE * settings.longest * earlier
+    limit = bounds.largest_change * size
+    if len(lengths) >= QUORUM:
+        limit = min(limit, bounds.longest * float(np.median(list(lengths.values()))))
+    if earlier > 0.0:
+        bound = LONGER_THAN_BEFORE * bounds.longest * earlier
         if min(lengths.values(), default=0.0) <= bound:  # not if training itself has changed
-            limits.append(bound)
-    limit = min(limits, default=np.inf)
+            limit = min(limit, bound)
     return {
         robot: f"an update of length {length:.3g}, at most {limit:.3g}"
         for robot, length in lengths.items()
@@ -97,19 +115,19 @@ def _too_long(
 
 
 def _odd_statistics(
-    updates: Mapping[str, Weights], refused: Mapping[str, str], settings: ScreeningSettings
+    updates: Mapping[str, Weights], refused: Mapping[str, str], bounds: ScreeningBounds
 ) -> dict[str, str]:
     rest = {robot: weights for robot, weights in updates.items() if robot not in refused}
-    if settings.statistics_distance is None or len(rest) < SMALLEST_MEDIAN:
+    if len(rest) < SMALLEST_MEDIAN:
         return {}
-    largest = WORST_CHANNEL * settings.statistics_distance
+    largest = WORST_CHANNEL * bounds.statistics_distance
     found = dict(zip(rest, statistics_distances(list(rest.values())), strict=True))
     return {
         robot: f"batch statistics {np.sqrt(np.mean(distances**2)):.2g} standard deviations from the others', "
-        f"at most {settings.statistics_distance:.2g}, and {np.max(distances):.2g} in one channel"
+        f"at most {bounds.statistics_distance:.2g}, and {np.max(distances):.2g} in one channel"
         for robot, distances in found.items()
         if distances.size
-        and not (np.sqrt(np.mean(distances**2)) <= settings.statistics_distance and np.max(distances) <= largest)
+        and not (np.sqrt(np.mean(distances**2)) <= bounds.statistics_distance and np.max(distances) <= largest)
     }
 
 
@@ -134,18 +152,18 @@ def statistics_distances(networks: Sequence[Weights]) -> list[FloatVector]:
     return list(together)
 
 
-def _disagreeing(updates: Mapping[str, FloatVector], settings: ScreeningSettings) -> dict[str, str]:
+def _disagreeing(updates: Mapping[str, FloatVector], bounds: ScreeningBounds) -> dict[str, str]:
     """The updates that oppose the others. The worst one is removed before the others are compared again.
 
     So an update that opposes all does not spoil the direction with which honest updates are compared.
     """
-    if settings.least_agreement is None or len(updates) < settings.quorum:
+    if len(updates) < QUORUM:
         return {}
     rest, refused = dict(updates), {}
     while len(rest) >= SMALLEST_MEDIAN:
         cosines = dict(zip(rest, agreements(list(rest.values())), strict=True))
         worst = min(sorted(cosines), key=cosines.__getitem__)
-        if cosines[worst] >= settings.least_agreement:
+        if cosines[worst] >= bounds.least_agreement:
             break
         refused[worst] = f"an update that agrees too little with the others' (cosine {cosines[worst]:.2f})"
         del rest[worst]

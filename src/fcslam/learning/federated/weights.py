@@ -5,8 +5,6 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError
-
 Weights = Mapping[str, NDArray[np.float32]]
 """Arrays by their names in the network, in the network's order; integer counters are left out."""
 FloatVector = NDArray[np.float64]
@@ -16,37 +14,9 @@ STATISTICS = (MEAN, VARIANCE)
 """Suffixes of the names of batch normalisation's statistics."""
 
 
-def trained_names(weights: Weights, frozen_statistics: bool) -> list[str]:
-    """Names of the arrays that training changes: all, or all but the batch statistics if these are frozen."""
-    return [name for name in weights if not (frozen_statistics and name.endswith(STATISTICS))]
-
-
-def shared_weights(weights: Weights, private: Collection[str]) -> dict[str, NDArray[np.float32]]:
-    """The weights without those of the private layers, which are named as in the settings."""
-    return {name: array for name, array in weights.items() if not _belongs(name, private)}
-
-
-def with_private(weights: Weights, own: Weights, private: Collection[str]) -> Weights:
-    """The weights with the arrays of ``own`` in the private layers; those that ``own`` lacks stay as they are."""
-    return {name: own.get(name, array) if _belongs(name, private) else array for name, array in weights.items()}
-
-
-def check_private(weights: Weights, private: Collection[str]) -> None:
-    """Check that each private layer is one of the network, and that others are left to share.
-
-    Raises:
-        TrainingError: it is not so.
-    """
-    for layer in private:
-        if not any(_belongs(name, [layer]) for name in weights):
-            layers = sorted({".".join(name.split(".")[:2]) for name in weights})
-            raise TrainingError(f"private: the network has no layer {layer}; it has {', '.join(layers)}")
-    if not shared_weights(weights, private):
-        raise TrainingError("private: no layer is left that robots share; name fewer layers")
-
-
-def _belongs(name: str, layers: Collection[str]) -> bool:
-    return any(name == layer or name.startswith(f"{layer}.") for layer in layers)
+def parameter_names(weights: Weights) -> list[str]:
+    """Names of the arrays that are no batch statistics."""
+    return [name for name in weights if not name.endswith(STATISTICS)]
 
 
 def update_vector(new: Weights, old: Weights, names: Collection[str]) -> FloatVector:
@@ -59,6 +29,11 @@ def interpolate_weights(old: Weights, new: Weights, share: float) -> dict[str, N
     """The weighted mean ``share`` * ``old`` + (1 - ``share``) * ``new``."""
     # Computed as a difference and not as a sum of products, so that equal values stay equal to the last bit.
     return {name: np.asarray(new[name] + share * (old[name] - new[name]), np.float32) for name in old}
+
+
+def size_bytes(weights: Weights) -> int:
+    """Size of the arrays."""
+    return sum(array.nbytes for array in weights.values())
 
 
 def weights_error(new: Weights, old: Weights) -> str | None:
