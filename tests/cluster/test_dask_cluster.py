@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
+from fcslam.cluster.dask_cluster import DaskCluster
 from fcslam.cluster.verifying import verifying
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lidar import pair_verification
-from fcslam.lidar.pair_verification import Pair, verify_here
+from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.verification import VerificationConfig
@@ -74,8 +75,9 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
     with Cluster(tmp_path) as cluster:
         one, two = cluster.start_worker("one"), cluster.start_worker("two")
         time.sleep(3.0)
-        with verifying(cluster.address) as verify:
-            wait_for(lambda: len(verify._processes()) == 2)
+        with DaskCluster(cluster.address) as workers:
+            verify = VerificationPool(workers.executors)
+            wait_for(lambda: len(workers.executors()) == 2)
             done = []
             monkeypatch.setattr(
                 pair_verification,
@@ -89,7 +91,7 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
             one.kill()
             assert written(verify(pairs, CONFIG)) == expected
             assert written(verify(pairs[::-1], CONFIG)) == expected[::-1]
-            wait_for(lambda: len(verify._processes()) == 1)
+            wait_for(lambda: len(workers.executors()) == 1)
             assert not warnings_of(), "a cluster may shrink"
 
             done.clear()
@@ -97,7 +99,7 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
             cluster.scheduler.kill()
             for _ in range(3):
                 assert written(verify(pairs, CONFIG)) == expected
-            wait_for(lambda: not verify._processes())
+            wait_for(lambda: not workers.executors())
             assert written(verify(pairs, CONFIG)) == expected
             (warning,) = wait_for(warnings_of)
             assert warning.startswith(f"the cluster {cluster.address} is gone")
@@ -106,7 +108,7 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
             cluster.scheduler.wait()
             cluster.start_scheduler(int(cluster.address.rpartition(":")[2]))
             cluster.start_worker("three")
-            wait_for(verify._processes)
+            wait_for(workers.executors)
             done.clear()
             wait_for(lambda: written(verify(pairs, CONFIG)) == expected and done)
             wait_for(lambda: "is back" in caplog.text)
@@ -131,15 +133,15 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
 
         cluster.start_worker("good")
         wait_for(lambda: refusal(cluster) is None)
-        with verifying(cluster.address) as verify:
+        with DaskCluster(cluster.address) as workers:
             cluster.start_worker(
                 "changed", preload="import fcslam.storage.state_file as file; file.code_version = lambda: 'other'"
             )
             (warning,) = wait_for(warnings_of)
             assert warning.startswith("a worker of the cluster gets no work: 'changed' (tcp://127.0.0.1:")
             assert warning.endswith(f"has fcslam 0.1.0, {DIFFERENT}")
-            assert len(verify._processes()) == 1
-            assert written(verify(pairs, CONFIG)) == expected
+            assert len(workers.executors()) == 1
+            assert written(VerificationPool(workers.executors)(pairs, CONFIG)) == expected
         assert len(warnings_of()) == 1
 
 
@@ -201,9 +203,9 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
             pass
         wait_for(lambda: "Starting established" in (tmp_path / "scheduler-0.log").read_text())
         time.sleep(1.0)
-        with configured(ours), verifying(cluster.address) as verify:
-            assert len(verify._processes()) == 1
-            assert written(verify(pairs, CONFIG)) == expected
+        with configured(ours), DaskCluster(cluster.address) as workers:
+            assert len(workers.executors()) == 1
+            assert written(VerificationPool(workers.executors)(pairs, CONFIG)) == expected
 
 
 def test_the_command_maps_the_same_on_a_cluster_and_on_processes(tmp_path, logs, capsys, monkeypatch):

@@ -146,14 +146,8 @@ def all_edits(mission: ViewedMission) -> list[EditSummary]:
 
 def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
     """An edit; ``gone`` names the edits that undid others (``fcslam.cloud.edits.undone``)."""
-    return EditSummary(
-        number=edit.number,
-        kind=kind_of(edit.content),
-        content=asdict(edit.content),
-        author=edit.author,
-        time_s=edit.time_s,
-        undone_by=gone.get(edit.number),
-    )
+    kind, content = kind_of(edit.content), asdict(edit.content)
+    return _shown(EditSummary, edit, kind=kind, content=content, undone_by=gone.get(edit.number))
 
 
 def map_summaries(mission: ViewedMission) -> list[MapSummary]:
