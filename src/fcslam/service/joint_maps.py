@@ -94,45 +94,31 @@ def joint_maps_of(result: FleetResult, heard_s: Mapping[tuple[str, int], float],
 
 
 def write_joint_maps(path: Path, maps: JointMaps) -> None:
-    """Write the joint maps as one file, whole or not at all."""
-    content = io.BytesIO()
-    described = {
+    """Write the joint maps as one file of NumPy arrays, whole or not at all; what is no grid is JSON in one of them."""
+    about = {
         k: {"resolution": grid.resolution_m, "origin": grid.origin_xy, "frame": maps.frames[k]}
         for k, grid in maps.grids.items()
     }
-    head = {
-        "sessions": [asdict(session) for session in maps.sessions],
-        "maps": described,
-        "radius": maps.robot_radius_m,
-    }
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        archive.writestr("joint.json", json.dumps(head))
-        for k, grid in maps.grids.items():
-            array = io.BytesIO()
-            np.save(array, grid.cells, allow_pickle=False)
-            archive.writestr(f"{k}.npy", array.getvalue())
+    head = {"sessions": [asdict(one) for one in maps.sessions], "maps": about, "radius": maps.robot_radius_m}
+    content, cells = io.BytesIO(), {str(k): grid.cells for k, grid in maps.grids.items()}
+    np.savez_compressed(content, head=np.frombuffer(json.dumps(head).encode(), np.uint8), **cells)
     write_file(path, content.getvalue())
 
 
 def read_joint_maps(path: Path) -> JointMaps:
     """Read what ``write_joint_maps`` wrote."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            head = json.loads(archive.read("joint.json"))
+        with np.load(path, allow_pickle=False) as file:
+            head = json.loads(file["head"].tobytes())
+            maps = {int(k): about for k, about in head["maps"].items()}
             grids = {
-                int(k): OccupancyMap(
-                    np.load(io.BytesIO(archive.read(f"{k}.npy")), allow_pickle=False),
-                    about["resolution"],
-                    tuple(about["origin"]),
-                )
-                for k, about in head["maps"].items()
+                k: OccupancyMap(file[str(k)], about["resolution"], tuple(about["origin"])) for k, about in maps.items()
             }
-        frames = {int(k): about["frame"] for k, about in head["maps"].items()}
-        radius_m = float(head["radius"])
         sessions = [JointSession(**{**one, "pose": tuple(one["pose"])}) for one in head["sessions"]]
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        frames = {k: about["frame"] for k, about in maps.items()}
+        return JointMaps(sessions, grids, frames, float(head["radius"]))
+    except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
         raise StoreError(f"{path}: no joint maps can be read ({error})") from error
-    return JointMaps(sessions, grids, frames, radius_m)
 
 
 class LivePose(NamedTuple):
