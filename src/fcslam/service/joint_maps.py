@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -100,8 +100,9 @@ def write_joint_maps(path: Path, maps: JointMaps) -> None:
         for k, grid in maps.grids.items()
     }
     head = {"sessions": [asdict(one) for one in maps.sessions], "maps": about, "radius": maps.robot_radius_m}
-    content, cells = io.BytesIO(), {str(k): grid.cells for k, grid in maps.grids.items()}
-    np.savez_compressed(content, head=np.frombuffer(json.dumps(head).encode(), np.uint8), **cells)
+    arrays: dict[str, Any] = {str(k): grid.cells for k, grid in maps.grids.items()}
+    arrays["head"], content = np.frombuffer(json.dumps(head).encode(), np.uint8), io.BytesIO()
+    np.savez_compressed(content, **arrays)
     write_file(path, content.getvalue())
 
 
