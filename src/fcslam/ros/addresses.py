@@ -33,11 +33,7 @@ def is_address(text: str) -> bool:
 
 
 def parse_address(text: str) -> RosAddress:
-    """The address in ``text``.
-
-    Raises:
-        NetworkError: its namespace is not a valid one.
-    """
+    """The address in ``text``."""
     match = _ADDRESS.fullmatch(text)
     assert match is not None  # as is_address says
     namespace = match[2].rstrip("/")
@@ -49,11 +45,7 @@ def parse_address(text: str) -> RosAddress:
 
 
 def open_network(address: RosAddress, environment: Mapping[str, str] = os.environ) -> RosNetwork:
-    """Join the network of ``address``; the domain of ROS 2 is ROS_DOMAIN_ID, or 0.
-
-    Raises:
-        NetworkError: the domain is out of range, the middleware is missing, or the network cannot be joined.
-    """
+    """Join the network of ``address``; the domain of ROS 2 is ROS_DOMAIN_ID, or 0."""
     text = environment.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
         raise NetworkError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")

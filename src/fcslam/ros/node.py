@@ -139,11 +139,7 @@ class RobotNode:
         self._subscribe()
 
     def run(self, watch: "Callable[[int, RobotPose | None], None]" = lambda _scans, _pose: None) -> None:
-        """Map until ``stop``; after each record, ``watch`` gets the number of scans and the pose of the last one.
-
-        Raises:
-            NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
-        """
+        """Map until ``stop``; after each record, ``watch`` gets the number of scans and the pose of the last one."""
         threads = [
             threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
             threading.Thread(target=self._publish_maps, name="maps", daemon=True),
@@ -193,11 +189,7 @@ class RobotNode:
         self._stop.set()
 
     def publish_map(self) -> None:
-        """Publish the map, the path and the closures as they are now; the robot's own map only if there is a scan.
-
-        Raises:
-            FcslamError: the map is gone.
-        """
+        """Publish the map, the path and the closures as they are now; the robot's own map only if there is a scan."""
         is_finished_map = self._suggest_pose is not None
         if self._pose is None and not is_finished_map:
             return

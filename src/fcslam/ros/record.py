@@ -116,11 +116,7 @@ class _Inbox:
         self._messages.put((topic, received_ns, payload))
 
     def get(self, timeout_s: float) -> tuple[str, int, bytes]:
-        """The next message.
-
-        Raises:
-            queue.Empty: none came within the time.
-        """
+        """The next message."""
         message = self._messages.get(timeout=timeout_s)
         with self._lock:
             self._waiting_bytes -= len(message[2])

@@ -43,11 +43,7 @@ class Ros2Network:
     """A participant of one DDS domain. A process has at most one for each domain."""
 
     def __init__(self, domain: int, environment: Mapping[str, str] = os.environ) -> None:
-        """Join ``domain``.
-
-        Raises:
-            NetworkError: Cyclone DDS is not installed or cannot start.
-        """
+        """Join ``domain``."""
         try:
             from cyclonedds import builtin, core
             from cyclonedds import domain as domains
@@ -203,9 +199,6 @@ def configuration(environment: Mapping[str, str]) -> str:
 
     ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean in ROS 2. CYCLONEDDS_URI
     comes last and overrides them.
-
-    Raises:
-        NetworkError: a peer is not an address.
     """
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET").upper()
     local = reach in ("LOCALHOST", "OFF") or environment.get("ROS_LOCALHOST_ONLY") == "1"

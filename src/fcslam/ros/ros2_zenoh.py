@@ -46,11 +46,7 @@ class ZenohNetwork:
     """A session of Zenoh that takes part in one domain of ROS 2."""
 
     def __init__(self, domain: int, environment: Mapping[str, str] = os.environ) -> None:
-        """Join ``domain`` at a router; the environment configures the session as it does that of rmw_zenoh.
-
-        Raises:
-            NetworkError: eclipse-zenoh is not installed, its configuration cannot be used, or no router answers.
-        """
+        """Join ``domain`` at a router; the environment configures the session as it does that of rmw_zenoh."""
         try:
             import zenoh
         except ImportError as error:
@@ -206,9 +202,6 @@ _ADVICE: Final = (
 def session_config(environment: Mapping[str, str]) -> Any:
     """The configuration of a session: that of ZENOH_SESSION_CONFIG_URI or else rmw_zenoh's, changed by
     ZENOH_CONFIG_OVERRIDE (``KEY=VALUE;KEY=VALUE``).
-
-    Raises:
-        NetworkError: one of the two cannot be used.
     """
     import zenoh
 

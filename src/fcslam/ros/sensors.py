@@ -40,13 +40,12 @@ from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.pairing import Message, PosedImage, PosedScan
 from fcslam.sources.bags.reader import Numbered, ReadLaser, SensorReader
 from fcslam.sources.bags.rig import (
+    MountedSensor,
     MountingError,
     Rig,
-    check_frames,
-    given_mounting,
     mounted_camera,
+    mountings_of,
     rig_of,
-    sensor_mounting,
     tilt_note,
     usual_scan,
 )
@@ -185,11 +184,7 @@ class LiveSensors:
         yield from self.wait(now_s)
 
     def wait(self, now_s: float) -> Iterator[SensorRecord]:
-        """Yield what need not wait any longer at the time ``now_s``, if there is no message.
-
-        Raises:
-            NetworkError: as in ``add``.
-        """
+        """Yield what need not wait any longer at the time ``now_s``, if there is no message."""
         self._began = now_s if self._began is None else self._began
         if self._reader is None:
             self._rig = self._rig_now(now_s)
@@ -385,16 +380,12 @@ class LiveSensors:
         return enough and (self._has_odometry or self.is_without_odometry)
 
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
-        if self._options.laser_poses:
-            kinds = [self._topics.kinds[topic] for topic in self._topics.scans]
-            return list(map(given_mounting, self._options.laser_poses, kinds))
-        sensors = [(topic, scan.frame) for topic, scan in zip(self._topics.scans, first, strict=True)]
+        sensors = [
+            MountedSensor(topic, topic, self._topics.kinds[topic], scan.frame)
+            for topic, scan in zip(self._topics.scans, first, strict=True)
+        ]
         try:
-            check_frames(sensors)
-            return [
-                sensor_mounting(self._tree, base_frame, frame, self._topics.kinds[topic], topic)
-                for topic, frame in sensors
-            ]
+            return mountings_of(sensors, self._tree, base_frame, self._options.laser_poses)
         except MountingError as error:
             raise NetworkError(str(error)) from error
 

@@ -167,19 +167,11 @@ class DecodedBag(BagFile):
 
     @property
     def census(self) -> Census:
-        """The frames of all scans, odometry and transforms; those of messages that are invalid are left out.
-
-        Raises:
-            SourceError: the bag cannot be read.
-        """
+        """The frames of all scans, odometry and transforms; those of messages that are invalid are left out."""
         return self._census_and_tape[0]
 
     def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
-        """The messages of ``topics`` in the order of recording.
-
-        Raises:
-            SourceError: the bag cannot be read.
-        """
+        """The messages of ``topics`` in the order of recording."""
         kept = [topic for topic in topics if _is_kept(topic)]
         others = [topic for topic in topics if not _is_kept(topic)]
         streams = [*[self._kept_messages(kept)] * bool(kept), *[self._other_messages(others)] * bool(others)]

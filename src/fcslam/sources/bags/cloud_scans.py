@@ -66,11 +66,7 @@ class BagScans:
         return valid(self._robot.bag.read([topic]), lambda message: self.scan(message, self._options.cloud_band))
 
     def scan(self, message: BagMessage, band: CloudBand) -> ScanMessage:
-        """The scan of a message; raises ValueError if it is invalid.
-
-        Raises:
-            SourceError: tf lacks the mounting of a cloud.
-        """
+        """The scan of a message; raises ValueError if it is invalid."""
         topic, content = message.topic, message.content
         if topic.type in LASER_SCANS:
             scan: ScanMessage = content

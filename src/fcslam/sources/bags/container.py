@@ -99,11 +99,7 @@ class BagFile:
 
     @cached_property
     def topics(self) -> tuple[Topic, ...]:
-        """All topics, sorted by name; a topic with two types is listed twice.
-
-        Raises:
-            SourceError: the bag is empty, damaged, or its parts do not belong together.
-        """
+        """All topics, sorted by name; a topic with two types is listed twice."""
         counts: Counter[tuple[str, str]] = Counter()
         for part in self._parts:
             with part.opened() as reader:
@@ -179,11 +175,7 @@ class PartOrder:
         """When another file first went on with a topic."""
 
     def check(self, topic: str, part: Path, time_ns: int) -> None:
-        """Check the next scan of a topic.
-
-        Raises:
-            SourceError: the topic comes from two files at the same time, or a long time lies between the files.
-        """
+        """Check the next scan of a topic."""
         before, before_ns = self._last.get(topic, (part, time_ns))
         self._last[topic] = part, time_ns
         if before == part:
@@ -299,11 +291,7 @@ class _Part:
 
     @cached_property
     def _checked_path(self) -> Path:
-        """The path; files of MCAP are looked through once before, as they could fill the memory.
-
-        Raises:
-            SourceError: one would fill the memory, or is not a bag of ROS 2.
-        """
+        """The path; files of MCAP are looked through once before, as they could fill the memory."""
         for path in self.path.glob("*.mcap") if self.path.is_dir() else [self.path]:
             with open_file(path) as file:
                 if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:

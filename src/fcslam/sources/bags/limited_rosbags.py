@@ -69,11 +69,7 @@ def ros1_reader(path: Path) -> Any:
 
 
 def ros2_reader(path: Path, suffix: str) -> Any:
-    """A reader of a file of ROS 2 with ``suffix``, or of a folder with its metadata (``dir``), not yet opened.
-
-    Raises:
-        OSError, ValueError, sqlite3.Error: a file is refused.
-    """
+    """A reader of a file of ROS 2 with ``suffix``, or of a folder with its metadata (``dir``), not yet opened."""
     _limit_rosbags()
     from rosbags import rosbag2
 
@@ -85,11 +81,7 @@ def ros2_reader(path: Path, suffix: str) -> Any:
 
 
 def check_metadata(folder: Path) -> None:
-    """Check metadata.yaml and the files that it names.
-
-    Raises:
-        OSError, ValueError: one is too large, expands, is not a regular file of the folder, or is named twice.
-    """
+    """Check metadata.yaml and the files that it names."""
     described = parse_yaml(read_text(folder / METADATA, folder, _MOST_METADATA_BYTES), _MOST_METADATA_BYTES)
     try:
         names = [Path(name).name for name in described["rosbag2_bagfile_information"]["relative_file_paths"]]
@@ -102,11 +94,7 @@ def check_metadata(folder: Path) -> None:
 
 
 def check_chunks(reader: Any) -> None:
-    """Check that the chunks of an opened MCAP file that overlap in time, which rosbags unpacks at once, fit in memory.
-
-    Raises:
-        LimitError: they do not.
-    """
+    """Check that chunks of an opened MCAP file that overlap in time, which rosbags unpacks at once, fit in memory."""
     size = os.stat(reader.path).st_size
     unpacked, ends = 0, [(chunk.message_end_time, -chunk.uncompressed_size) for chunk in reader.chunks]
     begins = [(chunk.message_start_time, chunk.uncompressed_size) for chunk in reader.chunks]

@@ -149,12 +149,7 @@ def candidates_of(robot: BagRobot) -> Candidates:
 
 
 def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
-    """Plan how a robot of a bag is read.
-
-    Raises:
-        SourceError: a topic is missing, none of a laser's scans can be read, or it is not clear which odometry or
-            which transforms are the robot's.
-    """
+    """Plan how a robot of a bag is read."""
     topics = choose_topics(_known_topics(robot), options, partial(_view_rad, robot), partial(_has_images, robot))
     tree = robot.bag.census.tree(robot.transforms)
     scans = BagScans(
@@ -238,11 +233,7 @@ def _odometry(
 def _odometry_candidates(
     robot: BagRobot, options: BagOptions, topics: Topics, tree: TransformTree, frame: str
 ) -> Iterator[OdometryInput]:
-    """The chosen topic of odometry, then tf; ``frame`` is that of the first laser.
-
-    Raises:
-        SourceError: there is no odometry of the frames that the user names, or it is not clear which is the base.
-    """
+    """The chosen topic of odometry, then tf; ``frame`` is that of the first laser."""
     link = tree.odometry_link(frame, options.odom_frame, options.base_frame)
     measured = [topic for topic in topics.odometry if topic.type == ODOMETRY]
     if options.odom_topic is None and options.odom_frame is not None:
@@ -264,11 +255,7 @@ def _odometry_candidates(
 
 
 def _base_frame(robot: BagRobot, options: BagOptions, topic: Topic) -> str | None:
-    """The frame of the base on a topic of odometry that has several.
-
-    Raises:
-        SourceError: tf does not say which of them is of the robot.
-    """
+    """The frame of the base on a topic of odometry that has several."""
     frames = [frame for frame in usual(robot.bag.census.base_frames.get(topic, {})) if frame]
     chosen = options.base_frame or robot.base_frames.get(topic.name)
     if len(frames) < 2:

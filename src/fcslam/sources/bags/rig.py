@@ -1,6 +1,6 @@
 """The mounted sensors of a robot: they turn its messages into records."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from math import degrees, hypot, radians
 from typing import NamedTuple
 
@@ -25,6 +25,24 @@ _FARTHEST_M = 10.0
 
 class MountingError(FcslamError):
     """A laser cannot be read as it is mounted; the message says why, and what to do."""
+
+
+class UnknownMountingError(NoTransformError):
+    """tf does not say where a sensor sits."""
+
+    def __init__(self, reason: str, sensor: str) -> None:
+        super().__init__(reason)
+        self.sensor = sensor
+
+
+class MountedSensor(NamedTuple):
+    """A laser or a sensor of clouds on its robot."""
+
+    name: str
+    topic: str
+    kind: str
+    """Type of its messages."""
+    frame: str
 
 
 class Rig(NamedTuple):
@@ -76,49 +94,50 @@ def rig_of(
     return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera)
 
 
-def check_frames(frames: Iterable[tuple[str, str]]) -> None:
-    """Check the topic and the frame of each laser.
+def mountings_of(
+    sensors: Sequence[MountedSensor], tree: TransformTree, base_frame: str, poses: Sequence[GivenPose]
+) -> list[Mounting]:
+    """Where the sensors sit: where the user says, or else where tf says.
 
     Raises:
-        MountingError: two topics have one frame, so tf cannot give the pose of each laser.
+        UnknownMountingError: tf does not say it.
+        MountingError: a laser does not look along the floor, or is not on the robot, or two topics have one frame, so
+            tf cannot give the pose of each laser.
     """
+    if poses:
+        return [
+            Mounting((x, y, theta), upside_down=any(upside_down) and sensor.kind in LASER_SCANS, tilt_rad=0.0)
+            for (x, y, theta, *upside_down), sensor in zip(poses, sensors, strict=True)
+        ]
     topic_of: dict[str, str] = {}
-    for topic, frame in frames:
-        if (other := topic_of.setdefault(frame, topic)) != topic:
+    for sensor in sensors:
+        if (other := topic_of.setdefault(sensor.frame, sensor.topic)) != sensor.topic:
             raise MountingError(
-                f"the scans of {other} and {topic} have one frame, '{frame}', so tf cannot give the pose of each "
-                "laser; give it with --sensors laser-pose=X,Y,THETA for each"
+                f"the scans of {other} and {sensor.topic} have one frame, '{sensor.frame}', so tf cannot give the pose "
+                "of each laser; give it with --sensors laser-pose=X,Y,THETA for each"
             )
+    return [_mounting_in(tree, base_frame, sensor) for sensor in sensors]
 
 
-def sensor_mounting(tree: TransformTree, base_frame: str, frame: str, kind: str, name: str) -> Mounting:
-    """Where tf says that a laser, or another sensor with messages of type ``kind``, sits.
-
-    Raises:
-        NoTransformError: tf does not say it.
-        MountingError: the laser ``name`` does not look along the floor, or is not on the robot.
-    """
-    mounted = mounting(tree.fixed(base_frame, frame))
+def _mounting_in(tree: TransformTree, base_frame: str, sensor: MountedSensor) -> Mounting:
+    try:
+        mounted = mounting(tree.fixed(base_frame, sensor.frame))
+    except NoTransformError as error:
+        raise UnknownMountingError(str(error), sensor.name) from error
     away_m = hypot(*mounted.T_base_laser[:2])
     if away_m > _FARTHEST_M:
         raise MountingError(
-            f"tf puts the laser of {name} {away_m:.0f} m from '{base_frame}', as if in millimetres or centimetres; "
-            "correct it in tf, or give its pose with --sensors laser-pose=X,Y,THETA (metres, radians)"
+            f"tf puts the laser of {sensor.name} {away_m:.0f} m from '{base_frame}', as if in millimetres or "
+            "centimetres; correct it in tf, or give its pose with --sensors laser-pose=X,Y,THETA (metres, radians)"
         )
-    if kind not in LASER_SCANS:  # their scans are level
+    if sensor.kind not in LASER_SCANS:  # their scans are level
         return Mounting(mounted.T_base_laser, upside_down=False, tilt_rad=0.0)
     if mounted.tilt_rad > _STEEPEST_RAD:
         raise MountingError(
-            f"the laser of {name} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and does not look along the "
-            "floor; choose a level one by --sensors scan-topic, or give its pose with --sensors laser-pose"
+            f"the laser of {sensor.name} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and does not look along "
+            "the floor; choose a level one by --sensors scan-topic, or give its pose with --sensors laser-pose"
         )
     return mounted
-
-
-def given_mounting(pose: GivenPose, kind: str) -> Mounting:
-    """The mounting that the user gives, of a sensor with messages of type ``kind``."""
-    x, y, theta, *upside_down = pose
-    return Mounting((x, y, theta), upside_down=any(upside_down) and kind in LASER_SCANS, tilt_rad=0.0)
 
 
 def tilt_note(mounted: Mounting) -> str:

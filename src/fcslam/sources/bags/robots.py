@@ -109,11 +109,7 @@ def _is_apart(member: _Member, robot: _Member) -> bool:
 
 
 def robot_of(bag: DecodedBag, options: BagOptions) -> BagRobot:
-    """The only robot of a bag, or the one that ``options`` name.
-
-    Raises:
-        SourceError: as in ``robots_of``, or there are several robots, or none of this name.
-    """
+    """The only robot of a bag, or the one that ``options`` name."""
     if options.robot is None:
         robots = robots_of(bag, options)
         if len(robots) == 1:
@@ -223,11 +219,7 @@ def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions
 
 
 def _lost_scans(bag: DecodedBag, robots: Sequence[_Member], members: Sequence[_Member]) -> tuple[str, ...]:
-    """Notes on scans that are of none of several robots.
-
-    Raises:
-        SourceError: they are on a topic of one of them.
-    """
+    """Notes on scans that are of none of several robots."""
     notes = []
     for member in members:
         for topic, frames in () if member in robots else member.scan_frames.items():

@@ -21,21 +21,21 @@ from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
-from fcslam.sources.bags.plan import BagPlan, RecordedLaser, candidates_of, plan_of
+from fcslam.sources.bags.plan import BagPlan, candidates_of, plan_of
 from fcslam.sources.bags.reader import Numbered, ReadLaser, SensorReader
 from fcslam.sources.bags.rig import (
+    MountedSensor,
     MountingError,
     Rig,
-    check_frames,
-    given_mounting,
+    UnknownMountingError,
     mounted_camera,
+    mountings_of,
     rig_of,
-    sensor_mounting,
     tilt_note,
 )
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
 from fcslam.sources.bags.topics import agree_on_topics
-from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError
+from fcslam.sources.bags.transforms import USUAL_BASES, Mounting
 from fcslam.sources.contradictions import Alternation, ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -89,20 +89,12 @@ class RosBag:
 
     @cached_property
     def robot(self) -> BagRobot:
-        """The robot whose topics are read.
-
-        Raises:
-            SourceError: the bag cannot be read, or has several robots.
-        """
+        """The robot whose topics are read."""
         return self._given_robot or robot_of(self.bag, self._options)
 
     @cached_property
     def plan(self) -> BagPlan:
-        """What is read, and how.
-
-        Raises:
-            SourceError: the bag cannot be read, or what it needs is missing or contradictory.
-        """
+        """What is read, and how."""
         return plan_of(self.robot, self._options)
 
     @property
@@ -356,13 +348,17 @@ class RosBag:
         if poses and len(poses) != len(lasers):
             named = ", ".join(laser.name for laser in lasers)
             raise SourceError(f"{self.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
-        if poses:
-            return [given_mounting(pose, laser.topic.type) for pose, laser in zip(poses, lasers, strict=True)]
+        sensors = [MountedSensor(each.name, each.topic.name, each.topic.type, each.first.frame) for each in lasers]
         try:
-            check_frames((laser.topic.name, laser.first.frame) for laser in lasers)
-            return [self._mounting(laser, base_frame, errors) for laser in lasers]
+            return mountings_of(sensors, self.plan.tree, base_frame, poses)
         except MountingError as error:
             raise SourceError(f"{self.path}: {error}") from error
+        except UnknownMountingError as error:
+            raise SourceError(
+                f"{self.path}: tf has {error}{_in_brackets(errors)}, so the pose of the laser of {error.sensor} is "
+                "unknown; give it with --sensors laser-pose=X,Y,THETA (metres, radians)"
+                f"{' for each laser' * (len(lasers) > 1)}; if it is in another part of this recording, give both joined by a comma"
+            ) from error
 
     @property
     def is_upside_down(self) -> bool:
@@ -383,11 +379,7 @@ class RosBag:
         return RosBag(self.path, self.name, options, (*self._notes, *notes), self.robot)
 
     def robots(self, name: str | None = None) -> "list[RosBag]":
-        """The robots of the bag, or the one that is chosen, named as in it; ``name`` stands for the bag.
-
-        Raises:
-            SourceError: the bag cannot be read, or does not say which robot some topic is of.
-        """
+        """The robots of the bag, or the one that is chosen, named as in it; ``name`` stands for the bag."""
         robots = robots_of(self.bag, self._options)
         if self._options.robot is not None or len(robots) == 1:
             return [self]
@@ -404,17 +396,6 @@ class RosBag:
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
         return RosBag(self.path, called, options, self._notes, robot)
 
-    def _mounting(self, laser: RecordedLaser, base_frame: str, errors: Mapping[str, str]) -> Mounting:
-        try:
-            return sensor_mounting(self.plan.tree, base_frame, laser.first.frame, laser.topic.type, laser.name)
-        except NoTransformError as error:
-            raise SourceError(
-                f"{self.path}: tf has {error}{_in_brackets(errors)}, so the pose of the laser of {laser.name} "
-                "is unknown; give it with --sensors laser-pose=X,Y,THETA (metres, "
-                f"radians){' for each laser' * (len(self.plan.lasers) > 1)}; "
-                "if it is in another part of this recording, give both joined by a comma"
-            ) from error
-
     def _camera(self, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
         """The camera with its calibration and mounting; without them it is ignored, with a note."""
         path, topic = self.path, self.plan.topics.camera
@@ -425,11 +406,7 @@ class RosBag:
 
 
 def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]:
-    """The bags of one fleet with ``options``, read from the same topics if all of them have these.
-
-    Raises:
-        SourceError: a bag cannot be read.
-    """
+    """The bags of one fleet with ``options``, read from the same topics if all of them have these."""
     agreed, notes = agree_on_topics([candidates_of(bag.robot) for bag in bags], options or BagOptions())
     return [RosBag(bag.path, bag.name, agreed, () if k else notes, bag.robot) for k, bag in enumerate(bags)]
 

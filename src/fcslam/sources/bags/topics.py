@@ -134,11 +134,7 @@ def choose_topics(
 def find_candidates(
     known: KnownTopics, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
 ) -> Candidates:
-    """The topics from which ``choose_topics`` would choose.
-
-    Raises:
-        SourceError: the bag cannot be read.
-    """
+    """The topics from which ``choose_topics`` would choose."""
     scans, images = _preferred(_scans(known)), _images(known)
     calibrated = [topic for topic in images if _calibration_of(topic, known) and has_images(topic)]
     return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(known), calibrated)
