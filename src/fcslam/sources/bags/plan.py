@@ -28,7 +28,6 @@ from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import SCANS_THAT_VOTE
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand
-from fcslam.sources.pose import Pose
 
 _IMAGES_TRIED = 5
 _STRIDE = 5
@@ -150,175 +149,169 @@ def candidates_of(robot: BagRobot) -> Candidates:
 
 def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
     """Plan how a robot of a bag is read."""
-    topics = choose_topics(_known_topics(robot), options, partial(_view_rad, robot), partial(_has_images, robot))
-    tree = robot.bag.census.tree(robot.transforms)
-    scans = BagScans(
-        robot, topics.scans, options, tree, lambda frame: _base_frame_of(frame, robot, options, topics, tree)
-    )
-    lasers = tuple(
-        _laser(robot, scans, topic, frame)
-        for topic in topics.scans
-        for frame in robot.scan_frames.get(topic.name, (None,))
-    )
-    notes: list[str] = []
-    odometry = _odometry(robot, options, topics, tree, scans, lasers[0].first.frame, notes)
-    ahead_s = 0.0 if odometry is None else _clock_ahead_s(robot, options, topics, scans, odometry)
-    if odometry is not None and ahead_s:
-        notes.append(
-            f"{robot.bag.path}: the clock of {odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the "
-            "times of recording; corrected"
+    return _Planner(robot, options).plan()
+
+
+class _Planner:
+    def __init__(self, robot: BagRobot, options: BagOptions) -> None:
+        self._robot, self._options, self._bag, self._path = robot, options, robot.bag, robot.bag.path
+        self._topics = choose_topics(
+            _known_topics(robot), options, partial(_view_rad, robot), partial(_has_images, robot)
         )
-    read = {(topic, "", ""): topic.name for topic in topics.scans}
-    if odometry is not None:
-        read |= {(topic, *(odometry.edge or ("", ""))): odometry.name for topic in odometry.topics}
-    counted = robot.bag.census.clocks
-    clocks = {name: counted[stamped] for stamped, name in read.items() if stamped in counted}
-    calibration = calibration_in(robot, topics.camera_info)
-    return BagPlan(topics, tree, scans, lasers, odometry, ahead_s, clocks, calibration, tuple(notes))
+        self._tree = robot.bag.census.tree(robot.transforms)
+        self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
+        self._notes: list[str] = []
+        """Why an odometry is not used, or not as it is."""
+
+    def plan(self) -> BagPlan:
+        """Decide everything."""
+        topics = self._topics
+        lasers = tuple(
+            self._laser(topic, frame)
+            for topic in topics.scans
+            for frame in self._robot.scan_frames.get(topic.name, (None,))
+        )
+        odometry = self._odometry(lasers[0].first.frame)
+        ahead_s = 0.0 if odometry is None else self._clock_ahead_s(odometry)
+        read = {(topic, "", ""): topic.name for topic in topics.scans}
+        if odometry is not None:
+            read |= {(topic, *(odometry.edge or ("", ""))): odometry.name for topic in odometry.topics}
+        counted = self._bag.census.clocks
+        clocks = {name: counted[stamped] for stamped, name in read.items() if stamped in counted}
+        calibration = calibration_in(self._robot, topics.camera_info)
+        notes = tuple(self._notes)
+        return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, clocks, calibration, notes)
+
+    def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
+        own = (scan for scan in self._scans.of(topic) if frame in (None, scan.frame))
+        first = list(islice(own, SCANS_THAT_VOTE))
+        if not first:
+            raise SourceError(
+                f"{self._path}: none of the {topic.message_count} scans in {topic.name} can be read"
+                f"{self._first_error(topic)}; correct the laser's driver, or copy the bag again"
+            )
+        sector_rad = None if topic.type in LASER_SCANS else cloud_sector_rad(first)
+        if sector_rad is not None:
+            raise SourceError(
+                f"{self._path}: each cloud of {topic.name} is a sector of about {degrees(sector_rad):.0f} deg; let the "
+                "driver publish whole turns, or record its laser scans"
+            )
+        is_in_sectors = are_sectors(first)
+        return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), frame, is_in_sectors)
+
+    def _first_error(self, topic: Topic) -> str:
+        """The fault of the first scan of a topic, in brackets."""
+        for message in islice(self._bag.read([topic]), 1):
+            try:
+                self._scans.scan(message, self._options.cloud_band)
+            except ValueError as error:
+                return f" ({error})"
+        return ""
+
+    def _odometry(self, frame: str) -> OdometryInput | None:
+        """The odometry that is read; ``frame`` is that of the first laser."""
+        if self._options.odom_topic == NO_ODOMETRY:
+            return None
+        for candidate in self._odometry_candidates(frame):
+            error = "" if candidate.edge is not None else _odometry_error(self._robot, candidate.topics[0])
+            readings = chain.from_iterable(valid(self._bag.read(candidate.topics), candidate.readings))
+            fault = f"cannot be read ({error})" if error else fault_of_odometry(each.T_odom_base for each in readings)
+            if fault is None or not (error or self._scans_change()):
+                return candidate
+            self._notes.append(f"{self._path}: {candidate.name} {fault}, so it is not used")
+        self._notes.append(f"{self._path}: {WITHOUT_ODOMETRY}")
+        return None
+
+    def _odometry_candidates(self, frame: str) -> Iterator[OdometryInput]:
+        """The chosen topic of odometry, then tf."""
+        options = self._options
+        link = self._tree.odometry_link(frame, options.odom_frame, options.base_frame)
+        measured = self._measured
+        if options.odom_topic is None and options.odom_frame is not None:
+            measured = []
+        for topic in measured:
+            yield OdometryInput((topic,), None, self._base_frame(topic))
+        if measured and options.odom_topic is not None:
+            return
+        if link is not None:
+            named = tuple(topic for topic in self._topics.odometry if topic.type != ODOMETRY)
+            yield OdometryInput(named or self._topics.transforms, link)
+        elif options.odom_frame or (options.base_frame and not measured):
+            known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in self._tree.links)
+            raise SourceError(
+                f"{self._path}: tf has no transform from {options.odom_frame or 'a frame'} to "
+                f"{options.base_frame or 'a frame above the laser'}; give --sensors odom-frame and base-frame; "
+                f"tf has {known or 'no transforms'}"
+            )
+
+    @property
+    def _measured(self) -> list[Topic]:
+        return [topic for topic in self._topics.odometry if topic.type == ODOMETRY]
+
+    def _base_frame(self, topic: Topic) -> str | None:
+        """The frame of the base on a topic of odometry that has several."""
+        frames = [frame for frame in usual(self._bag.census.base_frames.get(topic, {})) if frame]
+        chosen = self._options.base_frame or self._robot.base_frames.get(topic.name)
+        if len(frames) < 2:
+            return None
+        if chosen in frames:
+            return chosen
+        raise SourceError(
+            f"{self._path}: {topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one "
+            "the laser is on; choose one by --sensors base-frame"
+        )
+
+    def _base_frame_of(self, frame: str) -> str:
+        """The base of the robot with ``frame``, before its lasers are known."""
+        bases = [self._options.base_frame]
+        for topic in self._measured:
+            bases += [self._base_frame(topic), *self._bag.census.base_frames.get(topic, {})]
+        link = self._tree.odometry_link(frame, self._options.odom_frame)
+        usual_ones = [each for each in USUAL_BASES if each in self._tree]
+        return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
+
+    def _scans_change(self) -> bool:
+        """Whether the scans show that the robot moves: some scan measures something else than the first."""
+        found = self._scans.of(self._topics.scans[0])
+        first = next(found, None)
+        return first is not None and any(
+            changed_share(first.raw_ranges_m, scan.raw_ranges_m) > CHANGED
+            for scan in islice(found, None, None, _STRIDE)
+        )
+
+    def _clock_ahead_s(self, odometry: OdometryInput) -> float:
+        """The clock of the odometry against that of the scans by the times of recording; 0 if they are alike."""
+
+        def scan_ends(message: BagMessage) -> list[float]:
+            return [self._scans.scan(message, self._options.cloud_band).end]
+
+        def reading_ends(message: BagMessage) -> list[float]:
+            return [reading.stamp for reading in odometry.readings(message)]
+
+        found = []
+        for topics, ends_of in ((self._topics.scans[:1], scan_ends), (odometry.topics, reading_ends)):
+            lags_s = []
+            for message in islice(self._bag.read(topics), _READINGS_TRIED):
+                ends_s = chain.from_iterable(valid([message], ends_of))
+                lags_s += [message.bag_time_ns / 1e9 - end_s for end_s in ends_s]
+            if len(lags_s) < _FEWEST_LAGS:
+                return 0.0
+            low_s, middle_s, high_s = quantiles(lags_s, n=4)
+            if high_s - low_s > _LARGEST_DELAY_S:
+                return 0.0
+            found.append(middle_s)
+        ahead_s = found[0] - found[1]
+        if abs(ahead_s) < _LARGEST_DELAY_S:
+            return 0.0
+        self._notes.append(
+            f"{self._path}: the clock of {odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the times of "
+            "recording; corrected"
+        )
+        return ahead_s
 
 
 def _known_topics(robot: BagRobot) -> KnownTopics:
     return KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
-
-
-def _laser(robot: BagRobot, scans: BagScans, topic: Topic, frame: str | None) -> RecordedLaser:
-    path = robot.bag.path
-    first = list(islice((scan for scan in scans.of(topic) if frame in (None, scan.frame)), SCANS_THAT_VOTE))
-    if not first:
-        raise SourceError(
-            f"{path}: none of the {topic.message_count} scans in {topic.name} can be read"
-            f"{_first_error(robot, scans, topic)}; correct the laser's driver, or copy the bag again"
-        )
-    sector_rad = None if topic.type in LASER_SCANS else cloud_sector_rad(first)
-    if sector_rad is not None:
-        raise SourceError(
-            f"{path}: each cloud of {topic.name} is a sector of about {degrees(sector_rad):.0f} deg; let the driver "
-            "publish whole turns, or record its laser scans"
-        )
-    is_in_sectors = are_sectors(first)
-    return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), frame, is_in_sectors)
-
-
-def _first_error(robot: BagRobot, scans: BagScans, topic: Topic) -> str:
-    """The fault of the first scan of a topic, in brackets."""
-    for message in islice(robot.bag.read([topic]), 1):
-        try:
-            scans.scan(message, CloudBand())
-        except ValueError as error:
-            return f" ({error})"
-    return ""
-
-
-def _odometry(
-    robot: BagRobot,
-    options: BagOptions,
-    topics: Topics,
-    tree: TransformTree,
-    scans: BagScans,
-    frame: str,
-    notes: list[str],
-) -> OdometryInput | None:
-    if options.odom_topic == NO_ODOMETRY:
-        return None
-    for candidate in _odometry_candidates(robot, options, topics, tree, frame):
-        error = "" if candidate.edge is not None else _odometry_error(robot, candidate.topics[0])
-        fault = f"cannot be read ({error})" if error else fault_of_odometry(_poses_of(robot, candidate))
-        if fault is None or not (error or _scans_change(scans, topics.scans[0])):
-            return candidate
-        notes.append(f"{robot.bag.path}: {candidate.name} {fault}, so it is not used")
-    notes.append(f"{robot.bag.path}: {WITHOUT_ODOMETRY}")
-    return None
-
-
-def _odometry_candidates(
-    robot: BagRobot, options: BagOptions, topics: Topics, tree: TransformTree, frame: str
-) -> Iterator[OdometryInput]:
-    """The chosen topic of odometry, then tf; ``frame`` is that of the first laser."""
-    link = tree.odometry_link(frame, options.odom_frame, options.base_frame)
-    measured = [topic for topic in topics.odometry if topic.type == ODOMETRY]
-    if options.odom_topic is None and options.odom_frame is not None:
-        measured = []
-    for topic in measured:
-        yield OdometryInput((topic,), None, _base_frame(robot, options, topic))
-    if measured and options.odom_topic is not None:
-        return
-    if link is not None:
-        named = tuple(topic for topic in topics.odometry if topic.type != ODOMETRY)
-        yield OdometryInput(named or topics.transforms, link)
-    elif options.odom_frame or (options.base_frame and not measured):
-        known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in tree.links)
-        raise SourceError(
-            f"{robot.bag.path}: tf has no transform from {options.odom_frame or 'a frame'} to "
-            f"{options.base_frame or 'a frame above the laser'}; give --sensors odom-frame and base-frame; "
-            f"tf has {known or 'no transforms'}"
-        )
-
-
-def _base_frame(robot: BagRobot, options: BagOptions, topic: Topic) -> str | None:
-    """The frame of the base on a topic of odometry that has several."""
-    frames = [frame for frame in usual(robot.bag.census.base_frames.get(topic, {})) if frame]
-    chosen = options.base_frame or robot.base_frames.get(topic.name)
-    if len(frames) < 2:
-        return None
-    if chosen in frames:
-        return chosen
-    raise SourceError(
-        f"{robot.bag.path}: {topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one "
-        "the laser is on; choose one by --sensors base-frame"
-    )
-
-
-def _base_frame_of(frame: str, robot: BagRobot, options: BagOptions, topics: Topics, tree: TransformTree) -> str:
-    """The base of the robot with ``frame``, before its lasers are known."""
-    bases = [options.base_frame]
-    for topic in (topic for topic in topics.odometry if topic.type == ODOMETRY):
-        bases.append(_base_frame(robot, options, topic))
-        readings = valid(islice(robot.bag.read([topic]), _READINGS_TRIED), lambda message: message.content)
-        bases += [reading.base_frame for reading in readings]
-    link = tree.odometry_link(frame, options.odom_frame)
-    usual_ones = [each for each in USUAL_BASES if each in tree]
-    return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
-
-
-def _poses_of(robot: BagRobot, odometry: OdometryInput) -> Iterator[Pose]:
-    readings = valid(robot.bag.read(odometry.topics), odometry.readings)
-    return (reading.T_odom_base for reading in chain.from_iterable(readings))
-
-
-def _scans_change(scans: BagScans, topic: Topic) -> bool:
-    """Whether the scans show that the robot moves: some scan measures something else than the first."""
-    found = scans.of(topic)
-    first = next(found, None)
-    return first is not None and any(
-        changed_share(first.raw_ranges_m, scan.raw_ranges_m) > CHANGED for scan in islice(found, None, None, _STRIDE)
-    )
-
-
-def _clock_ahead_s(
-    robot: BagRobot, options: BagOptions, topics: Topics, scans: BagScans, odometry: OdometryInput
-) -> float:
-    """The clock of the odometry against that of the scans by the times of recording; 0 if they are alike."""
-
-    def scan_ends(message: BagMessage) -> list[float]:
-        return [scans.scan(message, options.cloud_band).end]
-
-    def reading_ends(message: BagMessage) -> list[float]:
-        return [reading.stamp for reading in odometry.readings(message)]
-
-    found = []
-    for read, ends_of in ((topics.scans[:1], scan_ends), (odometry.topics, reading_ends)):
-        lags_s = []
-        for message in islice(robot.bag.read(read), _READINGS_TRIED):
-            ends = next(valid([message], ends_of), [])
-            lags_s += [message.bag_time_ns / 1e9 - end_s for end_s in ends]
-        if len(lags_s) < _FEWEST_LAGS:
-            return 0.0
-        low_s, middle_s, high_s = quantiles(lags_s, n=4)
-        if high_s - low_s > _LARGEST_DELAY_S:
-            return 0.0
-        found.append(middle_s)
-    ahead_s = found[0] - found[1]
-    return 0.0 if abs(ahead_s) < _LARGEST_DELAY_S else ahead_s
 
 
 def _odometry_error(robot: BagRobot, topic: Topic) -> str:

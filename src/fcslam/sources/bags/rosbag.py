@@ -357,7 +357,8 @@ class RosBag:
             raise SourceError(
                 f"{self.path}: tf has {error}{_in_brackets(errors)}, so the pose of the laser of {error.sensor} is "
                 "unknown; give it with --sensors laser-pose=X,Y,THETA (metres, radians)"
-                f"{' for each laser' * (len(lasers) > 1)}; if it is in another part of this recording, give both joined by a comma"
+                f"{' for each laser' * (len(lasers) > 1)}; if it is in another part of this recording, give both "
+                "joined by a comma"
             ) from error
 
     @property
